@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.comparison import compare as compare
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
-    from ortho_pipeline.estimation.problem import Prior as Prior
+    from ortho_pipeline.estimation.observations.prior import Prior as Prior
     from ortho_pipeline.exchange.geodataframe import from_geodataframe as from_geodataframe
     from ortho_pipeline.exchange.geodataframe import to_geodataframe as to_geodataframe
     from ortho_pipeline.exchange.model_file import load_model as load_model
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.report.notebook.charts import plot as plot
     from ortho_pipeline.report.notebook.tables import html as html
     from ortho_pipeline.surface.base import Surface as Surface
+    from ortho_pipeline.surface.dem import open_dem as open_dem
 
 __version__: str
 
@@ -68,7 +69,7 @@ _HOMES = {
     "OutputOptions": "options",
     "PointOptions": "options",
     "Points": "points",
-    "Prior": "estimation.problem",
+    "Prior": "estimation.observations.prior",
     "RPC": "models",
     "RasterSource": "raster.source",
     "Scene": "hookspecs",
@@ -88,6 +89,7 @@ _HOMES = {
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
+    "open_dem": "surface.dem",
     "open_scene": "plugins",
     "ortho_array": "commands.arrays.lazy",
     "plot": "report.notebook.charts",

@@ -45,14 +45,14 @@ import pluggy
 if TYPE_CHECKING:
     from ortho_pipeline.display.notices import Notice
     from ortho_pipeline.estimation.fit import Fit
-    from ortho_pipeline.estimation.problem import Prior
+    from ortho_pipeline.estimation.observations.prior import Prior
     from ortho_pipeline.models.base import SensorModel
     from ortho_pipeline.points import Points
 
 PROJECT_NAME = "ortho_pipeline"
 #: The entry-point groups, and the hooks that are called in the modules which each names.
 GROUPS = {
-    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_formats", "ortho_studies"),
+    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_formats"),
     "ortho_pipeline_commands": ("ortho_commands",),
 }
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
@@ -292,85 +292,6 @@ class Format:
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """The outcome of a simulation: its files by name, and what to try with them (text for the terminal)."""
-
-    files: Mapping[str, Path]
-    text: str
-
-
-@dataclass(frozen=True)
-class Reproduced:
-    """The outcome of an experiment: a document of JSON values, its text for the terminal, and its page of HTML."""
-
-    document: Mapping[str, Any]
-    text: str
-    page: Callable[[], str]
-
-
-@dataclass(frozen=True)
-class StudyOption:
-    """An option of ``ortho simulate NAME``: a keyword argument of `Study.simulate`.
-
-    Parameters
-    ----------
-    name : str
-        The keyword; on the command line with dashes, unless `flag` says otherwise.
-    help : str
-        One line.
-    kind : type
-        int, float, or bool (a switch).
-    default : optional
-        None where the simulation has a default of its own.
-    low, high : float, optional
-        The least and the greatest value.
-    unit : str
-        Shown in place of the value.
-    flag : str
-        The switch as it is typed (``--rpc/--no-rpc``).
-    """
-
-    name: str
-    help: str
-    kind: type = float
-    default: Any = None
-    low: float | None = None
-    high: float | None = None
-    unit: str = ""
-    flag: str = ""
-
-
-@dataclass(frozen=True)
-class Study:
-    """Scenes of known truth of one sensor, and the experiment of a paper on them.
-
-    The first line of the docstrings of both functions is what ``--help`` says.
-
-    Parameters
-    ----------
-    name : str
-        ``ortho simulate NAME`` and ``ortho reproduce NAME``; unique among all plugins.
-    title : str
-        One line for the lists of both commands.
-    simulate : callable(folder, *, seed, **options) -> Simulated, optional
-        Writes a product with its DEM and points. Its files appear together, or none does.
-    reproduce : callable(realisations, *, progress) -> Reproduced, optional
-        Computes what a paper has tables of; calls `progress` with the share that is done (0 to 1).
-    options : tuple of StudyOption
-        Of `simulate`, besides the seed.
-    realisations : int
-        How often noise is drawn where the user does not say.
-    """
-
-    name: str
-    title: str
-    simulate: Callable[..., Simulated] | None = None
-    reproduce: Callable[..., Reproduced] | None = None
-    options: tuple[StudyOption, ...] = ()
-    realisations: int = 100
-
-
-@dataclass(frozen=True)
 class Subcommand:
     """A command of ``ortho`` that a package adds; its code is imported when somebody calls it.
 
@@ -416,12 +337,6 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 @hookspec
 def ortho_formats() -> Iterable[Format]:
     """Return the formats that this plugin writes sensor models in."""
-    raise NotImplementedError
-
-
-@hookspec
-def ortho_studies() -> Iterable[Study]:
-    """Return simulated scenes and experiments; called for ``ortho simulate`` and ``ortho reproduce`` alone."""
     raise NotImplementedError
 
 

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.family_fit import fit_family as fit_family
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
-    from ortho_pipeline.estimation.problem import Prior as Prior
-    from ortho_pipeline.estimation.problem import priors_at as priors_at
+    from ortho_pipeline.estimation.observations.prior import Prior as Prior
+    from ortho_pipeline.estimation.observations.prior import priors_at as priors_at
     from ortho_pipeline.estimation.spatial.correlation import analyse_fit as analyse_fit
     from ortho_pipeline.exchange.export import Export as Export
     from ortho_pipeline.exchange.rpc import export_rpc as export_rpc
@@ -73,21 +73,17 @@ if TYPE_CHECKING:
     from ortho_pipeline.geodesy.ellipsoid import orbital_from_ecef as orbital_from_ecef
     from ortho_pipeline.hookspecs import Format as Format
     from ortho_pipeline.hookspecs import Piece as Piece
-    from ortho_pipeline.hookspecs import Reproduced as Reproduced
     from ortho_pipeline.hookspecs import Scene as Scene
     from ortho_pipeline.hookspecs import Sensor as Sensor
-    from ortho_pipeline.hookspecs import Simulated as Simulated
-    from ortho_pipeline.hookspecs import Study as Study
-    from ortho_pipeline.hookspecs import StudyOption as StudyOption
     from ortho_pipeline.hookspecs import Subcommand as Subcommand
     from ortho_pipeline.hookspecs import hookimpl as hookimpl
-    from ortho_pipeline.models import KINDS as KINDS
     from ortho_pipeline.models import RPC as RPC
     from ortho_pipeline.models import ImageCorrection as ImageCorrection
     from ortho_pipeline.models import MapPlane as MapPlane
     from ortho_pipeline.models import Rational as Rational
     from ortho_pipeline.models import SensorModel as SensorModel
     from ortho_pipeline.models import require_view as require_view
+    from ortho_pipeline.models.base import KINDS as KINDS
     from ortho_pipeline.models.base import Array as Array
     from ortho_pipeline.models.base import ground_of_grid as ground_of_grid
     from ortho_pipeline.models.frame.camera import LOOKS_PAST as LOOKS_PAST
@@ -166,7 +162,7 @@ _NAMES = {
         "Fit",
         "fit",
     ),
-    "estimation.problem": (
+    "estimation.observations.prior": (
         "Prior",
         "priors_at",
     ),
@@ -214,17 +210,12 @@ _NAMES = {
     "hookspecs": (
         "Format",
         "Piece",
-        "Reproduced",
         "Scene",
         "Sensor",
-        "Simulated",
-        "Study",
-        "StudyOption",
         "Subcommand",
         "hookimpl",
     ),
     "models": (
-        "KINDS",
         "RPC",
         "ImageCorrection",
         "MapPlane",
@@ -233,6 +224,7 @@ _NAMES = {
         "require_view",
     ),
     "models.base": (
+        "KINDS",
         "Array",
         "ground_of_grid",
     ),

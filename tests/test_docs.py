@@ -16,7 +16,6 @@ import pytest
 
 import ortho_pipeline
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.plugins import Host
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("sample_data/**/*.md")])
@@ -55,14 +54,15 @@ COMMANDS = [pytest.param(line, id=f"{page.name}: {line[:60]}") for page in PAGES
 @pytest.fixture
 def with_tinysat(monkeypatch):
     """Have the plugin that docs/plugins.md builds."""
-    from ortho_pipeline.commands import studies
+    from ortho_studies import studies
 
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "ortho_tinysat"))
     import ortho_tinysat_flight
     import ortho_tinysat_study
 
     monkeypatch.setitem(cli.commands, "flight", ortho_tinysat_flight.flight)
-    monkeypatch.setattr(studies, "studies", lambda: {"tinysat": ortho_tinysat_study.STUDY, **Host.discover().studies})
+    installed = studies.studies()
+    monkeypatch.setattr(studies, "studies", lambda: {"tinysat": ortho_tinysat_study.STUDY, **installed})
     yield
     for name in ("ortho_tinysat_study", "ortho_tinysat_flight", "ortho_tinysat"):
         sys.modules.pop(name, None)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_studies import hookspecs as of_studies
 from osgeo import gdal
 
 from ortho_pipeline import hookspecs, plugin
@@ -184,11 +185,12 @@ def test_the_tutorial_is_the_example():
         assert "\n\n\n".join(parts) + "\n" == (EXAMPLE / name).read_text(encoding="utf-8"), name
 
 
-KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Format, Export, hookspecs.Study, hookspecs.Subcommand)
+KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Format, Export, hookspecs.Subcommand, of_studies.Study)
 
 
 def test_everything_that_an_author_can_use_is_in_the_tutorial():
     hooks = [name for name, value in vars(hookspecs).items() if hasattr(value, "ortho_pipeline_spec")]
+    hooks += [name for name, value in vars(of_studies).items() if hasattr(value, "ortho_studies_spec")]
     assert len(hooks) == 5
     fields = [field.name for kind in KINDS for field in dataclasses.fields(kind)]
     for name in hooks + fields:

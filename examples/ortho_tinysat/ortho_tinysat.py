@@ -16,7 +16,6 @@ from ortho_pipeline.plugin import (
     Scene,
     Sensor,
     SensorModel,
-    Study,
     geocentric,
     hookimpl,
     place,
@@ -102,13 +101,6 @@ def open_scene(dataset: Any, *, mounting: str = "0") -> Scene:
     known = {"roll": Prior(roll, np.radians(0.05)), "delay": Prior(0.0, 0.1)}
     facts = {"acquired": flight.get("acquired", "unknown")}
     return Scene("tinysat", dataset.GetDescription(), *size, {"tinysat": model}, str(path), facts=facts, priors=known)
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    from ortho_tinysat_study import STUDY  # here: few commands need it, and all would wait for it
-
-    yield STUDY
 
 
 @hookimpl

@@ -18,8 +18,8 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import confined
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import is_address, is_far, url_of
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.files.locations import Location
+from ortho_pipeline.stores.objects import Objects
 
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000
@@ -82,8 +82,8 @@ def far_states(job: Job) -> tuple[FileState, ...]:
         If the store does not answer.
     """
     found = []
-    for address in sorted({url_of(path) for _, path in job.request.files if is_far(path)}):
-        if not is_address(address):
+    for address in sorted({Location(path).url for _, path in job.request.files if Location(path).is_far}):
+        if not Location(address).is_address:
             continue
         folder, _, name = address.rpartition("/")
         try:
@@ -96,7 +96,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
-    return [path for _, path in job.request.named if os.path.isabs(path) and not is_far(path)]
+    return [path for _, path in job.request.named if os.path.isabs(path) and not Location(path).is_far]
 
 
 def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:

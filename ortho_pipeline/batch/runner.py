@@ -37,10 +37,10 @@ from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
-from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.process_limits import Progress
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
 #: A larger file is not a report on a mosaic.
@@ -212,7 +212,7 @@ def run(
         If the file is wrong, or another run works in the output folder. What is wrong with a scene is its outcome.
     """
     planned = config if isinstance(config, Plan) else plan(config, allow_network=allow_network)
-    if store is None and is_far(planned.path):
+    if store is None and Location(planned.path).is_far:
         raise InputError(
             "what a pipeline file of another machine asks for goes to a store", file=planned.path, field="output",
             remedy="give a folder of objects for the outputs, such as s3://bucket/prefix, or copy the file",

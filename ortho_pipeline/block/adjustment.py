@@ -33,13 +33,13 @@ from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import marks_warning
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3
@@ -191,7 +191,7 @@ def _prepared(
     takes_part = ~_among(points, set(exclude))
     rays = takes_part[points.point]
     local = meet(frame, models, points, rays)
-    problem = BlockProblem(points, models, frame, known, _priors(models, points, priors))
+    problem = BlockProblem(points, models, frame, known, pseudo_of(models, points, priors))
     local = _at_known(problem, local, rays)
     seen = rays & np.isfinite(predict(frame, models, points, local)).all(axis=1)
     ground = points.control & takes_part
@@ -236,9 +236,10 @@ def _at_known(problem: BlockProblem, local: Array, rays: Mask) -> Array:
     return local
 
 
-def _priors(
+def pseudo_of(
     models: Sequence[SensorModel], points: BlockPoints, priors: Mapping[str, Mapping[str, Prior]]
 ) -> tuple[Pseudo, ...]:
+    """Return what is known of the parameters of images ``(P,)`` by themselves."""
     found, begin = [], 0
     strangers = sorted(set(priors) - set(points.images))
     if strangers:

@@ -29,8 +29,8 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Select
 from ortho_pipeline.block.equations.solver import Solved, attempt, solve
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
-from ortho_pipeline.estimation.spatial.common_unknown import CommonUnknown
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, solve_2x2
 
@@ -129,11 +129,11 @@ class CommonError(CommonUnknown):
     def _misfits(self, linear: Linear) -> list[Misfits]:
         """Return what one sigma of it, east and north, takes off the misfits."""
         problem, rows = linear.problem, linear.ordering.grounded
-        found = []
+        sigmas, found = problem.on_points(linear.state.local, rows).sigmas, []
         for axis in range(2):
             ground = np.zeros((len(problem.points), 3))
             root = np.sqrt(linear.weights.ground_weights[rows])
-            ground[rows, axis] = self.sigmas[rows] / problem.ground_sigmas[rows, axis] * root
+            ground[rows, axis] = self.sigmas[rows] / sigmas[:, axis] * root
             found.append(Misfits(np.zeros_like(linear.misfits.rays), ground, np.zeros_like(linear.misfits.pseudo)))
         return found
 

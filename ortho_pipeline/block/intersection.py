@@ -121,7 +121,10 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     rows[rays] = partials
     if scaled and sigma0 is not None:
         covariance *= sigma0**2
-    return Intersection(points, places.geodetic, covariance, residuals, _angles(points, rows, found), sigma0)
+    # Along a ray the image does not change: it is across both rows of the partials.
+    directions = np.where(found[points.point, None], np.cross(rows[:, 0], rows[:, 1]), np.nan)
+    one, _, angles = ray_angles(points.point, directions)
+    return Intersection(points, places.geodetic, covariance, residuals, largest_angles(points, one, angles), sigma0)
 
 
 def models_of(models: Mapping[str, SensorModel], points: BlockPoints) -> tuple[SensorModel, ...]:
@@ -265,19 +268,28 @@ def _per_point(count: int, of: Index, values: Array) -> Array:
     return total
 
 
-def _angles(points: BlockPoints, rows: Array, found: np.ndarray) -> Array:
-    """Return the largest angle (degrees) between two rays of each point ``(N,)``: along a ray both partials vanish."""
-    directions = np.cross(rows[:, 0], rows[:, 1])
+def ray_angles(point: Index, directions: Array) -> tuple[Index, Index, Array]:
+    """Return the pairs of rays that belong to one of points ``(M,)``, and the angles (degrees) between them.
+
+    Directions ``(M, 3)`` are of any length; rays without one (NaN) are left out. Up or down is the same ray.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    order = np.argsort(points.point, kind="stable")
-    counts = np.bincount(points.point, minlength=len(points))
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    angles = np.full(len(points), np.nan)
-    for count in np.unique(counts[found]):
-        which = np.flatnonzero(found & (counts == count))
-        rays = directions[order[starts[which][:, None] + np.arange(count)]]
-        # The sign of a direction depends on the handedness of the image axes, the same for all of a block or not.
-        cosines = np.abs(rays @ rays.swapaxes(1, 2)).min(axis=(1, 2))
-        angles[which] = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    return angles
+        units = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    rays = np.flatnonzero(np.isfinite(units).all(axis=1))
+    order = rays[np.argsort(point[rays], kind="stable")]
+    pairs = [np.zeros((0, 2), np.int64)]
+    for apart in range(1, len(order)):
+        same = point[order[apart:]] == point[order[:-apart]]
+        if not same.any():
+            break
+        pairs.append(np.column_stack([order[:-apart][same], order[apart:][same]]))
+    one, other = np.concatenate(pairs).T
+    cosines = np.abs((units[one] * units[other]).sum(axis=1))
+    return one, other, np.degrees(np.arccos(np.clip(cosines, 0.0, 1.0)))
+
+
+def largest_angles(points: BlockPoints, one: Index, angles: Array) -> Array:
+    """Return the largest of the angles of pairs of rays, whose first is `one`, of each point ``(N,)``; else NaN."""
+    largest = np.full(len(points), np.nan)
+    np.fmax.at(largest, points.point[one], angles)
+    return largest

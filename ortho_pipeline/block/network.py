@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.intersection import largest_angles, ray_angles
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.models.base import Array
 
@@ -47,15 +48,8 @@ class Network:
 def network_of(fit: BlockFit) -> Network:
     """Return the network of an adjusted block, by the rays that were used."""
     points = fit.points
-    directions = ray_directions(fit)
-    good = np.isfinite(directions).all(axis=1)
-    one, other = _meeting(points.point, np.flatnonzero(good))
-    # Up or down along a ray is the same ray.
-    cosines = np.abs((directions[one] * directions[other]).sum(axis=1))
-    angles = np.degrees(np.arccos(np.clip(cosines, 0.0, 1.0)))
-    largest = np.full(len(points), -np.inf)
-    np.maximum.at(largest, points.point[one], angles)
-    largest[np.isneginf(largest)] = np.nan
+    one, other, angles = ray_angles(points.point, _directions(fit))
+    largest = largest_angles(points, one, angles)
     ends = np.sort(np.stack([points.image[one], points.image[other]], axis=1), axis=1)
     found, which = np.unique(ends, axis=0, return_inverse=True)
     pairs = tuple(
@@ -68,8 +62,8 @@ def network_of(fit: BlockFit) -> Network:
     return Network(pairs, largest, _parts(points.images, found))
 
 
-def ray_directions(fit: BlockFit) -> Array:
-    """Return the unit vectors ``(M, 3)`` of the rays at the adjusted ground; NaN for those that were not used.
+def _directions(fit: BlockFit) -> Array:
+    """Return the directions ``(M, 3)`` of the rays at the adjusted ground; NaN for those that were not used.
 
     In the local frame of the block. Along a ray the image does not change: it is across both rows of the partials.
     """
@@ -86,24 +80,7 @@ def ray_directions(fit: BlockFit) -> Array:
         if len(rays):
             partials = places.ground_partials(fit.models[name], points.point[rays])
             found[rays] = np.cross(partials[:, 0], partials[:, 1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        found /= np.linalg.norm(found, axis=1, keepdims=True)
     return found
-
-
-def _meeting(point: Index, rays: Index) -> tuple[Index, Index]:
-    """Return all pairs of `rays` (numbers of rays) that belong to one point."""
-    order = rays[np.argsort(point[rays], kind="stable")]
-    of, counts = np.unique(point[order], return_counts=True)
-    starts = np.concatenate([[0], np.cumsum(counts)])[: len(of)]
-    one, other = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for count in np.unique(counts).tolist():
-        members = order[starts[counts == count][:, None] + np.arange(count)]
-        for i in range(count):
-            for j in range(i + 1, count):
-                one.append(members[:, i])
-                other.append(members[:, j])
-    return np.concatenate(one), np.concatenate(other)
 
 
 def _parts(images: Sequence[str], pairs: Index) -> tuple[tuple[str, ...], ...]:

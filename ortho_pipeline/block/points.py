@@ -18,6 +18,7 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable
@@ -87,7 +88,7 @@ class BlockPoints:
     shape_image: Array | None = None
     sigma_common: Array = None  # type: ignore[assignment]  # filled below
     groups: Index | None = None
-    _whitening: Array | None = field(init=False, repr=False, default=None)
+    _errors: ImageErrors | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         count, rays = len(self.ids), len(self.point)
@@ -110,7 +111,7 @@ class BlockPoints:
         if self.shape_image is not None:
             directions = checked_covariance(self.shape_image, rays)
             object.__setattr__(self, "shape_image", directions)
-            object.__setattr__(self, "_whitening", np.linalg.inv(np.linalg.cholesky(directions)))
+            object.__setattr__(self, "_errors", ImageErrors(np.asarray(np.linalg.cholesky(directions))))
 
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
@@ -249,14 +250,12 @@ class BlockPoints:
 
     def whitened(self, values: Array, rays: Index | slice) -> Array:
         """Return values of rays ``(k, 2, ...)``, over their sigma already, as independent and of sigma 1."""
-        if self._whitening is None:
-            return values
-        return np.asarray(np.einsum("kij,kj...->ki...", self._whitening[rays], values))
+        return values if self._errors is None else self._errors[rays].whitened(values)
 
     def in_pixels(self, values: Array, rays: Index) -> Array:
         """Return in pixels what `whitened` returned, values of rays ``(k, 2, ...)``."""
-        if self._whitening is not None:
-            values = np.einsum("kij,kj...->ki...", np.linalg.inv(self._whitening[rays]), values)
+        if self._errors is not None:
+            values = self._errors[rays].restored(values)
         return np.asarray(values * self.sigma_image[rays].reshape(-1, *[1] * (values.ndim - 1)))
 
     def in_image(self, name: str) -> Points:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 

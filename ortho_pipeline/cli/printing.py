@@ -19,7 +19,7 @@ from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.results import CompareResult, FitResult, Result
-    from ortho_pipeline.files.process_limits import Progress
+    from ortho_pipeline.runtime.process_limits import Progress
 
 #: Exit code of a command that made a part of what was asked for.
 PARTLY_DONE = 3

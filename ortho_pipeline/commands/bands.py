@@ -14,7 +14,7 @@ from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import allowed, states, together, whole_or_nothing, write_json
-from ortho_pipeline.files.locations import archive_of, located, place
+from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_stack import stack_bands
 from ortho_pipeline.imaging.registration import Registration
@@ -77,7 +77,7 @@ def register(
                 "this path would be read and written", file=path, field="folder", remedy="choose another folder"
             )
     # Bands in an archive are those of the archive.
-    read = {archive_of(str(path)) or Path(path): "band" for path in paths}
+    read = {Location(path).archive or Path(path): "band" for path in paths}
     ledger = Ledger(read, states([*paths, opened.model_source]))
     with together(folder, files["image"].stem):
         if beside is not None:

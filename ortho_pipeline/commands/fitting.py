@@ -26,11 +26,11 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report import document as report
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 
 @with_items

@@ -15,7 +15,7 @@ from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
 from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
-from ortho_pipeline.commands.resolved.request import Request, point_options
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import (
     ENDINGS,
     OF_REPORT,
@@ -33,7 +33,6 @@ from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.export import FORMATS, Export, check_formats
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256
-from ortho_pipeline.files.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
@@ -47,6 +46,7 @@ from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.surface import footprint
 
 if TYPE_CHECKING:
@@ -97,8 +97,9 @@ def rectify(
         For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
         written, an old side-car that would attach to the ortho.
     """
+    assert isinstance(points, PointOptions), "with_items makes options of points"
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
-    request = Request(image, scene, point_options(points), surface, match, output)
+    request = Request(image, scene, points, surface, match, output)
     files = outputs(folder, stem, output)
     inputs.check_paths(files, request, overwrite)
     require_heights(surface)

@@ -19,7 +19,6 @@ from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import part_of_outputs, staged, together, write_text
-from ortho_pipeline.files.storage.delivery import address_of, delivered
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.options.texts import Text
@@ -30,6 +29,7 @@ from ortho_pipeline.report.matching import MatchingRecord, matching_record
 from ortho_pipeline.report.notebook import tables
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import refuted
+from ortho_pipeline.stores.delivery import address_of, delivered
 
 SCHEMA_VERSION = 1
 #: How the names of a scene's outputs end, after its stem.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline import plugins
-from ortho_pipeline.commands.heights.surfaces import open_dem
+from ortho_pipeline.commands.heights.surfaces import dem_as_stated
 from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.commands.stac.given import heights_given, with_items
@@ -22,7 +22,6 @@ from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
@@ -34,6 +33,7 @@ from ortho_pipeline.options.texts import counted
 from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
+from ortho_pipeline.stores import kept
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.cells.copernicus import extent_of
@@ -208,7 +208,7 @@ def dem_check(
     """
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
     extent = extent_of(ground_transform(plane, "EPSG:4979")(ground)[:, :2])
-    heights = open_dem(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
+    heights = dem_as_stated(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(

@@ -24,7 +24,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
-from ortho_pipeline.estimation.statistics import chance_of, squared_distances
+from ortho_pipeline.estimation.statistics import chance_of, left_out, rms, squared_distances
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
@@ -53,6 +53,8 @@ _MEDIAN_OF_TWO = 2 * math.log(2)
 REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
 _SCALE_FLOOR = 1e-3
+#: A point with a smaller determinant of its redundancy is not tested.
+_TESTABLE = 1e-6
 #: A point without an image is so far off (px): its square is still a number.
 _FAR = 1e150
 _SUBSETS = 500
@@ -93,6 +95,18 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
             break
         keep = keep | agree
     return keep, reasons
+
+
+def refuse_many(names: Sequence[str], count: int, what: str, source: str, remedy: str) -> None:
+    """Refuse to clean up where so many of `count` contradict that which of them are wrong is a guess."""
+    if len(names) > REJECTED_LIMIT * count:
+        some = ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
+        raise DegeneratePoints(
+            f"{len(names)} of {counted(count, what)} contradict the others ({some}): which of them are wrong cannot be "
+            "decided",
+            file=source or None,
+            remedy=remedy,
+        )
 
 
 def _common(problem: Problem) -> Solution:
@@ -221,11 +235,8 @@ class _Tested(NamedTuple):
 def _against_others(solution: Solution) -> _Tested | None:
     """Test the residual of each point; None where there is too little redundancy."""
     redundancy = solution.redundancy_blocks()
-    standardised = solution.errors.whitened(solution.residuals)
-    good = np.linalg.det(redundancy) > 1e-6
-    squares = np.zeros(len(redundancy))
-    squares[good] = squared_distances(standardised[good], redundancy[good])
-    freedom = solution.freedom - 2
+    apart = left_out(redundancy, solution.errors.whitened(solution.residuals), known=0.0)
+    squares, freedom = np.where(np.linalg.det(redundancy) > _TESTABLE, apart.squares, 0.0), solution.freedom - 2
     if solution.sigma0 is None or freedom < 1:
         return None
     others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
@@ -238,16 +249,9 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
         solution = problem.solve(keep)
     except (DegeneratePoints, TooFewPoints):
         return np.ones(len(keep)), np.zeros(len(keep))
-    miss = problem.image - solution.model.ground_to_image(problem.ground)
-    miss[~np.isfinite(miss).all(axis=1)] = np.inf
-    jacobian = problem.errors.whitened(solution.model.param_partials(problem.ground))
-    jacobian[~np.isfinite(jacobian).all(axis=(1, 2))] = 0.0
-    spread = np.eye(2) + jacobian @ solution.cofactors @ jacobian.transpose(0, 2, 1)
-    standardised = np.clip(problem.errors.whitened(np.clip(miss, -_FAR, _FAR)), -_FAR, _FAR)
-    distance = squared_distances(standardised, spread)
-    freedom = max(solution.freedom, 1.0)
+    apart = _Apart.of(solution, problem)
     scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
-    return chance_of(distance / scale**2, 2, freedom), np.hypot(miss[:, 0], miss[:, 1])
+    return chance_of(apart.squares / scale**2, 2, max(solution.freedom, 1.0)), np.hypot(*apart.miss.T)
 
 
 # -- what is not left out --------------------------------------------------------------------------------------------
@@ -319,43 +323,49 @@ def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> l
 
 
 @dataclass(frozen=True)
-class _Checks:
-    """Check points that have an image: their rows, how far off they are ``(n, 2)`` px, and what that is in sigmas.
+class _Apart:
+    """How far points that took no part in a solution are from it: ``(n, 2)`` px, and in sigmas.
 
     `partials` are those by the parameters in sigmas of the points, `spread` what is expected with a sigma0 of 1.
     """
 
     problem: Problem
     miss: Array
-    standardised: Array
     partials: Array
     spread: Array
+
+    @classmethod
+    def of(cls, solution: Solution, problem: Problem) -> _Apart:
+        """Return it of the points of a problem; those without an image are infinitely far off."""
+        miss = problem.image - solution.model.ground_to_image(problem.ground)
+        miss[~np.isfinite(miss).all(axis=1)] = np.inf
+        partials = np.zeros((len(miss), 2, 0))
+        if len(solution.model.params):
+            partials = problem.errors.whitened(solution.model.param_partials(problem.ground))
+        partials[~np.isfinite(partials).all(axis=(1, 2))] = 0.0
+        return cls(problem, miss, partials, np.eye(2) + partials @ solution.cofactors @ partials.transpose(0, 2, 1))
 
     @property
     def squares(self) -> Array:
         """Squared distances ``(n,)`` in sigmas; 2 in the mean where sigma0 is 1."""
-        return squared_distances(self.standardised, self.spread)
+        white = np.clip(self.problem.errors.whitened(np.clip(self.miss, -_FAR, _FAR)), -_FAR, _FAR)
+        return squared_distances(white, self.spread)
 
     def expected(self, scale: float) -> Array:
         """Root mean square ``(n,)`` px of the distances of good points, where sigma0 squared is `scale`."""
         return np.sqrt(scale * self.problem.errors.mean_square(self.spread))
 
 
-def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array | None) -> _Checks | None:
+def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array | None) -> _Apart | None:
+    """Return how far check points that have an image are off."""
     usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
     if not usable.any():
         return None
-    problem = Problem.of(solution.model, points, usable, {})
-    miss = problem.image - solution.model.ground_to_image(problem.ground)
-    measured = problem.points.groups < 0
+    apart = _Apart.of(solution, Problem.of(solution.model, points, usable, {}))
+    measured = apart.problem.points.groups < 0
     if common is None and measured.sum() >= _OWN_PLACE and (points.groups[used] >= 0).all():
-        miss[measured] -= np.median(miss[measured], axis=0)
-    if len(solution.model.params):
-        partials = problem.errors.whitened(solution.model.param_partials(problem.ground))
-    else:
-        partials = np.zeros((len(miss), 2, 0))
-    spread = np.eye(2) + partials @ solution.cofactors @ partials.transpose(0, 2, 1)
-    return _Checks(problem, miss, problem.errors.whitened(miss), partials, spread)
+        apart.miss[measured] -= np.median(apart.miss[measured], axis=0)
+    return apart
 
 
 def _outlying_checks(
@@ -408,24 +418,24 @@ def checks_apart(
     apart = not shared and measured[used].all() and _together_apart(checks.squares[~off], scale, solution.freedom)
     miss = checks.problem.image - solution.model.ground_to_image(checks.problem.ground)
     sizes = np.hypot(*miss.T)
-    rest = None if off.all() else _rms(sizes[~off])
-    if not apart and not (off.any() and _rms(sizes) > FAR_ABOVE * (_rms(usual) if rest is None else rest)):
+    rest = None if off.all() else rms(sizes[~off])
+    if not apart and not (off.any() and rms(sizes) > FAR_ABOVE * (rms(usual) if rest is None else rest)):
         return []
     if apart:
         off |= sizes > (_ONE_APART * usual if len(ids) > 1 else 0.0)
-        rest = None if off.all() or not off.any() else _rms(sizes[~off])
+        rest = None if off.all() or not off.any() else rms(sizes[~off])
     far = np.lexsort((-sizes, ~off))[: min(_NAMED, int(off.sum()) or 3)]
     beyond = outside_of_hull(points.image[used], checks.problem.image[off])
     without = "" if rest is None else f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
     agree = "check points are wrong, or the model is poor between the control points"
     text = (
-        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}: RMSE {_rms(sizes):.3g} px"
-        f"{'' if len(ids) == 1 else f' over all {len(ids)}'}{without}, where {_rms(usual):.2g} px was to be expected "
+        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}: RMSE {rms(sizes):.3g} px"
+        f"{'' if len(ids) == 1 else f' over all {len(ids)}'}{without}, where {rms(usual):.2g} px was to be expected "
         f"from the control points; {agree if apart or rest is None else 'the others agree with them'}"
     )
     return [
         Notice(
-            "checks-apart", text, count=len(ids), off=int(off.sum()), rmse=_rms(sizes), expected=_rms(usual),
+            "checks-apart", text, count=len(ids), off=int(off.sum()), rmse=rms(sizes), expected=rms(usual),
             points=ids[far].tolist(), rest=rest, alike=are_alike(miss[off]), beyond_control=int(beyond.sum()),
         )
     ]  # fmt: skip
@@ -434,7 +444,7 @@ def checks_apart(
 def are_alike(misses: Array) -> bool:
     """Tell whether several misses ``(n, k)`` are one shift: their scatter about their mean is below half of it."""
     mean = misses.mean(axis=0) if len(misses) else np.zeros(1)
-    return len(misses) > 1 and bool(_rms(np.linalg.norm(misses - mean, axis=1)) < 0.5 * np.linalg.norm(mean))
+    return len(misses) > 1 and bool(rms(np.linalg.norm(misses - mean, axis=1)) < 0.5 * np.linalg.norm(mean))
 
 
 def _together_apart(squares: Array, scale: float, freedom: float) -> bool:
@@ -443,10 +453,6 @@ def _together_apart(squares: Array, scale: float, freedom: float) -> bool:
         return False
     total, size = float(squares.sum()) / scale, 2 * len(squares)
     return total >= size * _APART**2 and bool(chance_of(total, size, max(freedom, 1.0)) <= OUTLYING_RISK)
-
-
-def _rms(sizes: Array) -> float:
-    return float(np.sqrt((sizes**2).mean()))
 
 
 def contradicting(

@@ -19,60 +19,20 @@ import numpy as np
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.choice.recommendation import recommend
+from ortho_pipeline.estimation.choice.row import Row
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
 from ortho_pipeline.estimation.fit import SIGNIFICANCE, Fit, Prior, fit
-from ortho_pipeline.estimation.ground_residuals import rmse_metres
-from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.correction import FREE
 from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 #: What is adjusted over a scene's own model.
 CORRECTIONS = tuple(FREE)
 #: Models whose median error is within this factor of the smallest one have a vote on gross errors.
 _CLEAR_SIGHTED = 2.0
-
-
-@dataclass(frozen=True)
-class Row:
-    """One model of a comparison: its fit, or the reason why there is none."""
-
-    model: str
-    parameters: int
-    minimum_points: int
-    dimensions: int
-    fit: Fit | None = None
-    error: str | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the row of ``ortho compare --json`` (docs/formats.md)."""
-        row: dict[str, Any] = {
-            "model": self.model,
-            "parameters": self.parameters,
-            "minimum_points": self.minimum_points,
-            "dimensions": self.dimensions,
-            "error": self.error,
-        }
-        which = ("control", "check", "loo")
-        if self.fit is None:
-            unknown = ("condition", "redundancy", "sigma0", "fitted_as", "ridge", "effective_parameters")
-            nothing = dict.fromkeys(which)
-            return {**row, "rmse": nothing, "rmse_m": dict(nothing), **dict.fromkeys(unknown), **to_document(())}
-        return {
-            **row,
-            "rmse": self.fit.rmses,
-            "rmse_m": rmse_metres(self.fit),
-            "condition": json_value(float(self.fit.condition)),
-            "redundancy": self.fit.redundancy,
-            "sigma0": self.fit.sigma0,
-            "fitted_as": self.fit.model_name,
-            "ridge": self.fit.ridge,
-            "effective_parameters": json_value(float(self.fit.effective_parameters)),
-            **to_document(self.fit.warnings),
-        }
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import DegeneratePoints, InputError, ModelError
-from ortho_pipeline.estimation.blunders import REJECTED_LIMIT, OutlyingPoint, checks_apart, find_blunders, outlying
+from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.estimation.blunders import OutlyingPoint, checks_apart, find_blunders, outlying, refuse_many
 from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,
     UNSTABLE,
@@ -24,16 +24,17 @@ from ortho_pipeline.estimation.determinacy import (
     uncertain_edge,
     unstable,
 )
-from ortho_pipeline.estimation.problem import Prior, Problem, Solution
+from ortho_pipeline.estimation.observations.prior import Prior
+from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 __all__ = ["Fit", "Prior", "fit", "root_mean_square"]
 
@@ -397,7 +398,10 @@ def _searched(
     if robust and len(problem.model.params):
         keep, reasons = find_blunders(problem, ridge)
         rejected = {int(problem.rows[i]): reason for i, reason in reasons.items()}
-        _refuse_many(points, rejected, len(keep))
+        names = [points.ids[i] for i in sorted(rejected)]
+        refuse_many(
+            names, len(keep), "control point", points.source, "measure these points again, or remove the wrong ones"
+        )
         if ridge is not None:
             problem, strength = regularised(problem, keep, ridge)
     return keep, rejected, problem, strength
@@ -472,14 +476,3 @@ def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list
                 )
             )
     return found
-
-
-def _refuse_many(points: Points, rejected: dict[int, str], count: int) -> None:
-    if len(rejected) > REJECTED_LIMIT * count:
-        names = ", ".join(points.ids[i] for i in sorted(rejected))
-        raise DegeneratePoints(
-            f"{len(rejected)} of {counted(count, 'control point')} contradict the others ({names}): "
-            "which of them are wrong cannot be decided",
-            file=points.source,
-            remedy="measure these points again, or remove the wrong ones",
-        )

@@ -29,125 +29,17 @@ import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
-from ortho_pipeline.geodesy.distortion import map_from_enu
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
+from ortho_pipeline.estimation.observations.prior import Prior
+from ortho_pipeline.estimation.statistics import effective_parameters, left_out, unit_weight
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
-from ortho_pipeline.points.image_errors import says_more
 
 #: A scaled normal matrix beyond this condition is taken as singular: the points do not determine the model.
 CONDITION_LIMIT = 1e6
-#: An error across a direction that is smaller than this part of that along it is rounding.
-_ROUNDING = 1e-14
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A parameter known beforehand: one more observation with this mean and sigma, in the parameter's unit."""
-
-    mean: float
-    sigma: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.mean) and self.sigma > 0):
-            raise InputError(
-                f"a prior has a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
-            )
-
-
-def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prior]:
-    """Return priors that hold parameters at their values in `model`, with these sigmas by name."""
-    values = dict(zip(model.param_names, model.params.tolist(), strict=True))
-    return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class ImageErrors:
-    """A-priori errors of image measurements: Cholesky factors ``(n, 2, 2)`` px of their covariances, lower triangles.
-
-    Whitening is a division by the standard deviations where column and row err independently.
-    """
-
-    factor: Array
-
-    def __getitem__(self, rows: np.ndarray) -> ImageErrors:
-        return ImageErrors(self.factor[rows])
-
-    @classmethod
-    def of(cls, model: SensorModel, points: Points) -> ImageErrors:
-        """Return the errors of points, which are in the CRS of the model, with what those of their ground move.
-
-        Raises
-        ------
-        InputError
-            If a point states no error at all in some direction of the image.
-        """
-        factor = _factors(points.sigma_image, points.covariance_image)
-        known = (points.sigma_ground > 0).any(axis=1)
-        if known.any():
-            ground = points.ground[known]
-            # On the ellipsoid: at heights of people a metre of it is a thousandth longer at most.
-            per_metre = map_from_enu(points.crs, ground * (1.0, 1.0, 0.0))
-            moved = model.ground_partials(ground) @ (per_metre * points.sigma_ground[known][:, None, :])
-            factor[known] = _summed(np.concatenate([factor[known], moved], axis=2))
-        exact = (np.diagonal(factor, axis1=1, axis2=2) <= 0).any(axis=1)
-        if exact.any():
-            name = points.ids[int(np.flatnonzero(exact)[0])]
-            raise InputError(
-                f"the point {name} has no error in some direction of the image", file=points.source or None,
-                field="sigma_image", remedy="give each measurement a positive standard deviation",
-            )  # fmt: skip
-        return cls(factor)
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations ``(n, 2)`` px of column and row."""
-        return np.asarray(np.linalg.norm(self.factor, axis=2))
-
-    @property
-    def covariance(self) -> Array:
-        """Covariances ``(n, 2, 2)`` px^2."""
-        return self.factor @ self.factor.transpose(0, 2, 1)
-
-    def whitened(self, values: Array) -> Array:
-        """Return values ``(n, 2)`` or ``(n, 2, P)`` of px as multiples of independent standard deviations."""
-        factor = self.factor.reshape(-1, 2, 2, *(1,) * (values.ndim - 2))
-        white = np.empty(values.shape)
-        white[:, 0] = values[:, 0] / factor[:, 0, 0]
-        white[:, 1] = (values[:, 1] - factor[:, 1, 0] * white[:, 0]) / factor[:, 1, 1]
-        return white
-
-    def restored(self, white: Array) -> Array:
-        """Return whitened values ``(n, 2)`` in px."""
-        return (self.factor @ white[:, :, None])[:, :, 0]
-
-    def mean_square(self, white: Array) -> Array:
-        """Return the mean square distance ``(n,)`` px^2 of errors whose whitened covariance is ``(n, 2, 2)``."""
-        return np.einsum("nij,njk,nik->n", self.factor, white, self.factor)
-
-
-def _factors(sigma: Array, covariance: Array) -> Array:
-    """Return the Cholesky factors ``(n, 2, 2)`` of covariances; of those without directions `sigma` ``(n,)`` counts."""
-    factor = np.zeros((len(sigma), 2, 2))
-    factor[:, 0, 0] = factor[:, 1, 1] = sigma
-    full = says_more(covariance)
-    factor[full] = np.linalg.cholesky(covariance[full])
-    return factor
-
-
-def _summed(parts: Array) -> Array:
-    """Return the Cholesky factors ``(n, 2, 2)`` of A A^T for each A ``(n, 2, k)``.
-
-    By orthogonalising the rows of A, not from A A^T: where one direction errs far more than the other, as with heights
-    that are hardly known, the difference of squares would be lost to rounding.
-    """
-    column, row = parts[:, 0], parts[:, 1]
-    first = np.linalg.norm(column, axis=1)
-    axis = np.divide(column, first[:, None], out=np.zeros_like(column), where=first[:, None] > 0)
-    along = (row * axis).sum(axis=1)
-    across = np.linalg.norm(row - along[:, None] * axis, axis=1)
-    across[across <= _ROUNDING * np.abs(along)] = 0.0
-    return np.stack([np.stack([first, np.zeros_like(first)], axis=1), np.stack([along, across], axis=1)], axis=1)
+#: A point with less redundancy than this in some direction is indispensable.
+INDISPENSABLE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,33 +79,20 @@ class Solution:
 
         NaN is a point, or a group, that is indispensable.
         """
-        left = self.leave_each_out()
-        shared = [np.flatnonzero(self.groups == group) for group in sorted({*self.groups.tolist()} - {-1})]
-        if shared:
-            left[self.groups >= 0] = self.leave_out(shared)[self.groups >= 0]
+        left, white = self.leave_each_out(), self.errors.whitened(self.residuals)
+        design = self.errors.whitened(self.jacobian)
+        for group in sorted({*self.groups.tolist()} - {-1}):
+            of = self.groups == group
+            rows = design[of].reshape(2 * int(of.sum()), -1)
+            redundancy = np.eye(len(rows)) - rows @ self.cofactors @ rows.T
+            together = left_out(redundancy[None], white[of].reshape(1, -1), known=INDISPENSABLE).whole
+            left[of] = self.errors[of].restored(together.reshape(-1, 2))
         return left
 
     def leave_each_out(self) -> Array:
         """Return residuals ``(n, 2)`` px that each point would have had alone without itself, whatever its group."""
-        left = np.full(self.residuals.shape, np.nan)
-        redundancy, white = self.redundancy_blocks(), self.errors.whitened(self.residuals)
-        good = np.linalg.det(redundancy) > 1e-9
-        solved = np.linalg.solve(redundancy[good], white[good][:, :, None])[:, :, 0]
-        left[good] = self.errors[good].restored(solved)
-        return left
-
-    def leave_out(self, groups: list[np.ndarray]) -> Array:
-        """Return residuals ``(n, 2)`` px that the points of each group would have had, had the group taken no part."""
-        left = np.full(self.residuals.shape, np.nan)
-        count = self.cofactors.shape[0]
-        jacobian, residuals = self.errors.whitened(self.jacobian), self.errors.whitened(self.residuals)
-        for group in groups:
-            rows = jacobian[group].reshape(2 * len(group), count)
-            matrix = np.eye(len(rows)) - rows @ self.cofactors @ rows.T
-            if np.linalg.eigvalsh(matrix)[0] > 1e-9:
-                solved = np.linalg.solve(matrix, residuals[group].ravel())
-                left[group] = self.errors[group].restored(solved.reshape(-1, 2))
-        return left
+        white = self.errors.whitened(self.residuals)
+        return self.errors.restored(left_out(self.redundancy_blocks(), white, known=INDISPENSABLE).whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,13 +163,10 @@ class Problem:
             residuals = residuals - jacobian @ solved.values
             believed = believed - rows @ solved.values
         observed = np.concatenate([errors.whitened(residuals).ravel(), believed[true]])
-        effective = float(count)
-        if not true.all():
-            known = np.vstack([data, rows[true]])
-            effective = float(np.einsum("ij,ij->", known @ solved.cofactors, known))
+        effective = effective_parameters(count, [(rows[~true], solved.cofactors)])
         freedom = len(observed) - effective
-        # Fictitious observations make the count a fraction; less than a whole one tells nothing of weights.
-        sigma0 = math.sqrt(float(observed @ observed) / freedom) if freedom > 1 - 1e-6 else None
+        # Less than a whole observation too many tells nothing of weights.
+        sigma0 = unit_weight(float(observed @ observed), freedom, 1 - 1e-6)
         return Solution(
             model, jacobian, residuals, errors, solved.cofactors, freedom, effective, sigma0, condition,
             self.points.groups[keep],

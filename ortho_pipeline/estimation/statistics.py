@@ -1,18 +1,67 @@
-r"""Statistics of estimated parameters, from their values and covariance.
+r"""Statistics of an adjustment, of one image and of a block: of its observations, and of estimated parameters.
+
+Observations are left out without adjusting again. With the redundancy matrix :math:`I - H` of observations of unit
+weight, and its block :math:`R` of some of them with the misfits :math:`v`, these would be :math:`R^{-1} v` off had they
+taken no part, and :math:`w^2 = v^T R^{-1} v` is their distance from all others in standard deviations. Both are exact
+for models that are linear in their parameters. Directions in which the others tell nothing have no redundancy: nothing
+is known there, and nothing can be tested.
+
+Of estimated parameters, from their values and covariance:
 
 - total correlation of parameter k: :math:`\sqrt{1 - 1 / (C_{kk} (C^{-1})_{kk})}`, its multiple correlation with all
   others; 1 is a parameter whose effect the group of the others can take over;
 - Student test of the hypothesis that the parameter is zero: :math:`t_k = x_k / \sigma_k`, two-sided.
 
-Source: section 3.3 of Bueyueksalih et al. (OrbView-3), after Jacobsen (RAPORIO).
+Source: Baarda 1968 and Cook and Weisberg 1982, section 2.2 (leaving out); section 3.3 of Bueyueksalih et al.
+(OrbView-3), after Jacobsen (RAPORIO).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.geodesy.ellipsoid import Array
+
+
+class LeftOut(NamedTuple):
+    """Parts of k observations each, left out one by one.
+
+    `misfits` ``(n, k)`` are zero along directions in which nothing is known, and NaN where that is so in all; `known`
+    ``(n, k)`` are the others, along the axes of the redundancy. `squares` ``(n,)`` are w squared, of `rank` ``(n,)``
+    degrees of freedom.
+    """
+
+    misfits: Array
+    known: NDArray[np.bool_]
+    squares: Array
+    rank: NDArray[np.int64]
+
+    @property
+    def whole(self) -> Array:
+        """The misfits, NaN where they are not known in all directions."""
+        return np.where(self.known.all(axis=1, keepdims=True), self.misfits, np.nan)
+
+
+def left_out(redundancy: Array, misfits: Array, *, known: float, testable: float | None = None) -> LeftOut:
+    """Return parts with blocks ``(n, k, k)`` of the redundancy matrix, and misfits ``(n, k)``, as if left out.
+
+    Parameters
+    ----------
+    known, testable : float
+        Least redundancy of a direction in which something is known, and in which it is tested; the same by default.
+    """
+    shares, axes = np.linalg.eigh(redundancy)
+    turned = np.einsum("nij,ni->nj", axes, misfits)
+    there, tested = shares > known, shares > (known if testable is None else testable)
+    alone = turned / np.where(there, shares, np.inf)
+    left = np.einsum("nij,nj->ni", axes, alone)
+    left[~there.any(axis=1)] = np.nan
+    return LeftOut(left, there, np.where(tested, turned * alone, 0.0).sum(axis=1), tested.sum(axis=1))
 
 
 def squared_distances(residuals: Array, covariance: Array) -> Array:
@@ -31,6 +80,29 @@ def chance_of(squares: ArrayLike, size: ArrayLike, freedom: ArrayLike) -> Array:
     from scipy.special import fdtrc  # scipy.stats would take most of the start-up of a command
 
     return np.asarray(fdtrc(size, freedom, np.asarray(squares) / size))
+
+
+def rms(sizes: Array) -> float:
+    """Return the root mean square of sizes ``(n,)``; what is not finite is left out, and 0 stands for none."""
+    known = sizes[np.isfinite(sizes)]
+    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
+
+
+def effective_parameters(count: int, fictitious: Iterable[tuple[Array, Array]]) -> float:
+    """Return how many of `count` parameters true observations determine: the trace of their hat matrix.
+
+    `fictitious` are rows ``(k, p)`` of other observations over their sigmas (a regularisation, soft constraints, what
+    holds a datum) and the cofactors ``(p, p)`` of their parameters: what these determine is not unknown.
+    """
+    return count - sum(float(((rows @ cofactors) * rows).sum()) for rows, cofactors in fictitious)
+
+
+def unit_weight(square: float, freedom: float, least: float) -> float | None:
+    """Return the standard error of unit weight of a sum of squares; None for no more than `least` degrees of freedom.
+
+    These are a fraction where some observations are fictitious.
+    """
+    return math.sqrt(square / freedom) if freedom > least else None
 
 
 def correlation_of(covariance: Array) -> Array:

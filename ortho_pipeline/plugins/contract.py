@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import OrthoError, described
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor

@@ -14,7 +14,7 @@ from typing import Any
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed, described
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
-from ortho_pipeline.hookspecs import Format, Scene, Sensor, Study
+from ortho_pipeline.hookspecs import Format, Scene, Sensor
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.plugins.contract import scene_faults
@@ -101,11 +101,6 @@ class Host:
     def formats(self) -> Mapping[str, Format]:
         """The formats that models are written in, by name: those of the host, then those of plugins."""
         return {**FORMATS, **self._registry.formats()}
-
-    @functools.cached_property
-    def studies(self) -> Mapping[str, Study]:
-        """The simulations and experiments by name; collected when they are first asked for."""
-        return self._registry.studies()
 
     def open_image(
         self,

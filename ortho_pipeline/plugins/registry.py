@@ -14,27 +14,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from ortho_pipeline import hookspecs
 from ortho_pipeline.errors import OrthoError, PluginError, described
-from ortho_pipeline.hookspecs import GROUPS, PROJECT_NAME, Format, Sensor, Study, Subcommand
+from ortho_pipeline.hookspecs import Format, Sensor, Subcommand
 
 if TYPE_CHECKING:
     from ortho_pipeline.models import SensorModel
 
 BUNDLED = "ortho-pipeline"
-#: What each hook returns, what it is collected in, and what authors are told who return something else.
-_RETURNS: dict[str, tuple[type, type, str]] = {
-    "ortho_sensors": (Iterable, list, "yield the Sensor, or return [Sensor(...)]"),
-    "ortho_models": (Mapping, dict, "return {kind: class}"),
-    "ortho_formats": (Iterable, list, "yield the Format, or return [Format(...)]"),
-    "ortho_studies": (Iterable, list, "yield the Study, or return [Study(...)]"),
-    "ortho_commands": (Iterable, list, "yield the Subcommand, or return [Subcommand(...)]"),
-}
 _TYPED, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _ENDING = re.compile(r"[._-][A-Za-z0-9._-]*\.?[A-Za-z0-9]+")
 log = logging.getLogger(__name__)
@@ -86,24 +78,29 @@ class Registry:
     ----------
     lenient : bool
         Leave out a plugin that breaks the contract and list it in `broken`, instead of raising.
-    group : str
-        Entry-point group of the plugins, of `hookspecs.GROUPS`.
+    group : str, optional
+        Entry-point group of the plugins, of the ``GROUPS`` of `specs`; its ``PROJECT_NAME`` without it.
     reserved : iterable of str
         Names that belong to the host.
+    specs : module
+        The hooks, as `ortho_pipeline.hookspecs` has them: a package that has hooks of its own names its module.
 
     Attributes
     ----------
     origin : dict of str to Provenance
         Of every plugin, by its name.
     owner : dict of str to str
-        The plugin that a sensor, a model family, a format, a study or a command belongs to.
+        The plugin that a sensor, a model family, a format, a command or another offer belongs to.
     broken : tuple of Broken
     """
 
-    def __init__(self, lenient: bool, group: str = PROJECT_NAME, reserved: Iterable[str] = ()) -> None:
-        self._manager = pluggy.PluginManager(PROJECT_NAME)
-        self._manager.add_hookspecs(hookspecs)
-        self._group = group
+    def __init__(
+        self, lenient: bool, group: str = "", reserved: Iterable[str] = (), specs: ModuleType = hookspecs
+    ) -> None:
+        self._manager = pluggy.PluginManager(specs.PROJECT_NAME)
+        self._manager.add_hookspecs(specs)
+        self._specs = specs
+        self._group = group or specs.PROJECT_NAME
         self._reserved = set(reserved)
         self._lenient = lenient
         self.origin: dict[str, Provenance] = {}
@@ -147,14 +144,14 @@ class Registry:
         """Collect the sensors that plugins offer, by name."""
         from ortho_pipeline.plugins.contract import sensor_faults
 
-        return self._named("ortho_sensors", "sensor", sensor_faults)
+        return self.named("ortho_sensors", "sensor", Sensor, sensor_faults)
 
     def models(self) -> Mapping[str, type[SensorModel]]:
         """Collect the model families that plugins offer, by kind."""
         from ortho_pipeline.models import KINDS, SensorModel
 
         families: dict[str, type[SensorModel]] = {}
-        for plugin, offered in self._returned("ortho_models"):
+        for plugin, offered in self._returned("ortho_models", Mapping, dict, "return {kind: class}"):
             with self._judged(self.origin[plugin]):
                 for name, family in offered.items():
                     if not (isinstance(name, str) and isinstance(family, type) and issubclass(family, SensorModel)):
@@ -176,23 +173,34 @@ class Registry:
 
         self._reserved |= RESERVED
         endings = {one.ending.casefold(): one.name for one in FORMATS.values()}
-        added = self._named("ortho_formats", "format", lambda offer: _format_faults(offer, endings))
+        added = self.named("ortho_formats", "format", Format, lambda offer: _format_faults(offer, endings))
         return {name: replace(one, write=_checked(one, self.owner[name])) for name, one in added.items()}
-
-    def studies(self) -> Mapping[str, Study]:
-        """Collect the studies that plugins offer, by name."""
-        return self._named("ortho_studies", "study", _study_faults)
 
     def commands(self) -> Mapping[str, Subcommand]:
         """Collect the commands that packages add, by name."""
-        return self._named("ortho_commands", "command", _command_faults)
+        return self.named("ortho_commands", "command", Subcommand, _command_faults)
 
-    def _named(self, hook: str, what: str, faults: Callable[[Any], Iterator[str]]) -> Mapping[str, Any]:
-        """Collect what a hook offers, by name; the first fault of an offer is that of its plugin."""
+    def named(
+        self, hook: str, what: str, kind: type[Any], faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
+    ) -> Mapping[str, Any]:
+        """Collect what a hook offers, by name.
+
+        Parameters
+        ----------
+        hook : str
+            It returns an iterable of values of `kind`.
+        what : str
+            What people call such a value.
+        faults : callable(offer) -> iterator of str
+            What is wrong with an offer; the first fault is an error of its plugin.
+        """
         offers: dict[str, Any] = {}
-        for plugin, offered in self._returned(hook):
+        advice = f"yield the {kind.__name__}, or return [{kind.__name__}(...)]"
+        for plugin, offered in self._returned(hook, Iterable, list, advice):
             with self._judged(self.origin[plugin]):
                 for offer in offered:
+                    if not isinstance(offer, kind):
+                        raise PluginError(f"plugin {plugin}: {hook} yields {type(offer).__name__}, not {kind.__name__}")
                     if fault := next(faults(offer), None):
                         raise PluginError(f"plugin {plugin}: {fault}")
                     if offer.name in offers and self.owner[offer.name] == plugin:
@@ -216,16 +224,17 @@ class Registry:
         log.warning("%s", broken)
 
     def _refuse_misspelt(self, plugin: Any, name: str) -> None:
-        hooks = GROUPS[self._group]
+        hooks = self._specs.GROUPS[self._group]
         for hook in hooks:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
                 raise PluginError(
-                    f"plugin {name}: {hook} is not marked with @hookimpl", remedy="write @hookimpl above it"
+                    f"plugin {name}: {hook} is not marked with @hookimpl",
+                    remedy=f"write @hookimpl above it, the one of the hooks of {self._specs.PROJECT_NAME}",
                 )
         for hook in dir(plugin):
             if hook in hooks or self._manager.parse_hookimpl_opts(plugin, hook) is None:
                 continue
-            for group, others in GROUPS.items():
+            for group, others in self._specs.GROUPS.items():
                 if hook in others:
                     raise PluginError(
                         f"plugin {name}: {hook} is not called in plugins of the entry-point group {self._group}",
@@ -234,9 +243,8 @@ class Registry:
             meant = difflib.get_close_matches(hook, hooks, 1) or hooks
             raise PluginError(f"plugin {name}: there is no hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
 
-    def _returned(self, hook: str) -> Iterator[tuple[str, Any]]:
+    def _returned(self, hook: str, wanted: type, collect: type, advice: str) -> Iterator[tuple[str, Any]]:
         # pluggy calls the hook once for each plugin, wrappers around it: so an error can name its plugin.
-        wanted, collect, advice = _RETURNS[hook]
         every = getattr(self._manager.hook, hook).get_hookimpls()
         offering = [one for one in every if not (one.wrapper or one.hookwrapper)]
         for implementation in offering:
@@ -271,16 +279,9 @@ class Registry:
         self.owner[name] = plugin
 
 
-def _study_faults(study: object) -> Iterator[str]:
-    if not isinstance(study, Study):
-        yield f"ortho_studies yields {type(study).__name__}, not Study"
-
-
-def _format_faults(offer: object, endings: dict[str, str]) -> Iterator[str]:
+def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
     """Yield what is wrong with an offered format; `endings` are those that are taken, with the formats' names."""
-    if not isinstance(offer, Format):
-        yield f"ortho_formats yields {type(offer).__name__}, not Format"
-    elif not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
+    if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
         yield f"{offer.name!r} is not a name of a format: lower case, digits and dashes"
     elif not isinstance(offer.title, str) or not offer.title.strip():
         yield f"format {offer.name!r}: its title is empty"
@@ -318,10 +319,7 @@ def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
     return write
 
 
-def _command_faults(command: object) -> Iterator[str]:
-    if not isinstance(command, Subcommand):
-        yield f"ortho_commands yields {type(command).__name__}, not Subcommand"
-        return
+def _command_faults(command: Subcommand) -> Iterator[str]:
     texts = (command.name, command.summary, command.target)
     if not all(isinstance(text, str) for text in texts) or not _TYPED.fullmatch(command.name):
         yield f"{command.name!r} is not a name of a command: lower case, digits and dashes"

@@ -40,7 +40,7 @@ class Candidate(Record):
 
 
 class MatchComponents(Record):
-    """What the covariances of the matches are made of (docs/matching.md)."""
+    """What the covariances of the matches are made of (docs/engineering/matching.md)."""
 
     matching: float
     height_m: float

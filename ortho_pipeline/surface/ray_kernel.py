@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 Array = NDArray[np.float64]
 

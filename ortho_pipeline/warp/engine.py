@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
@@ -34,6 +33,7 @@ from ortho_pipeline.raster.ortho import (
     value_range,
 )
 from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.runtime.process_limits import thread_pool
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpResult

@@ -55,6 +55,8 @@ _FAR = 1000.0
 _NO_PLACE = -1e9
 #: Output pixels whose image points are computed at once.
 _PIECE = 1_000_000
+#: GDAL's warper only makes files.
+tile_maker = None
 
 
 @dataclass(frozen=True)

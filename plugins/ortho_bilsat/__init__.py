@@ -17,7 +17,6 @@ from ortho_pipeline.plugin import (
     Notice,
     Scene,
     Sensor,
-    Study,
     camera_from_platform,
     exterior_sigmas,
     geodetic,
@@ -43,15 +42,6 @@ def ortho_sensors() -> Iterable[Sensor]:
         },
         metadata_beside=survey_of,
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``bilsat``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_bilsat.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

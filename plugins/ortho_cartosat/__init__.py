@@ -18,7 +18,6 @@ from ortho_pipeline.plugin import (
     Scene,
     Sensor,
     SensorModel,
-    Study,
     hookimpl,
     rpc_of_dataset,
     rpc_of_fields,
@@ -58,15 +57,6 @@ def ortho_sensors() -> Iterable[Sensor]:
             },
         },
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``cartosat``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_cartosat.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

@@ -26,7 +26,6 @@ from ortho_pipeline.plugin import (
     Sensor,
     SensorModel,
     Setting,
-    Study,
     Text,
     ground_transform,
     has_rpc,
@@ -63,15 +62,6 @@ def ortho_sensors() -> Iterable[Sensor]:
     """Offer the sensor ``ikonos``."""
     yield Sensor("ikonos", "IKONOS Geo products (po_* with metadata.txt, with or without RPC)", recognises, open_scene,
                  options=OPTIONS)  # fmt: skip
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``ikonos``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_ikonos.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

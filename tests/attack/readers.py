@@ -41,8 +41,6 @@ from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb, write_rpc_txt
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.stac.collection import Collection
-from ortho_pipeline.files.stac.item import read_item as read_stac_item
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.imaging.matching import open_references
 from ortho_pipeline.models import ImageCorrection, SensorModel
@@ -51,7 +49,9 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.stac import acquisition_time
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.stores.stac.collection import Collection
+from ortho_pipeline.stores.stac.item import read_item as read_stac_item
+from ortho_pipeline.surface.dem import open_dem
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _survey(path: Path) -> Any:
 
 
 def _dem(path: Path) -> Any:
-    surface = Surface.open(path, "ellipsoid")
+    surface = open_dem(path, "ellipsoid")
     rows, columns = surface.shape
     part = surface.window(0, 0, min(columns, 40), min(rows, 40))
     return [part[np.isfinite(part)], np.isinf(part).any() * math.inf if np.isinf(part).any() else 0.0]

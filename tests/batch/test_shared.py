@@ -32,8 +32,8 @@ from ortho_pipeline.batch.shared.run import SharedFolder, run_shared, summary_of
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, error_document
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import Objects
 
 gdal.UseExceptions()
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-from ortho_cartosat.truth import StereoPair
+from ortho_studies.cartosat.truth import StereoPair
+from ortho_studies.simulation.scanner import LineScanner
 from scipy.stats import chi2
 
 from ortho_pipeline.block.adjustment import _prepared, adjust
@@ -25,7 +26,7 @@ from ortho_pipeline.block.reliability.standardised_residuals import standardise
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import geocentric
@@ -35,7 +36,6 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.report.notebook.tables import html
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT = 33.35, 37.25
 SIZE = 4000

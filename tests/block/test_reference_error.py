@@ -15,7 +15,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.variances import shared_errors
 from ortho_pipeline.commands.control.block_points import relative_to_reference
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.problem import Prior
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.options import BlockOptions, MatchOptions

@@ -325,7 +325,7 @@ def test_a_folder_that_cannot_be_written_is_said(tiny, tmp_path):
 
 def test_points_without_heights_take_them_from_the_dem(tiny):
     rows = [(name, col, row, lon, lat) for name, col, row, lon, lat, _ in tiny.points(6, noise=0)]
-    heights = ortho_pipeline.Surface.open(tiny.dem, ortho_pipeline.Vertical("ellipsoid")).heights(
+    heights = ortho_pipeline.open_dem(tiny.dem, ortho_pipeline.Vertical("ellipsoid")).heights(
         np.array([row[3:5] for row in rows]), "EPSG:4326"
     )
     ground = np.column_stack([np.array([row[3:5] for row in rows]), heights])

@@ -13,11 +13,13 @@ import pyproj
 import pytest
 from click.testing import CliRunner
 from known_scenes import DEVELOPMENT, KnownScene, known_scene
-from ortho_bilsat import truth as bilsat_scene
-from ortho_cartosat import truth as cartosat_scene
-from ortho_ikonos import truth as ikonos_scene
-from ortho_ikonos.experiment import vendor_rpc
-from ortho_orbview3 import truth as orbview3_scene
+from ortho_studies.bilsat import truth as bilsat_scene
+from ortho_studies.cartosat import truth as cartosat_scene
+from ortho_studies.ikonos import truth as ikonos_scene
+from ortho_studies.ikonos.experiment import vendor_rpc
+from ortho_studies.orbview3 import truth as orbview3_scene
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -25,15 +27,14 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.choice.expected_error import expectation
 from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
-from ortho_pipeline.estimation.comparison import Comparison, Row, available_models, choose_models, compare
+from ortho_pipeline.estimation.choice.row import Row
+from ortho_pipeline.estimation.comparison import Comparison, available_models, choose_models, compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import RPC, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)

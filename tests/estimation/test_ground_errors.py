@@ -11,7 +11,7 @@ import pytest
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.problem import ImageErrors
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points import Points
 

@@ -9,7 +9,8 @@ import pyproj
 import pytest
 
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.problem import ImageErrors, Problem
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
+from ortho_pipeline.estimation.problem import Problem
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points import Points
 

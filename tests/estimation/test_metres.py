@@ -8,7 +8,7 @@ from space import FLOOR, Satellite, axes, between, from_space, to_space
 
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, viewing
-from ortho_pipeline.estimation.problem import ImageErrors
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.points import Points
 
 PLACE = (17.9, 60.0)

@@ -10,6 +10,8 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from scipy.stats import binom
 
 from ortho_pipeline.errors import InputError
@@ -22,8 +24,6 @@ from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 Array = np.ndarray
 SIDE = 10_000.0

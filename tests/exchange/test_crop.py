@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -23,7 +24,6 @@ from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.plugins import open_scene as open_product
 from ortho_pipeline.points.table import Points
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor_model
 
 gdal.UseExceptions()

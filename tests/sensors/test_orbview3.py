@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_orbview3.label import read_label
 from ortho_orbview3.product import read_product
-from ortho_orbview3.simulation import write_product
+from ortho_studies.orbview3.simulation import write_product
 from osgeo import gdal
 
 from ortho_pipeline import commands

@@ -25,9 +25,9 @@ from ortho_pipeline.batch.records import Record
 from ortho_pipeline.batch.shared.leases import Lease, Leases, Lost
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import PART, Conflict, Objects
 from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import PART, Conflict, Objects
 
 XML = 'xmlns="http://doc.s3.amazonaws.com/2006-03-01"'
 

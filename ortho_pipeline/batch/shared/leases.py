@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from ortho_pipeline.batch.records import MAX_BYTES, Record
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import json_text
-from ortho_pipeline.files.storage.objects import Conflict, Objects
+from ortho_pipeline.stores.objects import Conflict, Objects
 
 #: Seconds after which a lease that nobody renews is another's to take; it is renewed four times in that time.
 PATIENCE = 120.0

@@ -1,7 +1,7 @@
 """A run whose outputs go to a folder of objects, by any number of workers at once.
 
 Each worker makes the scenes of its part, then those that nobody has begun, then those whose worker has died. A scene is
-made in a folder of this machine and uploaded, its result last (see `leases`, `files.storage.delivery`).
+made in a folder of this machine and uploaded, its result last (see `leases`, `stores.delivery`).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.leases import PATIENCE, Lease, Leases, Lost
 from ortho_pipeline.errors import InputError, OrthoError, error_document
 from ortho_pipeline.files import json_text
-from ortho_pipeline.files.process_limits import Progress
-from ortho_pipeline.files.storage.delivery import delivered
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.runtime.process_limits import Progress
+from ortho_pipeline.stores.delivery import delivered
+from ortho_pipeline.stores.objects import Objects
 
 _SUMMARY = "run.json"
 #: Seconds between two looks at what the others do.

@@ -48,8 +48,7 @@ class Linear:
         pseudo = problem.pseudo_equations(state)
         misfits = problem.misfits_of(seen.image, state.local, pseudo, ordering, weights)
         ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
-        scale = np.sqrt(weights.ground_weights[rows])[:, None] / problem.ground_sigmas[rows]
-        ground_by_point[rows] = problem.enu[rows] * scale[:, :, None]
+        ground_by_point[rows] = problem.on_points(state.local, rows).partials(weights.ground_weights[rows])
         return cls(problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo)
 
     def _handed_over(self) -> tuple[Array, Array, Array]:
@@ -78,7 +77,8 @@ class Linear:
         rays[used] = points.whitened((points.measured[used] - seen.image) * root[:, None], used)
         by_point[used] = points.whitened(seen.by_point, used)
         by_params[used] = points.whitened(seen.by_params, used)
-        ground = problem.ground_misfits(local, self.ordering, self.weights)
+        ground, grounded = problem.ground_misfits(local, self.ordering, self.weights), self.ordering.grounded
+        ground_by_point[grounded] = problem.on_points(local, grounded).partials(self.weights.ground_weights[grounded])
         return replace(
             self, state=replace(self.state, local=local), by_point=by_point, by_params=by_params,
             ground_by_point=ground_by_point, misfits=replace(self.misfits, rays=rays, ground=ground),

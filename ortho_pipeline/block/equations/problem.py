@@ -15,6 +15,7 @@ from ortho_pipeline.block.equations.unknowns import Columns, Mask, Ordering
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.buffers import Buffers
+from ortho_pipeline.estimation.observations.on_points import OnPoints
 from ortho_pipeline.models.base import Array, SensorModel
 
 #: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.
@@ -234,9 +235,14 @@ class BlockProblem:
     def ground_misfits(self, local: Array, ordering: Ordering, weights: Selection) -> Array:
         """Return the misfits ``(N, 3)`` of known ground with points at `local` ``(N, 3)``."""
         ground, rows = np.zeros((len(self.points), 3)), ordering.grounded
-        apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
-        ground[rows] = apart / self.ground_sigmas[rows] * np.sqrt(weights.ground_weights[rows])[:, None]
+        ground[rows] = self.on_points(local, rows).misfits(weights.ground_weights[rows])
         return ground
+
+    def on_points(self, local: Array, rows: Index) -> OnPoints:
+        """Return what is observed of the places of points `rows` ``(n,)`` by themselves, with points at `local`."""
+        apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
+        apart = np.where(np.isfinite(self.known[rows]), apart, 0.0)
+        return OnPoints(apart, self.enu[rows], self.ground_sigmas[rows])
 
     def pseudo_equations(self, state: State) -> PseudoEquations:
         """Return the equations of priors, datum and the models' constraints at a state."""

@@ -17,6 +17,7 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import meet, predict
 from ortho_pipeline.errors import InputError, NotConverged
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.estimation.statistics import effective_parameters, unit_weight
 from ortho_pipeline.models.base import Array
 
 #: Length of a step at which a minimum counts as reached, over the lengths of misfits and of their sigmas: the minimum
@@ -81,16 +82,14 @@ class Solved:
         """
         linear, ordering, misfits = self.linear, self.linear.ordering, self.linear.misfits
         true = linear.pseudo.true
-        effective = self.problem.size - sum(
-            float(((rows @ self.cofactors.of_image(image)) * rows).sum())
-            for image, rows in linear.pseudo_by_image(~true)
-        )
-        known = int(np.isfinite(self.problem.known[ordering.grounded]).sum())
+        fictitious = [(rows, self.cofactors.of_image(image)) for image, rows in linear.pseudo_by_image(~true)]
+        effective = effective_parameters(self.problem.size, fictitious)
+        known = int(self.problem.on_points(self.state.local, ordering.grounded).observed.sum())
         freedom = ordering.observations + known + int(true.sum()) - (effective + 3 * ordering.points)
         square = sum(float((part**2).sum()) for part in (misfits.rays, misfits.ground))
         square += float((misfits.pseudo[true] ** 2).sum())
-        # The effective number of parameters is a fraction; below half an observation there is no redundancy.
-        return (math.sqrt(square / freedom) if freedom > 0.5 else None), freedom
+        # Below half an observation too many there is no redundancy.
+        return unit_weight(square, freedom, 0.5), freedom
 
     def ground_covariance(self, covariance: Cofactors, factor: float) -> Array:
         """Return that of the points ``(N, 3, 3)``, east, north, up, NaN for those that take no part.

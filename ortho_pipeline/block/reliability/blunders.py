@@ -24,12 +24,11 @@ from ortho_pipeline.block.reliability.standardised_residuals import SCALE_FLOOR,
 from ortho_pipeline.block.reliability.suspects import GrossError, Trusted, judge
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.grid import estimate, reweighed
-from ortho_pipeline.errors import DegeneratePoints
-from ortho_pipeline.estimation.blunders import BLUNDER_RISK, REJECTED_LIMIT
+from ortho_pipeline.estimation.blunders import BLUNDER_RISK, refuse_many
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.estimation.statistics import chance_of
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
+from ortho_pipeline.options.texts import Setting, Text
 
 _ROBUST_ROUNDS, _TEST_ROUNDS = 6, 8
 #: Robust weights that change less than this on average decide no more about who is a suspect.
@@ -213,20 +212,12 @@ def _significant(solved: Solved, tests: StandardisedResiduals, variances: Varian
 
 def _refuse_many(problem: BlockProblem, selection: Selection, rejected: list[int]) -> None:
     """Refuse to clean up where so much contradicts that which part is wrong is a guess."""
-    active = problem.active(selection)
-    control = problem.points.control
-    for what, mask in (("control point", active & control), ("tie and check point", active & ~control)):
-        names = [problem.points.ids[i] for i in rejected if mask[i]]
-        if len(names) > REJECTED_LIMIT * int(mask.sum()):
-            some = ", ".join(names[:10]) + (" ..." if len(names) > 10 else "")
-            raise DegeneratePoints(
-                f"{len(names)} of {counted(int(mask.sum()), what)} contradict the others ({some}): which of "
-                "them are wrong cannot be decided",
-                file=problem.points.source or None,
-                remedy=Text(
-                    "measure these points again, remove the wrong ones, or state sigmas as large as their errors ",
-                    "(sigma_image, sigma_xy, sigma_h; ",
-                    Setting("points.ground_sigma", "XY,H"),
-                    " for ground that states none)",
-                ),
-            )
+    points, active = problem.points, problem.active(selection)
+    remedy = Text(
+        "measure these points again, remove the wrong ones, or state sigmas as large as their errors ",
+        "(sigma_image, sigma_xy, sigma_h; ",
+        Setting("points.ground_sigma", "XY,H"),
+        " for ground that states none)",
+    )
+    for what, mask in (("control point", active & points.control), ("tie and check point", active & ~points.control)):
+        refuse_many([points.ids[i] for i in rejected if mask[i]], int(mask.sum()), what, points.source, remedy)

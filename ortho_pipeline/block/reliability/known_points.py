@@ -21,7 +21,7 @@ from ortho_pipeline.block.reliability.standardised_residuals import standardise_
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.blunders import FAR_ABOVE, are_alike, contradicting
-from ortho_pipeline.estimation.statistics import chance_of
+from ortho_pipeline.estimation.statistics import chance_of, rms
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
 
@@ -123,8 +123,8 @@ def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals:
     tested = points.check & np.isfinite(residuals).any(axis=1)
     off = tested & np.isin(points.ids, names)
     sizes = {"plan": np.hypot(residuals[:, 0], residuals[:, 1]), "height": np.abs(residuals[:, 2])}
-    every = {what: _rms(size[tested]) for what, size in sizes.items()}
-    rest = {what: _rms(size[tested & ~off]) for what, size in sizes.items()}
+    every = {what: rms(size[tested]) for what, size in sizes.items()}
+    rest = {what: rms(size[tested & ~off]) for what, size in sizes.items()}
     spoilt = 2 * off.sum() >= tested.sum() or any(every[what] > FAR_ABOVE * rest[what] for what in sizes)
     if not (names and spoilt):
         return [one.notice() for one in doubts]
@@ -140,11 +140,6 @@ def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals:
     }  # fmt: skip
     others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:_NAMED]]
     return [Notice("checks-apart", text, **fields), *others]
-
-
-def _rms(sizes: Array) -> float:
-    known = sizes[np.isfinite(sizes)]
-    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
 
 
 def _both(rmse: Mapping[str, float]) -> str:

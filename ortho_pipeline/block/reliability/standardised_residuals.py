@@ -13,6 +13,7 @@ import numpy as np
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
+from ortho_pipeline.estimation.statistics import left_out
 from ortho_pipeline.models.base import Array
 
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
@@ -59,26 +60,22 @@ def standardise(solved: Solved) -> StandardisedResiduals:
     of_rays, of_ground = solved.points.hats(solved.cofactors)
     rays, ray_rank = np.zeros(len(of_rays)), np.zeros(len(of_rays), dtype=np.int64)
     point_kernel.squares(linear.ordering.rays, of_rays, linear.misfits.rays, _TESTABLE, rays, ray_rank)
-    ground, ground_rank = _standardised(linear.ordering.grounded, of_ground, linear.misfits.ground)
+    ground, ground_rank = _of_ground(solved, of_ground)
     return StandardisedResiduals(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
 
 
 def standardise_ground(solved: Solved) -> tuple[Array, Index]:
     """Return squared standardised residuals ``(N,)`` of known ground alone, and their degrees of freedom."""
-    hats = solved.points.hats(solved.cofactors)[1]
-    return _standardised(solved.linear.ordering.grounded, hats, solved.linear.misfits.ground)
+    return _of_ground(solved, solved.points.hats(solved.cofactors)[1])
 
 
-def _standardised(used: Index, hats: Array, misfits: Array) -> tuple[Array, Index]:
-    """Return squared standardised residuals ``(n,)`` of parts with a hat matrix, and their degrees of freedom.
+def _of_ground(solved: Solved, hats: Array) -> tuple[Array, Index]:
+    """Return those of ground with a hat matrix; zero where none takes part.
 
-    Zero for parts that are not `used`. Misfits are those that are left after a step; the rows themselves have those
-    that it was taken from.
+    Misfits are those that are left after a step; the rows themselves have those that it was taken from.
     """
+    used = solved.linear.ordering.grounded
     squares, rank = np.zeros(len(hats)), np.zeros(len(hats), dtype=np.int64)
-    redundancy, axes = np.linalg.eigh(np.eye(hats.shape[1]) - hats[used])
-    turned = np.einsum("nij,ni->nj", axes, misfits[used])
-    testable = redundancy > _TESTABLE
-    squares[used] = np.where(testable, turned**2 / np.where(testable, redundancy, 1.0), 0.0).sum(axis=1)
-    rank[used] = testable.sum(axis=1)
+    found = left_out(np.eye(3) - hats[used], solved.linear.misfits.ground[used], known=_TESTABLE)
+    squares[used], rank[used] = found.squares, found.rank
     return squares, rank

@@ -137,7 +137,7 @@ class _Suspects:
     """The rows of points of a chunk ``(n, m)``; their parts are their rays, and their ground if that is known."""
 
     def __init__(self, chunk: Chunk, linear: Linear, cofactors: Cofactors) -> None:
-        self.problem, self.chunk = linear.problem, chunk
+        self.problem, self.chunk, self.local = linear.problem, chunk, linear.state.local
         count, k = chunk.rays.shape
         self.design = linear.by_point[chunk.rays].reshape(count, 2 * k, 3)
         self.misfit = linear.misfits.rays[chunk.rays].reshape(count, 2 * k)
@@ -173,7 +173,7 @@ class _Suspects:
 
         None where parallel rays put it nowhere.
         """
-        sigmas = self.problem.ground_sigmas[self.chunk.points[k]]
+        sigmas = self._sigmas(self.chunk.points[[k]])[0]
         axes = tuple(np.flatnonzero(np.isfinite(sigmas)).tolist())
         known = self.parts[_GROUND][list(axes)]
         rays = self._all_but(_GROUND)
@@ -186,6 +186,10 @@ class _Suspects:
         place = inverse @ design.T @ weights @ self.misfit[k, rays]
         turned = self.design[k, known] * sigma[:, None]
         return sigma * self.misfit[k, known] - turned @ place, turned @ inverse @ turned.T, axes
+
+    def _sigmas(self, points: Index) -> Array:
+        """Return those ``(n, 3)`` of the ground of some points."""
+        return self.problem.on_points(self.local, points).sigmas
 
     def _all_but(self, without: int | None) -> np.ndarray:
         return np.concatenate([part for name, part in self.parts.items() if name != without])
@@ -203,7 +207,7 @@ class _Suspects:
             return np.asarray(np.abs(missed).reshape(len(of), -1).max(axis=1))
         apart = apart[:, self.parts[culprit]]
         if culprit == _GROUND:
-            sigmas = self.problem.ground_sigmas[chunk.points[of]]
+            sigmas = self._sigmas(chunk.points[of])
             known = np.isfinite(sigmas)
             return np.asarray(np.linalg.norm(np.where(known, apart * np.where(known, sigmas, 0.0), 0.0), axis=1))
         return np.asarray(np.linalg.norm(points.in_pixels(apart, chunk.rays[of, culprit]), axis=1))

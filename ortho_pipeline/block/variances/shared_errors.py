@@ -21,10 +21,9 @@ from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.spatial.shared_errors import (
     MATCHED_ALIKE,
-    NOT_KNOWN,
-    Neighbours,
     SharedErrors,
     positive_part,
+    shared_by,
 )
 from ortho_pipeline.models.base import Array
 
@@ -54,6 +53,8 @@ class SharedByImage:
         common : CommonError, optional
             What known ground has in common, as it was settled: its estimate errs with these measurements, too.
         """
+        from scipy.linalg import block_diag
+
         problem, sigma0 = solved.problem, solved.unit_weight()[0]
         points = problem.points
         if sigma0 is None or points.groups is None or problem.size > MOST_PARAMETERS:
@@ -77,7 +78,7 @@ class SharedByImage:
             inners.append(inner)
         if not images:
             return None
-        return cls(images, np.hstack(roots), _blocks(inners))
+        return cls(images, np.hstack(roots), block_diag(*inners))
 
     def added(self, covariance: Cofactors) -> Cofactors:
         """Return a covariance of the parameters with it."""
@@ -102,32 +103,15 @@ def _estimated(solved: Solved, rays: Index, design: Array, variance: float) -> t
 
     Sigma contains what all of them err alike.
     """
-    points, count, size = solved.problem.points, len(rays), design.shape[2]
-    groups = len(np.unique(points.grouped[rays]))
+    points, size = solved.problem.points, design.shape[2]
     sigmas = points.sigma_image[rays, None, None]
-    shift = points.whitened(np.broadcast_to(np.eye(2), (count, 2, 2)) / sigmas, rays)
-    whole = np.concatenate([design, shift], axis=2)
-    scene = Neighbours.of(points.measured[rays], solved.linear.misfits.rays[rays], whole)
-    flat, left = design.reshape(2 * count, size), shift.reshape(2 * count, 2)
-    moved = MATCHED_ALIKE * flat.T @ left
-    if scene is None:
-        # All that is known is who shares: a group is one point.
-        own = (count / groups - 1.0) * variance * flat.T @ flat
-        return SharedErrors(points=count, groups=groups, effective_points=groups, **NOT_KNOWN), own + moved @ moved.T
-    middle, likely = scene.middle(variance)
-    normal = variance * left.T @ left
-    grown = normal + positive_part(middle[size:, size:], left)
-    # Of a shift alone: the covariance is N^-1 (N + excess) N^-1.
-    inverse = np.linalg.inv(left.T @ left)
-    ratio = np.trace(inverse @ normal @ inverse) / np.trace(inverse @ grown @ inverse)
-    own = positive_part(middle[:size, :size], flat)
-    return SharedErrors(points=count, groups=groups, effective_points=count * ratio, **likely), own + moved @ moved.T
-
-
-def _blocks(parts: list[Array]) -> Array:
-    """Return the matrix with these blocks on its diagonal."""
-    ends = np.cumsum([0, *map(len, parts)])
-    found = np.zeros((ends[-1], ends[-1]))
-    for begin, end, part in zip(ends, ends[1:], parts, strict=False):
-        found[begin:end, begin:end] = part
-    return found
+    shift = points.whitened(np.broadcast_to(np.eye(2), (len(rays), 2, 2)) / sigmas, rays)
+    residuals = solved.linear.misfits.rays[rays]
+    found, excess = shared_by(points.measured[rays], residuals, design, points.grouped[rays], shift, shift, variance)
+    flat = design.reshape(-1, size)
+    moved = MATCHED_ALIKE * flat.T @ shift.reshape(-1, 2)
+    if excess is None:
+        own = (found.points / found.groups - 1.0) * variance * flat.T @ flat
+    else:
+        own = positive_part(excess, flat)
+    return found, own + moved @ moved.T

@@ -16,7 +16,6 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
@@ -27,6 +26,7 @@ from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.report.matching import MatchComponents
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
 

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import metre_partials
-from ortho_pipeline.estimation.problem import ImageErrors
+from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.models.base import Array
 
 #: Criteria that are larger than the smallest one by this contradict the model.

@@ -9,25 +9,22 @@ the errors at all points that took no part: check points, and control points eac
 3. Of the models within 2 % of the smallest expected error, the one with the fewest parameters.
 
 The smallest error at the points would be that of a model that is best by chance: there are some twenty candidates, and
-those with nearly as many parameters as observations vary most. docs/accuracy.md has what the choice costs.
+those with nearly as many parameters as observations vary most. docs/engineering/accuracy.md has what the choice costs.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
+from ortho_pipeline.estimation.choice.row import Row
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
-
-if TYPE_CHECKING:
-    from ortho_pipeline.estimation.comparison import Row
 
 #: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
 _SIGNIFICANTLY_WORSE = 0.05

@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
 from ortho_pipeline.estimation.problem import Problem, Solution
-from ortho_pipeline.estimation.spatial.common_unknown import CommonUnknown
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel, solve_2x2

@@ -83,7 +83,7 @@ class CovarianceFunction(Record):
 
 
 class Covariance(Record):
-    """Covariance analysis of residuals on the ground, per axis (x, y); docs/accuracy.md says what each number is."""
+    """Covariance analysis of residuals on the ground, per axis (x, y); see docs/engineering/accuracy.md."""
 
     # Pairs of numbers are per axis, in the unit of the residuals. Relative and correlation are those of pairs closer
     # than near_m, None where there is none; functions are None for an axis without a covariance that falls with

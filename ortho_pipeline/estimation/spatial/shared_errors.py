@@ -16,9 +16,9 @@ Beforehand families count alike, and ranges and ratios by their logarithms, beca
 known; but residuals show a part of the variance :math:`\sigma_n^2 + \sigma_s^2`, and each part from none to all is as
 likely as any other: else smooth functions of enormous variance, of which a fit leaves hardly anything, dominate.
 No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
-is right in the mean over scenes of all these kinds; it is not right for each kind alone (docs/accuracy.md). A constant
-part cannot be told from the shift: residuals do not show it at all. What matching itself adds of that kind is known
-(`MATCHED_ALIKE`), and the covariance has it.
+is right in the mean over scenes of all these kinds; it is not right for each kind alone
+(docs/engineering/accuracy.md). A constant part cannot be told from the shift: residuals do not show it at all. What
+matching itself adds of that kind is known (`MATCHED_ALIKE`), and the covariance has it.
 
 Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6;
 Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is likely).
@@ -67,7 +67,7 @@ NOT_KNOWN: dict[str, Any] = {"noise": None, "shared": None, "range_px": None}
 
 
 class SharedErrors(Record):
-    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
+    """Errors that neighbouring points share, in units of stated sigmas; see docs/engineering/accuracy.md."""
 
     # Of two axes, the first with the larger shared part: means over what is likely, None where the points are too few.
     # The range is the distance at which 1/e of the covariance is left. As many independent points as are effective
@@ -106,27 +106,52 @@ def shared_errors(
     own, usual = design @ solution.cofactors, variance * solution.cofactors
     if common is not None:
         own, usual = common.influence(solution)[rows], variance * common.cofactors(solution)
-    groups = len(np.unique(solution.groups[rows]))
     sigma = np.full(len(rows), MATCHED_ALIKE) if sigma_alike is None else np.maximum(sigma_alike[rows], MATCHED_ALIKE)
     alike = np.einsum("n,nip,nik->pk", sigma, own, shift[rows])
-    scene = Neighbours.of(image[rows], residuals, np.concatenate([design, own, shift[rows]], axis=2))
+    parts = np.concatenate([design, own], axis=2)
+    found, excess = shared_by(image[rows], residuals, parts, solution.groups[rows], shift, shift[rows], variance)
+    if excess is None:
+        covariance = usual * max(found.points / found.groups, 1.0)
+    else:
+        count = design.shape[2]
+        covariance = usual + positive_part(excess[count:, count:], _root(usual))
+    return found, covariance + alike @ alike.T
+
+
+def shared_by(
+    image: Array,
+    residuals: Array,
+    design: Array,
+    groups: np.ndarray,
+    shift: Array,
+    own_shift: Array,
+    variance: float,
+) -> tuple[SharedErrors, Array | None]:
+    """Return what points with groups share, and the excess of A' Sigma A over independent errors of `variance`.
+
+    The excess is None where they are too few: all that is known then is who shares, and a group is one point.
+
+    Parameters
+    ----------
+    image, residuals, groups : (n, 2), (n, 2), (n,)
+        Of these points, px, and whitened.
+    design : (n, 2, K)
+        The whole whitened design A, by which residuals are explained.
+    shift, own_shift : (N, 2, 2), (n, 2, 2)
+        A shift of the image in whitened observations, of all points and of these: those on their own count as they are.
+    """
+    count, number = len(image), len(np.unique(groups))
+    scene = Neighbours.of(image, residuals, np.concatenate([design, own_shift], axis=2))
     if scene is None:
-        # All that is known is who shares: a group is one point.
-        effective = float(len(solution.groups) - len(rows) + groups)
-        found = SharedErrors(points=len(rows), groups=groups, effective_points=effective, **NOT_KNOWN)
-        return found, usual * max(len(rows) / groups, 1.0) + alike @ alike.T
+        effective = float(len(shift) - count + number)
+        return SharedErrors(points=count, groups=number, effective_points=effective, **NOT_KNOWN), None
     middle, likely = scene.middle(variance)
-    count = design.shape[2]
-    covariance = usual + positive_part(middle[count : 2 * count, count : 2 * count], _root(usual))
-    # The same for a shift alone, of all points: those on their own count as they are.
-    normal = np.einsum("nij,nik->jk", shift, shift)
-    inverse = np.linalg.inv(normal)
-    total = variance * inverse
-    grown = total + positive_part(inverse @ middle[2 * count :, 2 * count :] @ inverse, _root(total))
-    effective = len(solution.groups) * float(np.trace(total) / np.trace(grown))
-    return SharedErrors(
-        points=len(rows), groups=groups, effective_points=effective, **likely
-    ), covariance + alike @ alike.T
+    # Of a shift alone the covariance is N^-1 (N + excess) N^-1.
+    left = shift.reshape(-1, 2)
+    inverse, more = np.linalg.inv(left.T @ left), positive_part(middle[-2:, -2:], left)
+    usual = variance * float(np.trace(inverse))
+    effective = len(shift) * usual / (usual + float(np.trace(inverse @ more @ inverse)))
+    return SharedErrors(points=count, groups=number, effective_points=effective, **likely), middle[:-2, :-2]
 
 
 def positive_part(excess: Array, design: Array) -> Array:

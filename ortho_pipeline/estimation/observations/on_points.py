@@ -1,0 +1,51 @@
+"""Observations of the places of points by themselves, beside their rays: known ground, and what else is known of them.
+
+There is one form of all of them, which is all that the solver, the sigmas and the search for gross errors see: along
+three axes of each point, how far what was observed is from where the point is, and with what sigma.
+
+- Known ground has the axes east, north and up. Of ground without a known height nothing is observed along the third.
+- A height of a surface would be observed along the normal of its tangent plane at the point's present place.
+
+A further type gives its apart, axes and sigmas for its points in `block.equations.problem.BlockProblem.on_points`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_pipeline.models.base import Array
+
+
+@dataclass(frozen=True, eq=False)
+class OnPoints:
+    """Observations of the places of n points.
+
+    Parameters
+    ----------
+    apart : ndarray (n, 3)
+        Observed minus present place, metres along the axes; 0 where nothing is observed.
+    axes : ndarray (n, 3, 3)
+        Rotations from the frame to the axes.
+    sigmas : ndarray (n, 3)
+        Standard deviations in metres; infinite along axes of which nothing is observed.
+    """
+
+    apart: Array
+    axes: Array
+    sigmas: Array
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """Along which axes ``(n, 3)`` something is observed: each is one equation."""
+        return np.isfinite(self.sigmas)
+
+    def misfits(self, weights: Array) -> Array:
+        """Return the misfits ``(n, 3)`` over their sigmas, with weights ``(n,)``."""
+        return self.apart / self.sigmas * np.sqrt(weights)[:, None]
+
+    def partials(self, weights: Array) -> Array:
+        """Return the derivatives ``(n, 3, 3)`` of what is predicted by the place in the frame, over the sigmas."""
+        return self.axes * (np.sqrt(weights)[:, None] / self.sigmas)[:, :, None]
