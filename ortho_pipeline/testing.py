@@ -129,7 +129,7 @@ def _assert_none(faults: Iterator[str]) -> None:
 
 def _check_foreign(sensor: Sensor) -> None:
     """Check that a sensor leaves datasets alone that nobody can take for its own."""
-    from ortho_pipeline.raster.source import gdal
+    from osgeo import gdal
 
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "foreign.tif"))

@@ -90,6 +90,7 @@ GDAL_MODULES = {
     "raster.ortho",
     "raster.regridded",
     "surface.dem_file",
+    "testing",
 }
 GDAL_MODULES |= {
     "surface.writing",
