@@ -227,9 +227,10 @@ class Registry:
         hooks = self._specs.GROUPS[self._group]
         for hook in hooks:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
+                marker = "ortho_pipeline.plugin" if self._specs is hookspecs else self._specs.__name__
                 raise PluginError(
                     f"plugin {name}: {hook} is not marked with @hookimpl",
-                    remedy=f"write @hookimpl above it, the one of the hooks of {self._specs.PROJECT_NAME}",
+                    remedy=f"write @hookimpl of {marker} above it",
                 )
         for hook in dir(plugin):
             if hook in hooks or self._manager.parse_hookimpl_opts(plugin, hook) is None:
