@@ -38,7 +38,7 @@ hookspecs
 raster
 surface
 exchange
-plugins
+host
 testing
 imaging
 block

@@ -142,7 +142,7 @@ class Registry:
 
     def sensors(self) -> Mapping[str, Sensor]:
         """Collect the sensors that plugins offer, by name."""
-        from ortho_pipeline.plugins.contract import sensor_faults
+        from ortho_pipeline.host.contract import sensor_faults
 
         return self.named("ortho_sensors", "sensor", Sensor, sensor_faults)
 
