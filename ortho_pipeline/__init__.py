@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene as Scene
     from ortho_pipeline.hookspecs import Sensor as Sensor
     from ortho_pipeline.hookspecs import hookimpl as hookimpl
+    from ortho_pipeline.host import open_scene as open_scene
     from ortho_pipeline.models import RPC as RPC
     from ortho_pipeline.models import ImageCorrection as ImageCorrection
     from ortho_pipeline.models import SensorModel as SensorModel
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.options import PointOptions as PointOptions
     from ortho_pipeline.options import SceneOptions as SceneOptions
     from ortho_pipeline.options import SurfaceOptions as SurfaceOptions
-    from ortho_pipeline.plugins import open_scene as open_scene
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
     from ortho_pipeline.points import write_points as write_points
@@ -90,7 +90,7 @@ _HOMES = {
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
     "open_dem": "surface.dem",
-    "open_scene": "plugins",
+    "open_scene": "host",
     "ortho_array": "commands.arrays.lazy",
     "plot": "report.notebook.charts",
     "read_block_points": "block.point_files",

@@ -80,7 +80,7 @@ class OrthoError(Exception):
         text = f"{where}: {self.message}" if where else self.message
         return f"{text}\n  Remedy: {self.remedy}" if self.remedy else text
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         # Keyword-only arguments do not survive the default pickling, and errors cross process borders in batch runs.
         return _rebuild, (type(self), self.message, self.file, self.field, self.remedy)
 
@@ -130,7 +130,9 @@ def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]],
     return decorate
 
 
-def _rebuild(kind, message, file, field, remedy):
+def _rebuild(
+    kind: type[OrthoError], message: str, file: str | None, field: str | None, remedy: str | None
+) -> OrthoError:
     return kind(message, file=file, field=field, remedy=remedy)
 
 

@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Sensor as Sensor
     from ortho_pipeline.hookspecs import Subcommand as Subcommand
     from ortho_pipeline.hookspecs import hookimpl as hookimpl
+    from ortho_pipeline.host import open_scene as open_scene
     from ortho_pipeline.models import RPC as RPC
     from ortho_pipeline.models import ImageCorrection as ImageCorrection
     from ortho_pipeline.models import MapPlane as MapPlane
@@ -119,7 +120,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.options.texts import Setting as Setting
     from ortho_pipeline.options.texts import Text as Text
     from ortho_pipeline.options.texts import counted as counted
-    from ortho_pipeline.plugins import open_scene as open_scene
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
     from ortho_pipeline.points import write_points as write_points
@@ -277,7 +277,7 @@ _NAMES = {
         "Text",
         "counted",
     ),
-    "plugins": ("open_scene",),
+    "host": ("open_scene",),
     "points": (
         "Points",
         "read_points",

@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 import typing
 from importlib.resources import files
 from pathlib import Path
@@ -45,6 +46,16 @@ def test_lazy_names_are_those_that_checkers_know(door) -> None:
     assert set(door.__all__) == set(homes)
     for name in door.__all__:
         assert getattr(door, name) is not None
+
+
+def test_all_modules_of_public_names_are_typed_strictly() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["mypy"]["overrides"]
+    (strict,) = (set(one["module"]) for one in settings if one.get("disallow_untyped_defs"))
+    homes = {f"ortho_pipeline.{home}" for door in (op, plugin) for home in door._HOMES.values()}
+    homes |= {getattr(getattr(op, name), "__module__", "") for name in op.__all__}
+    homes |= {getattr(getattr(plugin, name), "__module__", "") for name in plugin.__all__}
+    homes = {name for name in homes if name.startswith("ortho_pipeline")} - {"ortho_pipeline.commands.arrays.lazy"}
+    assert homes | {"ortho_pipeline", "ortho_pipeline.plugin", "ortho_pipeline.testing"} == strict
 
 
 def test_what_declares_a_command_loads_no_more_than_the_hooks() -> None:

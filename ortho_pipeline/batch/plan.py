@@ -15,7 +15,7 @@ from typing import Any
 
 import pyproj
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
 from ortho_pipeline.batch.places import Place, Places
 from ortho_pipeline.commands.heights.automatic import AUTO
@@ -164,7 +164,7 @@ def versions() -> dict[str, Any]:
         **{name: metadata.version(name) for name in packages},
         "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
         "proj": pyproj.proj_version_str,
-        "plugins": sorted(f"{one.plugin} ({one})" for one in plugins.Host.discover().plugins()),
+        "plugins": sorted(f"{one.plugin} ({one})" for one in host.Host.discover().plugins()),
     }
 
 

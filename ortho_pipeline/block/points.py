@@ -164,17 +164,17 @@ class BlockPoints:
     @property
     def control(self) -> NDArray[np.bool_]:
         """Which points are control ``(N,)``."""
-        return self.roles == "control"
+        return np.asarray(self.roles == "control")
 
     @property
     def check(self) -> NDArray[np.bool_]:
         """Which points are check points ``(N,)``."""
-        return self.roles == "check"
+        return np.asarray(self.roles == "check")
 
     @property
     def tie(self) -> NDArray[np.bool_]:
         """Which points are tie points ``(N,)``."""
-        return self.roles == "tie"
+        return np.asarray(self.roles == "tie")
 
     @property
     def rays(self) -> int:

@@ -43,7 +43,7 @@ def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
-class _Nodata(click.ParamType):
+class _Nodata(click.ParamType):  # type: ignore[type-arg]
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
@@ -132,12 +132,12 @@ def _typed(option: Option) -> dict[str, Any]:
     }.get(option.kind, {})
 
 
-class _Integers(click.ParamType):
+class _Integers(click.ParamType):  # type: ignore[type-arg]
     """Whole numbers with commas between, each within the range of a type."""
 
     name = "integers"
 
-    def __init__(self, each: click.ParamType) -> None:
+    def __init__(self, each: click.ParamType) -> None:  # type: ignore[type-arg]
         self._each = each
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:

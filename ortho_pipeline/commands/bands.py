@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import Result, to_store
@@ -96,7 +96,7 @@ def register(
 
 
 def _metadata_beside(scene: Scene, image: Path) -> Path | None:
-    sensor = plugins.Host.discover().sensors.get(scene.sensor)
+    sensor = host.Host.discover().sensors.get(scene.sensor)
     if sensor is None or sensor.metadata_beside is None or not place(scene.model_source).is_file():
         return None
     return sensor.metadata_beside(str(image))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.block.adjustment import adjust as adjust_block
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import Intersection
@@ -168,7 +168,7 @@ def intersect(
     _check_paths(files, images, points, scenes, *models)
     table, notes = read_points(images, labels, points, scenes[0].allow_network)
     if models:
-        plugins.Host.discover()  # model families of plugins, which a file may name
+        host.Host.discover()  # model families of plugins, which a file may name
         files_of = dict(zip(labels, models, strict=True))
         chosen = {
             label: read_model_file(located(path, allow_network=scenes[0].allow_network)).model

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.commands.heights.surfaces import dem_as_stated
 from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
@@ -26,11 +26,11 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.host.unread import unread
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
 from ortho_pipeline.stores import kept
@@ -41,23 +41,27 @@ from ortho_pipeline.surface.cells.copernicus import extent_of
 
 def sensors() -> dict[str, Any]:
     """List the installed sensors, where each comes from, and the plugins that are broken."""
-    host = plugins.Host.discover()
+    plugins = host.Host.discover()
     listed = [
         {
             "name": sensor.name,
             "description": sensor.description,
             "options": dict(sensor.options),
-            "distribution": host.provenance(name).distribution,
-            "version": host.provenance(name).version,
+            "distribution": plugins.provenance(name).distribution,
+            "version": plugins.provenance(name).version,
         }
-        for name, sensor in host.sensors.items()
+        for name, sensor in plugins.sensors.items()
     ]
-    return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": [entry.to_json() for entry in host.broken]}
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "sensors": listed,
+        "broken": [entry.to_json() for entry in plugins.broken],
+    }
 
 
 def formats() -> dict[str, str]:
     """Return the formats that models are written in, by name, each with its title; broken plugins are left out."""
-    return {name: one.title for name, one in plugins.Host(installed=True, lenient=True).formats.items()}
+    return {name: one.title for name, one in host.Host(installed=True, lenient=True).formats.items()}
 
 
 @with_items
@@ -228,7 +232,7 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
     those that are missing are fetched from PROJ's store before.
     """
     fetched = fetch_missing() if fetch_grids else []
-    host = plugins.Host(installed=True, lenient=True)
+    plugins = host.Host(installed=True, lenient=True)
     packages = ("ortho-pipeline", "numpy", "scipy", "numba", "pyproj", "click", "pluggy")
     allowed = [name for name in raster.DRIVERS if raster.gdal.GetDriverByName(name) is not None]
     return {
@@ -243,10 +247,10 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
         "proj": proj_info(),
         "grids": grids(),
         "fetched": fetched,
-        "plugins": [entry.to_json() for entry in host.plugins()],
-        "sensors": list(host.sensors),
-        "formats": list(host.formats),
-        "broken": [entry.to_json() for entry in host.broken],
+        "plugins": [entry.to_json() for entry in plugins.plugins()],
+        "sensors": list(plugins.sensors),
+        "formats": list(plugins.formats),
+        "broken": [entry.to_json() for entry in plugins.broken],
         "cpus": os.cpu_count(),
     }
 

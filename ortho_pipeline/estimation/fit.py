@@ -183,7 +183,7 @@ class Fit:
     def image_sigma(self, ground: Array) -> Array:
         """Return the standard deviation ``(N, 2)`` of predicted image points that comes from the parameters."""
         partials = self.model.param_partials(ground)
-        return np.sqrt(((partials @ self.covariance) * partials).sum(axis=2))
+        return np.asarray(np.sqrt(((partials @ self.covariance) * partials).sum(axis=2)))
 
     def statistics(self) -> dict[str, Any]:
         """Return the section ``statistics`` of the document: what is not finite is null."""

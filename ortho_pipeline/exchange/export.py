@@ -25,6 +25,7 @@ from ortho_pipeline.hookspecs import Format
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.flat import FlatSurface
 
 
 def check_formats(names: Sequence[str], known: Mapping[str, Format]) -> tuple[Format, ...]:
@@ -132,7 +133,7 @@ def _write_geolocation(export: Export, path: Path) -> None:
 
 
 def _where(export: Export) -> str:
-    surface = export.surface or Surface.constant(export.model.reference_height)
+    surface = export.surface or FlatSurface(export.model.reference_height)
     return f" {surface.describe()}"
 
 

@@ -162,7 +162,7 @@ def orbital_from_ecef(position: Array, velocity: Array) -> Array:
 def rotation_between(from_vectors: Array, to_vectors: Array) -> Array:
     """Return the rotation ``(3, 3)`` that best turns vectors ``(N, 3)`` into others, by least squares (Kabsch)."""
     u, _, vt = np.linalg.svd(to_vectors.T @ from_vectors)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 def _sin_cos(angle: float) -> tuple[float, float]:

@@ -114,7 +114,7 @@ class SensorModel(ABC):
         Here the corners of `domain`; a model that knows the frame of its image gives the corners of that.
         """
         centre, half = self.domain
-        return centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        return np.asarray(centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3))))
 
     @property
     def detail(self) -> float:

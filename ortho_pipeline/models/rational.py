@@ -363,7 +363,7 @@ class Rational(SensorModel):
         sums = self._table @ terms  # type: ignore[attr-defined]
         with np.errstate(invalid="ignore"):
             sums[:, ~(sums[2:] > _POLE).all(axis=0)] = np.nan
-        return sums
+        return np.asarray(sums)
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)
@@ -380,7 +380,7 @@ class Rational(SensorModel):
         partials = np.moveaxis((by_axis[:, :2] - ratios * by_axis[:, 2:]) / sums[2:], (0, 1, 2), (2, 1, 0))
         partials = partials * self.image_scale[:, None] / self.ground_scale
         partials[~np.isfinite(normalised).all(axis=1)] = np.nan
-        return partials if slopes is None else partials @ slopes
+        return np.asarray(partials if slopes is None else partials @ slopes)
 
     def param_partials(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)

@@ -193,12 +193,12 @@ class Points:
     @property
     def control(self) -> NDArray[np.bool_]:
         """Which points are control ``(N,)``."""
-        return self.roles == "control"
+        return np.asarray(self.roles == "control")
 
     @property
     def check(self) -> NDArray[np.bool_]:
         """Which points are check points ``(N,)``."""
-        return self.roles == "check"
+        return np.asarray(self.roles == "check")
 
     @property
     def tests(self) -> NDArray[np.bool_]:

@@ -468,7 +468,7 @@ class RasterSource:
 def _numpy_type(gdal_type: int) -> np.dtype[Any]:
     from osgeo import gdal_array
 
-    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
+    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))  # type: ignore[no-any-return]
 
 
 def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:

@@ -11,18 +11,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, rpc_text_of
-from ortho_pipeline.plugin import (
-    RPC,
-    InputError,
-    Notice,
-    Scene,
-    Sensor,
-    Setting,
-    Text,
-    hookimpl,
-    place,
-    read_bounded,
-)
+from ortho_pipeline.plugin import RPC, InputError, Notice, Scene, Sensor, Setting, Text, hookimpl, place, read_bounded
 
 #: Names of the USGS: 3v, year, month, day, and p for panchromatic or m for multispectral.
 _NAME = re.compile(r"3v(\d{6})([pm])\d", re.IGNORECASE)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import allowed, together, write_json, write_text
-from ortho_pipeline.plugins.registry import Registry
+from ortho_pipeline.host.registry import Registry
 from ortho_studies import hookspecs
 from ortho_studies.hookspecs import Study
 

@@ -624,9 +624,9 @@ def load() -> None:
     import ortho_pipeline.commands.mosaic.assembly
     import ortho_pipeline.commands.rectification
     import ortho_pipeline.warp.engine  # noqa: F401
-    from ortho_pipeline import plugins
+    from ortho_pipeline import host
 
-    plugins.Host.discover()
+    host.Host.discover()
 
 
 def main() -> int:

@@ -12,7 +12,7 @@ import pytest
 from osgeo import gdal
 
 import ortho_pipeline
-from ortho_pipeline import commands, plugins
+from ortho_pipeline import commands, host
 from ortho_pipeline.commands import results
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError, PluginError
@@ -489,7 +489,7 @@ def test_provenance_has_the_checksum_of_every_input_and_the_command(tiny, tmp_pa
 
 def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypatch):
     called = []
-    monkeypatch.setattr(plugins.Host, "discover", classmethod(called.append))
+    monkeypatch.setattr(host.Host, "discover", classmethod(called.append))
     path = tmp_path / "m_model.json"
     ortho_pipeline.save_model(tiny.model, path)
     open_scene(tiny.image, SceneOptions(model=path))

@@ -18,10 +18,10 @@ from ortho_pipeline.estimation.family_fit import fit_own
 from ortho_pipeline.exchange.crop import moved, noted_offset
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.host import open_scene as open_product
 from ortho_pipeline.models import ImageCorrection, model_from_dict
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene as open_product
 from ortho_pipeline.points.table import Points
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.testing import check_sensor_model

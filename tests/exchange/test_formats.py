@@ -19,7 +19,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.hookspecs import Format, hookimpl
-from ortho_pipeline.plugins import Host
+from ortho_pipeline.host import Host
 
 CORNERS = """
 import json

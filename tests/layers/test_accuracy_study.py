@@ -11,8 +11,8 @@ from osgeo import gdal
 
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import ImageCorrection
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface

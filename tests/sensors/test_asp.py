@@ -14,8 +14,8 @@ from used import pixels, ran, used
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.ellipsoid import geocentric, geodetic, meet_height
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import Pushbroom
-from ortho_pipeline.plugins import open_scene
 
 ASP = Path("sensors", "asp_plot")
 SIZE = (60, 50)

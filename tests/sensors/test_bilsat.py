@@ -26,12 +26,12 @@ from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.geodesy.ellipsoid import geocentric, geodetic
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.imaging.band_stack import stack_bands
 from ortho_pipeline.imaging.registration import TRANSFORMS, Transform, register
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.frame.resection import resect
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor
 
 XS = Interior(SIZE, SIZE, FOCAL_LENGTH, PITCH, PITCH)

@@ -18,8 +18,8 @@ from osgeo import gdal
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models.pushbroom.metadata import SoftSigmas
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster.source import open_dataset

@@ -22,9 +22,9 @@ from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, write_rpb, write_rpc_txt
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.host import Host
 from ortho_pipeline.models import ImageCorrection, MapPlane, Pieces
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import Host
 from ortho_pipeline.testing import check_sensor, check_sensor_model
 
 UTM = "EPSG:32639"

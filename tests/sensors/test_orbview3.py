@@ -21,9 +21,9 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.spatial.correlation import in_metres
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import PointOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.testing import check_sensor

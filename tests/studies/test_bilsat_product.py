@@ -28,10 +28,10 @@ from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.surface.base import Surface

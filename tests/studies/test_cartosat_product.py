@@ -26,8 +26,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 

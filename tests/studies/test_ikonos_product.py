@@ -16,8 +16,8 @@ from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.options import PointOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 

@@ -24,8 +24,8 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.commands.heights.automatic import extent_under
 from ortho_pipeline.errors import CoverageError, DatumError, InputError, StorageError
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.stores import kept, objects
 from ortho_pipeline.surface.cells import sources
 from ortho_pipeline.surface.cells.assembled import open_cells

@@ -9,13 +9,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 
@@ -139,7 +139,7 @@ def _is_ours(path: Path) -> bool:
 
 def _image(path: Path, name: str, options: SceneOptions) -> Found | None:
     try:
-        scene = plugins.open_scene(path, options.sensor, dict(options.sensor_options), **options.access)
+        scene = host.open_scene(path, options.sensor, dict(options.sensor_options), **options.access)
     except OrthoError as error:
         return _raster(path, name, options, error)
     models = ", ".join(scene.models)

@@ -15,11 +15,11 @@ from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.hookspecs import Format, Scene, Sensor
+from ortho_pipeline.host.contract import scene_faults
+from ortho_pipeline.host.registry import Broken, Provenance, Registry
+from ortho_pipeline.host.unread import unread
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.plugins.contract import scene_faults
-from ortho_pipeline.plugins.registry import Broken, Provenance, Registry
-from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster.source import open_dataset
 
 _COPY_IT = "correct what the file says there, or copy it again from the delivery"

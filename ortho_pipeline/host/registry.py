@@ -142,7 +142,7 @@ class Registry:
 
     def sensors(self) -> Mapping[str, Sensor]:
         """Collect the sensors that plugins offer, by name."""
-        from ortho_pipeline.plugins.contract import sensor_faults
+        from ortho_pipeline.host.contract import sensor_faults
 
         return self.named("ortho_sensors", "sensor", Sensor, sensor_faults)
 
@@ -227,9 +227,10 @@ class Registry:
         hooks = self._specs.GROUPS[self._group]
         for hook in hooks:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
+                marker = "ortho_pipeline.plugin" if self._specs is hookspecs else self._specs.__name__
                 raise PluginError(
                     f"plugin {name}: {hook} is not marked with @hookimpl",
-                    remedy=f"write @hookimpl of {self._specs.__name__} above it",
+                    remedy=f"write @hookimpl of {marker} above it",
                 )
         for hook in dir(plugin):
             if hook in hooks or self._manager.parse_hookimpl_opts(plugin, hook) is None:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from ortho_pipeline import _lazily
 
 if TYPE_CHECKING:
-    from ortho_pipeline.plugins.host import Host as Host
-    from ortho_pipeline.plugins.host import open_scene as open_scene
+    from ortho_pipeline.host.discovery import Host as Host
+    from ortho_pipeline.host.discovery import open_scene as open_scene
 
 __all__ = ["Host", "open_scene"]
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-    __getattr__ = _lazily(__name__, dict.fromkeys(__all__, "plugins.host"))
+    __getattr__ = _lazily(__name__, dict.fromkeys(__all__, "host.discovery"))
