@@ -48,7 +48,7 @@ class Row:
     error: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the row of ``ortho compare --json`` (docs/formats.md)."""
+        """Return the row of ``ortho compare --json`` (docs/engineering/formats.md)."""
         row: dict[str, Any] = {
             "model": self.model,
             "parameters": self.parameters,
