@@ -95,6 +95,7 @@ docs: setup
 	@$(BIN)/python docs/make_tutorial_images.py
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python docs/make_notebooks.py --pages
+	$(BIN)/python docs/make_commands.py
 	$(BIN)/python docs/make_man.py
 	rm -rf docs/__pycache__
 	$(BIN)/python tools/requirements.py docs | $(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt -r /dev/stdin

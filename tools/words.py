@@ -7,7 +7,7 @@ cells of tables, inline code and the texts of links and pictures count. Fenced c
 attributes of headings and signs without a letter or a digit do not.
 
 The user documentation is README.md and docs/, without docs/engineering/ and without generated pages
-(docs/reference/, docs/cli-reference.md). CHANGELOG.md, SECURITY.md and docs/engineering/ are counted by themselves.
+(docs/reference/, docs/commands/). CHANGELOG.md, SECURITY.md and docs/engineering/ are counted by themselves.
 
 Sentences are those of paragraphs, lists and cells of tables, without headings. Inline code counts as one word
 there. What has fewer than four words (a number, a label) is no sentence.
@@ -30,9 +30,8 @@ LONGER = {
     "docs/formats.md": "tables of files and their fields",
     "docs/formats/block-points.md": "tables of columns and of fields",
     "docs/notices.md": "a table of all notices",
-    "docs/options.md": "a table of all options",
 }
-GENERATED = ("docs/reference/", "docs/cli-reference.md")
+GENERATED = ("docs/reference/", "docs/commands/")
 #: Wordings that the language guide of this project replaces; each has two words or more.
 PHRASES = (
     "is said", "are said", "was said", "stands in for", "stand in for", "stood in for", "says nothing of",

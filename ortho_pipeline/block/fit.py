@@ -142,7 +142,7 @@ class BlockFit:
         }  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
-        """Return the section ``adjustment`` of the block's document (docs/formats/block-points.md)."""
+        """Return the section ``adjustment`` of the block's document (docs/engineering/formats.md)."""
         points = self.points
         values = dict(zip(self.parameters, zip(self.values, self.sigmas, strict=True), strict=True))
         return {

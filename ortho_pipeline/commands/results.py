@@ -84,7 +84,7 @@ class FitResult:
         return None if self.matched is None else matching_record(self.matched.to_json(), self.fit)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+        """Return the document of ``ortho fit --json`` (docs/engineering/formats.md)."""
         document = self.fit.to_json() | to_document(self.warnings)
         pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
         scale = None if refuted(document["notices"]) else map_scale(self.fit, max(pixels) if pixels else None)
@@ -135,7 +135,7 @@ class CompareResult:
     files: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho compare --json`` (docs/formats.md)."""
+        """Return the document of ``ortho compare --json`` (docs/engineering/formats.md)."""
         return {
             "schema_version": SCHEMA_VERSION,
             "image": str(self.scene.path),

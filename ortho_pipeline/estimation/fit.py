@@ -211,7 +211,7 @@ class Fit:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+        """Return the document of ``ortho fit --json`` (docs/engineering/formats.md)."""
         points = self.points
         return {
             "model": self.model_name,

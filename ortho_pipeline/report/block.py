@@ -75,7 +75,7 @@ def build_report(
     provenance: Mapping[str, Any],
     warnings: Sequence[Notice],
 ) -> BlockReport:
-    """Collect everything that the report says (docs/formats/block-points.md)."""
+    """Collect everything that the report says (docs/engineering/formats.md)."""
     places = placed(fit, starts)
     network, parted = found_network(fit)
     suffices = suffices_for(fit)

@@ -277,7 +277,7 @@ class Objects:
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
             raise InputError(
                 "the store does not let you do this", file=self.of(name),
-                remedy="give credentials as the store's own clients find them (docs/scale.md), or check their rights",
+                remedy="give credentials as the store's own clients find them (docs/remote.md), or check their rights",
             ) from error  # fmt: skip
         except exceptions.BaseError as error:
             raise StorageError(

@@ -51,7 +51,7 @@ PRODUCT_LINE, LEVEL = "Geo", "Standard Geometrically Corrected"
 #: Half the range of heights that `geo` is meant for where nothing else is known (m).
 HALF_RANGE = 500.0
 #: What the vendor states of the first years is 50 m at 90 %: 23 m for each coordinate. Direction of relief: by how much
-#: it differs from the nominal one within a real scene (docs/formats/ikonos.md).
+#: it differs from the nominal one within a real scene (docs/engineering/block-adjustment.md).
 SIGMAS = {"shift_x": 25.0, "shift_y": 25.0, "relief_x": 0.01, "relief_y": 0.01}
 #: RPC and metadata that differ by more than this on the plane (px) belong to different images.
 DISAGREEMENT = 1.0

@@ -82,7 +82,7 @@ def reproduce(
     -------
     Result
         `document` is the study's own; those of the bundled plugins have paper, settings, summary and tables
-        (docs/formats.md).
+        (docs/engineering/formats.md).
     """
     study = _study(name, "reproduce")
     assert study.reproduce

@@ -1,4 +1,4 @@
-"""Damaged files of every format are read soundly or refused with file, field and remedy (docs/reliability.md)."""
+"""Damaged files are read soundly or refused with file, field and remedy (docs/engineering/reliability.md)."""
 
 from __future__ import annotations
 

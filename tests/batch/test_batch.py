@@ -188,7 +188,7 @@ def test_a_file_that_is_not_there_or_not_utf8(tmp_path):
 
 
 def test_the_examples_of_the_guide_are_right(tmp_path):
-    guide = (ROOT / "docs" / "run.md").read_text(encoding="utf-8")
+    guide = "".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("run.md", "mosaic.md"))
     examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     assert len(examples) >= 3
     for example in examples:

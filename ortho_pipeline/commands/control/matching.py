@@ -108,7 +108,7 @@ class Matched:
         return shift
 
     def to_json(self) -> dict[str, Any]:
-        """Return the section ``matching`` of documents (docs/formats.md)."""
+        """Return the section ``matching`` of documents (docs/engineering/formats.md)."""
         from ortho_pipeline.imaging.matching import REASONS
 
         matches, kept, points = self.matches, self.kept, self.matches.points

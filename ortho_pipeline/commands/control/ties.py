@@ -70,7 +70,7 @@ class Tied:
     notices: tuple[Notice, ...] = field(default=())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the section ``ties`` of documents (docs/formats/block-points.md)."""
+        """Return the section ``ties`` of documents (docs/engineering/formats.md)."""
         names = self.points.images
         counts = np.bincount(np.bincount(self.points.point))
         found: dict[str, Any] = {

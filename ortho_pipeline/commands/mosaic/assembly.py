@@ -104,7 +104,7 @@ def assemble(
     resources: Resources | None = None,
     measure: Measure | None = None,
 ) -> tuple[dict[str, Any], ReportError | None]:
-    """Write a mosaic and its page; return its document (docs/run.md), which the caller writes.
+    """Write a mosaic and its page; return its document (docs/mosaic.md), which the caller writes.
 
     The error is that of a page that could not be made; it costs no mosaic.
 

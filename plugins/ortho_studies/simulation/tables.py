@@ -153,7 +153,7 @@ def make_document(
     curves: Sequence[Curve] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return the document of ``ortho reproduce`` (docs/formats.md).
+    """Return the document of ``ortho reproduce`` (docs/engineering/formats.md).
 
     Parameters
     ----------
