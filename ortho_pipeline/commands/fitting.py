@@ -116,11 +116,10 @@ def compare(
     best = compared.best
     if matched is not None:
         relative = () if best is None or best.fit is None else relative_to_reference(best.fit, match)
-        compared = replace(compared, notes=(*compared.notes, *matched.notices, *relative))
-    result = CompareResult(opened, compared, matched)
+        compared = compared.noted([*matched.notices, *relative])
+    compared = compared.replaced(image=str(opened.path), sensor=opened.sensor)
     if folder is None or best is None or best.fit is None:
-        return result
-    document = CompareResult(opened, compared).to_json()
+        return CompareResult(opened, compared, matched)
     chosen = replace(best.fit, warnings=(*best.fit.warnings, *relative_to_reference(best.fit, match)))
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
@@ -131,11 +130,12 @@ def compare(
     asked = request.asked("scene", "surface", "match")
     record = provenance(request, opened, heights, resolved.ledger.hashed(), command, asked)
     made = report.build_report(
-        scene=opened, fit=chosen, surface=heights, comparison=document, near=points.near,
+        scene=opened, fit=chosen, surface=heights, comparison=compared, near=points.near,
         provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
     write_report(made, chosen, files, matched, open_rasters(opened, request))
-    return replace(result, files=files)
+    named = {name: str(path) for name, path in files.items()}
+    return CompareResult(resolved.scene, compared.replaced(files=named), matched)
 
 
 def _require_points(request: Request) -> None:

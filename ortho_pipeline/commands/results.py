@@ -7,14 +7,14 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ParamSpec, TypeVar, cast
 
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import OrthoError, ReportError, error_document
-from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
@@ -127,23 +127,17 @@ class Result:
 
 @dataclass(frozen=True)
 class CompareResult:
-    """A comparison of models, and the report that was written, if any."""
+    """A comparison of models; `comparison` names the files of the report that was written, if any."""
 
     scene: Scene
-    comparison: comparing.Comparison
+    comparison: ComparisonRecord
     matched: Matched | None = None
-    files: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho compare --json`` (docs/formats.md)."""
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "image": str(self.scene.path),
-            "sensor": self.scene.sensor,
-            **self.comparison.to_json(),
-            **({} if self.matched is None else {"matching": self.matched.to_json()}),
-            "files": {name: str(path) for name, path in self.files.items()},
-        }
+        document = self.comparison.given()
+        files = document.pop("files")
+        return {**document, **({} if self.matched is None else {"matching": self.matched.to_json()}), "files": files}
 
 
 def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:

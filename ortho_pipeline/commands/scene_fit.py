@@ -138,7 +138,7 @@ class Adjusted:
         bias = self.fit.raw_bias
         if bias is None or self.fit.model_name in {family.name for family in families()}:
             return []
-        sizes = max(abs(bias["col"]) / self.scene.width, abs(bias["row"]) / self.scene.height)
+        sizes = max(abs(bias.col) / self.scene.width, abs(bias.row) / self.scene.height)
         if not sizes > _ELSEWHERE:
             return []
         text = (
@@ -292,7 +292,7 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     text = Text(
         "the correction was chosen by the matches (",
         Setting("points.correction"),
-        f" chooses another): {compared.reason}",
+        f" chooses another): {compared.recommendation.reason}",
     )
     return chosen, Notice("correction-by-matches", text, correction=chosen)
 

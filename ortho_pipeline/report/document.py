@@ -22,8 +22,10 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.estimation.fit import Fit, root_mean_square
+from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
+from ortho_pipeline.estimation.records import Adjustment, Point, Rmse, RmseOfView, RmsesOfView, is_known
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.json.records import DocumentError
@@ -33,7 +35,6 @@ from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
-from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
@@ -43,7 +44,6 @@ from ortho_pipeline.report.matching import matching_record
 from ortho_pipeline.report.page.scene import write_report_html
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import (
-    ComparisonRecord,
     ControlHull,
     Covariances,
     Dem,
@@ -106,7 +106,7 @@ def build_report(
     coverage: float | None = None,
     grid: Grid | None = None,
     warp: WarpResult | None = None,
-    comparison: Mapping[str, Any] | None = None,
+    comparison: ComparisonRecord | None = None,
     matching: Mapping[str, Any] | None = None,
     near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
@@ -120,8 +120,7 @@ def build_report(
         The adjusted model as RPC.
     coverage : float, optional
         Share (0 to 1) of the scene for which the DEM has a height.
-    comparison : mapping, optional
-        The document of ``ortho compare``.
+    comparison : ComparisonRecord, optional
     matching : mapping, optional
         From `commands.control.matching.Matched.to_json`.
     provenance : mapping, optional
@@ -134,7 +133,7 @@ def build_report(
     seen = viewing(fit.model, scene.width, scene.height)
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
     noted = to_document([*warnings, *doubts])
-    adjustment, rmse_m = _adjustment(fit, noted), RmsesOnGround.model_validate(rmse_metres(fit))
+    adjustment, rmse_m = _adjustment(fit, noted), rmse_metres(fit)
     matched = None if matching is None else matching_record(matching, fit)
     hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
     return SceneReport(
@@ -145,7 +144,7 @@ def build_report(
         covariance=_covariances(fit, near),
         map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
         control_hull=None if hull is None else ControlHull.model_validate(hull),
-        comparison=None if comparison is None else ComparisonRecord.model_validate(json_value(comparison)),
+        comparison=comparison,
         matching=matched,
         heights=heights,
         surface=None if surface is None else _surface(surface, coverage),
@@ -175,16 +174,17 @@ def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:
 
 def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
     """Return the adjustment with all that there is to warn of, and its points as they are on the ground."""
-    document = json_value(fit.to_json()) | noted
-    shifts, views = in_metres(fit, fit.residuals), along_view(fit)
+    record, shifts = fit.record, in_metres(fit, fit.residuals)
     places, shown = _in_degrees(fit, shifts)
-    for i, point in enumerate(document["points"]):
-        point["raw_residual"] = json_position(fit.raw_residuals[i])
-        point["residual_m"] = json_position(shifts[i])
-        point["view_residual"] = json_position(views[i])
-        point["height_m"] = json_value(fit.points.ground[i, 2])
-        point["lon_lat"], point["shown_lon_lat"] = json_position(places[i]), json_position(shown[i])
-    return Adjustment.model_validate(document)
+    names = ("raw_residual", "residual_m", "view_residual", "lon_lat", "shown_lon_lat")
+    vectors = zip(fit.raw_residuals, shifts, along_view(fit), places, shown, strict=True)
+    points = [
+        Point.model_validate(
+            {**point.given(), "height_m": json_value(height), **dict(zip(names, map(json_position, row), strict=True))}
+        )
+        for point, height, row in zip(record.points, fit.points.ground[:, 2], vectors, strict=True)
+    ]
+    return record.replaced(points=tuple(points), **{name: tuple(one) for name, one in noted.items()})
 
 
 def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
@@ -219,9 +219,8 @@ def _view_rmse(fit: Fit) -> RmsesOfView:
     views = along_view(fit)
 
     def over(mask: NDArray[np.bool_]) -> RmseOfView | None:
-        rows = views[mask]
-        rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
-        return None if rmse is None else RmseOfView(along=rmse["col"], across=rmse["row"], n=int(rmse["n"]))
+        rmse = Rmse.of(views[mask & np.isfinite(views).all(axis=1)])
+        return None if rmse is None else RmseOfView(along=rmse.col, across=rmse.row, n=rmse.n)
 
     return RmsesOfView(control=over(fit.used), check=over(fit.points.tests))
 

@@ -9,18 +9,17 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from ortho_pipeline.estimation.spatial.correlation import Covariance
-from ortho_pipeline.files.json.records import Record, Words
-from ortho_pipeline.report.adjustment_records import (
+from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.records import (
     Adjustment,
     Count,
-    LeftOut,
     NoticeDocument,
     Pair,
-    Rmses,
     RmsesOfView,
     RmsesOnGround,
 )
+from ortho_pipeline.estimation.spatial.correlation import Covariance
+from ortho_pipeline.files.json.records import Record, Words
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.map_scale import MapScaleRecord
@@ -135,60 +134,6 @@ class Headline(Record):
     metres: str | None
     what: str
     notes: tuple[str, ...]
-
-
-# -- compared models -------------------------------------------------------------------------------------------------
-
-
-class ComparedModel(Record):
-    """A model that was fitted, or why it could not be."""
-
-    model: str
-    parameters: Count
-    minimum_points: Count
-    dimensions: Literal[2, 3]
-    error: str | None
-    rmse: Rmses
-    rmse_m: RmsesOnGround
-    condition: float | None
-    redundancy: int | None
-    sigma0: float | None
-    fitted_as: str | None
-    ridge: float | None
-    effective_parameters: float | None
-    warnings: tuple[Words, ...]
-    notices: tuple[NoticeDocument, ...] = ()
-
-
-class PointCounts(Record):
-    """Numbers of points."""
-
-    control: Count
-    check: Count
-
-
-class Recommendation(Record):
-    """The model to take, null where nothing can be said, and what speaks for it."""
-
-    model: str | None
-    criterion: Literal["check", "leave-one-out", "none"]
-    reason: str
-
-
-class ComparisonRecord(Record):
-    """Models that ortho compare fitted to the same points, and its recommendation."""
-
-    schema_version: Count
-    image: str
-    sensor: str
-    model_crs: str | None
-    points: PointCounts
-    rows: tuple[ComparedModel, ...]
-    left_out: tuple[LeftOut, ...]
-    recommendation: Recommendation
-    warnings: tuple[Words, ...]
-    notices: tuple[NoticeDocument, ...] = ()
-    files: dict[str, str]
 
 
 # -- heights and the ortho -------------------------------------------------------------------------------------------

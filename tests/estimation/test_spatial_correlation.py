@@ -278,7 +278,7 @@ def test_control_and_check_are_apart_and_in_metres():
     rmse = result.rmse("check")
     assert rmse is not None
     assert found["check"].unit == "m"
-    assert np.hypot(*found["check"].absolute) == pytest.approx(2.5 * rmse["total"], rel=0.1)
+    assert np.hypot(*found["check"].absolute) == pytest.approx(2.5 * rmse.total, rel=0.1)
     # Distances are those of the ground: the scene is 2.5 km wide.
     last = found["control"].classes[-1]
     assert 2000 < last.to_m < 3600

@@ -64,7 +64,7 @@ def test_rigorous_model_recovers_an_independent_camera(tilt):
     from_survey = FrameCamera.from_geocentric(XS, scene.survey(0).position, heights=(700, 1900))
     for start in (from_survey, resect(exact, XS)):
         result = fit(start, exact, robust=False)
-        assert result.rmse("control")["total"] < 1e-9
+        assert result.rmse("control").total < 1e-9
         centre = geocentric(result.model.perspective_centre[None])[0]
         assert np.linalg.norm(centre - scene.camera.position) < 1e-6
         axes = result.model.rotation @ result.model.working_frame.axes * [[1], [-1], [-1]]
@@ -79,7 +79,7 @@ def test_the_level_of_the_paper_comes_from_tilt_and_noise():
         design = np.column_stack([np.ones(len(flat)), flat - flat.mean(axis=0)])
         misses = points.image - design @ np.linalg.lstsq(design, points.image)[0]
         plane.append(np.sqrt((misses**2).sum(axis=1).mean()))
-        rigorous.append(fit(resect(points, XS), points, robust=False).rmse("control")["total"])
+        rigorous.append(fit(resect(points, XS), points, robust=False).rmse("control").total)
     # Table 5: poly1 with 44 points 3.00 px; table 3: rigorous 0.99 px.
     assert 2.2 < np.median(plane) < 4.0
     assert 0.85 < np.median(rigorous) < 1.1

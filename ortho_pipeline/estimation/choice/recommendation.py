@@ -27,7 +27,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
-    from ortho_pipeline.estimation.comparison import Row
+    from ortho_pipeline.estimation.comparison import ComparedModel
 
 #: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
 _SIGNIFICANTLY_WORSE = 0.05
@@ -38,7 +38,7 @@ _Squares = dict[str, Array]
 
 
 def recommend(
-    rows: Sequence[Row],
+    rows: Sequence[ComparedModel],
     *,
     preferred: Sequence[str] = (),
     unsuited: Sequence[str] = (),
@@ -93,7 +93,7 @@ def _but(
     squares: _Squares,
     errors: Mapping[str, float],
     doubts: Mapping[str, str],
-    rows: Mapping[str, Row],
+    rows: Mapping[str, ComparedModel],
 ) -> str:
     """Return in words why the model with the smallest error at the points is not taken, and what to mind."""
     text = ""
@@ -114,7 +114,7 @@ def _shown(squares: Array) -> str:
     return f"{math.sqrt(squares.mean()):.3g} px"
 
 
-def _tests(rows: Sequence[Row]) -> tuple[_Squares, np.ndarray, int]:
+def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:
     """Return squared errors (px²) of each model at the points that test all of them, their mask, how many are checks.
 
     Without redundancy no control point can be left out; such models are tested where check points alone test all.
@@ -147,7 +147,7 @@ def _squares(found: Fit) -> Array:
     return squares
 
 
-def _doubts(row: Row, unsuited: Sequence[str]) -> str:
+def _doubts(row: ComparedModel, unsuited: Sequence[str]) -> str:
     """Return why a model is not recommended whatever its errors; empty if there is no reason.
 
     That it is uncertain at a corner is part of the error that is expected of it.
@@ -156,7 +156,9 @@ def _doubts(row: Row, unsuited: Sequence[str]) -> str:
     return " and ".join([*found, *(["unsuited to the scene"] if row.model in unsuited else [])])
 
 
-def _choose(squares: _Squares, errors: Mapping[str, float], rows: Mapping[str, Row], preferred: Sequence[str]) -> str:
+def _choose(
+    squares: _Squares, errors: Mapping[str, float], rows: Mapping[str, ComparedModel], preferred: Sequence[str]
+) -> str:
     """Return the model to take."""
     candidates: Sequence[str] = list(errors)
     if preferred:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.numbers import px
+from ortho_pipeline.estimation.records import Pair
 from ortho_pipeline.raster.output import png_bytes
-from ortho_pipeline.report.adjustment_records import Pair
 from ortho_pipeline.report.gallery.matches import Shown, in_words, shown
 from ortho_pipeline.report.records import SceneReport
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
+from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.report.matching import Candidate
 from ortho_pipeline.report.records import SceneReport
 

@@ -11,9 +11,9 @@ from ortho_pipeline.display.drawing import style_sheet
 from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.display.numbers import flat
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.estimation.records import is_known
 from ortho_pipeline.files import write_text
 from ortho_pipeline.raster.quicklook import preview_png
-from ortho_pipeline.report.adjustment_records import is_known
 from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.gallery.points import point_chips
