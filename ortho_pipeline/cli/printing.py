@@ -224,7 +224,7 @@ def print_comparison(result: CompareResult, units: str) -> None:
         say(f"\nleft out of all models: {point.id} ({point.reason})")
     reason = compared.recommendation.reason
     say(f"\n* Recommended: {reason}." if compared.recommended else f"\nNo recommendation: {reason}.")
-    for name, path in compared.files.items():
+    for name, path in result.files.items():
         say(f"  {name:<10} {path}")
     print_warnings(compared.warnings)
 

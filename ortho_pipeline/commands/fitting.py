@@ -134,8 +134,7 @@ def compare(
         provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
     write_report(made, chosen, files, matched, open_rasters(opened, request))
-    named = {name: str(path) for name, path in files.items()}
-    return CompareResult(resolved.scene, compared.replaced(files=named), matched)
+    return CompareResult(resolved.scene, compared, matched, files)
 
 
 def _require_points(request: Request) -> None:

@@ -7,7 +7,7 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -26,7 +26,7 @@ from ortho_pipeline.options.texts import Text
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
-from ortho_pipeline.report.matching import MatchingRecord, matching_record
+from ortho_pipeline.report.matching import MatchingRecord
 from ortho_pipeline.report.notebook import tables
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import refuted
@@ -81,7 +81,7 @@ class FitResult:
     @property
     def matching(self) -> MatchingRecord | None:
         """What was matched, and what its points say of the fit; None where nothing was."""
-        return None if self.matched is None else matching_record(self.matched.to_json(), self.fit)
+        return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/formats.md)."""
@@ -97,7 +97,7 @@ class FitResult:
             "removed": [dict(one) for one in self.removed],
             **({} if self.matching is None else {"matching": self.matching.to_json()}),
             "map_scale": None if scale is None else scale.to_json(),
-            "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
+            "covariance": analyse_fit(self.fit, near=self.near).to_json(),
         }
 
 
@@ -127,17 +127,18 @@ class Result:
 
 @dataclass(frozen=True)
 class CompareResult:
-    """A comparison of models; `comparison` names the files of the report that was written, if any."""
+    """A comparison of models, and the report that was written, if any."""
 
     scene: Scene
     comparison: ComparisonRecord
     matched: Matched | None = None
+    files: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho compare --json`` (docs/formats.md)."""
-        document = self.comparison.given()
-        files = document.pop("files")
-        return {**document, **({} if self.matched is None else {"matching": self.matched.to_json()}), "files": files}
+        document = self.comparison.model_dump(mode="json", exclude_unset=True, exclude={"files"})
+        matching = {} if self.matched is None else {"matching": self.matched.to_json()}
+        return {**document, **matching, "files": {name: str(path) for name, path in self.files.items()}}
 
 
 def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:

@@ -29,6 +29,7 @@ from ortho_pipeline.options import MatchOptions, PointOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.report.matching import MatchingRecord
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 from ortho_pipeline.surface.base import Surface
 
@@ -77,9 +78,9 @@ class Adjusted:
         return self.fit.to_json() if self.scene.adjusted is None else dict(self.scene.adjusted)
 
     @property
-    def matching(self) -> dict[str, Any] | None:
-        """The section ``matching`` of documents, None where nothing was matched."""
-        return None if self.matched is None else self.matched.to_json()
+    def matching(self) -> MatchingRecord | None:
+        """What was matched, and what its points say of the fit; None where nothing was."""
+        return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def removed_json(self) -> list[dict[str, Any]]:
         """Return the removed parameters as JSON values."""

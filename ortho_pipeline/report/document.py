@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,12 +39,10 @@ from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.layers.styles import raster_style
 from ortho_pipeline.report.map_scale import map_scale
-from ortho_pipeline.report.matching import matching_record
+from ortho_pipeline.report.matching import MatchingRecord
 from ortho_pipeline.report.page.scene import write_report_html
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import (
-    ControlHull,
-    Covariances,
     Dem,
     FlatGround,
     MapScaleRecord,
@@ -55,7 +52,6 @@ from ortho_pipeline.report.records import (
     RpcRecord,
     SceneRecord,
     SceneReport,
-    WarpRecord,
 )
 from ortho_pipeline.report.wording import UNKNOWN, corrected, headline, refuted, summary_text
 from ortho_pipeline.surface.flat import FlatSurface
@@ -67,7 +63,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface
-    from ortho_pipeline.warp.job import WarpResult
+    from ortho_pipeline.warp.job import WarpRecord
 
 Array = NDArray[np.float64]
 
@@ -105,9 +101,9 @@ def build_report(
     surface: Surface | None = None,
     coverage: float | None = None,
     grid: Grid | None = None,
-    warp: WarpResult | None = None,
+    warp: WarpRecord | None = None,
     comparison: ComparisonRecord | None = None,
-    matching: Mapping[str, Any] | None = None,
+    matching: MatchingRecord | None = None,
     near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
     warnings: Iterable[Notice] = (),
@@ -121,8 +117,7 @@ def build_report(
     coverage : float, optional
         Share (0 to 1) of the scene for which the DEM has a height.
     comparison : ComparisonRecord, optional
-    matching : mapping, optional
-        From `commands.control.matching.Matched.to_json`.
+    matching : MatchingRecord, optional
     provenance : mapping, optional
         From `commands.inputs.provenance`.
     near : float, optional
@@ -134,28 +129,28 @@ def build_report(
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
     noted = to_document([*warnings, *doubts])
     adjustment, rmse_m = _adjustment(fit, noted), rmse_metres(fit)
-    matched = None if matching is None else matching_record(matching, fit)
-    hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
     return SceneReport(
         scene=_scene(scene, seen),
         adjustment=adjustment,
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
-        covariance=_covariances(fit, near),
+        covariance=analyse_fit(fit, near=near),
         map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
-        control_hull=None if hull is None else ControlHull.model_validate(hull),
+        control_hull=control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
         comparison=comparison,
-        matching=matched,
+        matching=matching,
         heights=heights,
         surface=None if surface is None else _surface(surface, coverage),
         rpc=None if exported is None else RpcRecord(exact=exported.exact, max_error_px=exported.max_error_px),
         ortho=None if grid is None else _ortho(grid, warp),
-        warp=None if warp is None else _warped(warp),
+        warp=warp,
         provenance=Provenance.model_validate(json_value(provenance or {})),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=corrected(
-            headline(adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matched),
+            headline(
+                adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matching
+            ),
             noted["notices"],
         ),
     )
@@ -195,10 +190,6 @@ def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
     to_degrees, moved = ground_transform(points.crs, "EPSG:4979"), points.ground.copy()
     moved[:, :2] += np.einsum("nij,nj->ni", map_from_enu(points.crs, points.ground)[:, :2, :2], shifts)
     return to_degrees(points.ground)[:, :2], to_degrees(moved)[:, :2]
-
-
-def _covariances(fit: Fit, near: float | None) -> Covariances:
-    return Covariances(**analyse_fit(fit, near=near))
 
 
 def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScaleRecord | None:
@@ -264,7 +255,7 @@ def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
     return f" (the geoid is {undulation:+.1f} m from the ellipsoid there)"
 
 
-def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
+def _ortho(grid: Grid, warp: WarpRecord | None) -> OrthoRecord:
     unit = grid.crs.axis_info[0].unit_name
     left, bottom, right, top = (float(value) for value in grid.extent)
     return OrthoRecord(
@@ -276,11 +267,6 @@ def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
         size=(grid.width, grid.height),
         valid_share=None if warp is None else warp.valid_pixels / max(warp.pixels, 1),
     )
-
-
-def _warped(warp: WarpResult) -> WarpRecord:
-    """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
-    return WarpRecord.model_validate({name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
 def with_layers(

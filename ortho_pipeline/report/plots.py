@@ -14,10 +14,11 @@ from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.estimation.comparison import ComparedModel
 from ortho_pipeline.estimation.records import Pair, Point, is_known
+from ortho_pipeline.estimation.spatial.correlation import Covariance
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
 from ortho_pipeline.report.layers.accuracy import plot_accuracy
-from ortho_pipeline.report.records import Covariance, SceneReport
+from ortho_pipeline.report.records import SceneReport
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0

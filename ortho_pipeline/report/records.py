@@ -18,12 +18,14 @@ from ortho_pipeline.estimation.records import (
     RmsesOfView,
     RmsesOnGround,
 )
-from ortho_pipeline.estimation.spatial.correlation import Covariance
+from ortho_pipeline.estimation.spatial.correlation import Covariances
 from ortho_pipeline.files.json.records import Record, Words
+from ortho_pipeline.points.control_hull import ControlHull
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.map_scale import MapScaleRecord
 from ortho_pipeline.report.matching import MatchingRecord
+from ortho_pipeline.warp.job import WarpRecord
 
 Size = tuple[Annotated[int, pydantic.Field(ge=1)], Annotated[int, pydantic.Field(ge=1)]]
 
@@ -92,35 +94,6 @@ class SceneRecord(Record):
 
 
 # -- accuracy --------------------------------------------------------------------------------------------------------
-
-
-class Covariances(Record):
-    """Of control and of check points, never of both together."""
-
-    control: Covariance | None = None
-    check: Covariance | None = None
-
-    @property
-    def drawn_role(self) -> Literal["control", "check"] | None:
-        """The points whose analysis is drawn: check points where they could be tested, else control."""
-        roles: tuple[Literal["check", "control"], ...] = ("check", "control")
-        for role in roles:
-            found = self.of(role)
-            if found is not None and found.p_joint is not None and len(found.classes) > 1:
-                return role
-        return None
-
-    def of(self, role: Literal["control", "check"]) -> Covariance | None:
-        """Return the analysis of the points of a role."""
-        return self.check if role == "check" else self.control
-
-
-class ControlHull(Record):
-    """Convex hull of the used control points, and its share of the image; no outline of points in a line."""
-
-    share: Annotated[float, pydantic.Field(ge=0)]
-    n: Count
-    outline: tuple[Pair, ...]
 
 
 #: The figure of what nothing tests.
@@ -214,25 +187,6 @@ class OrthoRecord(Record):
     def crs_label(self) -> str:
         """The CRS as people read it: its code or its name."""
         return self.crs_name if "[" in self.crs else self.crs
-
-
-class WarpRecord(Record):
-    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
-
-    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked;
-    `filled_share` that of those which another ortho filled (`output.fill_from`), null where none was given.
-    """
-
-    max_error_px: float
-    tolerance_px: float
-    finest_spacing: int | None = None
-    refined_blocks: int | None = None
-    blocks: int | None = None
-    pixels: Count
-    valid_pixels: Count
-    transformer: str | None = None
-    hidden_share: float | None = None
-    filled_share: float | None = None
 
 
 class SceneReport(Record):

@@ -7,14 +7,14 @@ from typing import Protocol
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.warp import engine, gdal_engine
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 
 class Engine(Protocol):
     """What makes orthos; each engine is a module with this function."""
 
-    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         """Write an ortho; what the engine cannot do is an `InputError`."""
 
 

@@ -73,7 +73,7 @@ def test_every_model_is_a_row_and_one_that_cannot_be_fitted_says_why():
     assert [row.model for row in done.rows] == [family.name for family in families()]
     rows = {row.model: row for row in done.rows}
     assert "39" in str(rows["rfm3"].error)
-    assert rows["rfm3"].to_json()["rmse"] == {"control": None, "check": None, "loo": None}
+    assert rows["rfm3"].given()["rmse"] == {"control": None, "check": None, "loo": None}
     assert rows["affine3d"].error is None
     json.dumps(done.to_json(), allow_nan=False)
 
@@ -84,7 +84,7 @@ def test_flat_models_lose_on_hills_and_the_recommended_is_simple_enough():
     assert rows["affine2d"]["rmse"]["check"]["total"] > 10 * rows["affine3d"]["rmse"]["check"]["total"]
     assert done.recommended in ("affine3d", "dlt")
     assert done.recommendation.criterion == "check"
-    assert "20 check points" in done.reason
+    assert "20 check points" in done.recommendation.reason
 
 
 def test_metres_are_the_pixels_of_the_scene():
@@ -107,7 +107,7 @@ def test_a_blunder_is_left_out_of_every_model():
 def test_nothing_is_recommended_without_redundancy():
     done = compare(simulated(4, 0), ("affine3d",), size=(1000, 1000))
     assert done.recommended is None
-    assert "redundancy" in done.reason
+    assert "redundancy" in done.recommendation.reason
 
 
 def test_the_simpler_of_two_equal_models_is_recommended():
@@ -284,8 +284,8 @@ def test_no_unstable_model_is_recommended_on_spot_6(real):
     assert rows[smallest].reservations == ("unstable",)
     assert rows[done.recommended].reservations == ()
     assert done.recommended in ("poly3d2", "poly3d3")
-    assert f"; {smallest} has" in done.reason
-    assert done.reason.endswith("and is unstable")
+    assert f"; {smallest} has" in done.recommendation.reason
+    assert done.recommendation.reason.endswith("and is unstable")
     # With the RPC, which is right up to shift and drift.
     done = compare(points, ("rpc", "rpc+shift", "rpc+shift-drift", "rpc+affine", "poly3d2", "rfm2"), own=rpc, size=size)
     assert done.recommended in ("rpc+shift-drift", "rpc+affine")
@@ -312,7 +312,7 @@ def test_what_is_uncertain_over_the_scene_is_part_of_the_expected_error():
     assert done.recommended == "affine3d"
     alone = compare(points, ("affine14",), size=(1000, 1000))
     assert alone.recommended == "affine14"
-    assert alone.reason.endswith("it is uncertain at a corner: measure points there")
+    assert alone.recommendation.reason.endswith("it is uncertain at a corner: measure points there")
 
 
 def as_if(name: str, parameters: int, errors: np.ndarray) -> ComparedModel:
@@ -344,7 +344,7 @@ def test_an_error_below_the_noise_is_chance():
     fits = {row.model: row.fit for row in rows}
     # As uncertain as measured, and no less: then both errors are smaller than can be.
     exact = {name: dataclasses.replace(found, sigma0=1.0) for name, found in fits.items() if found}
-    rows = [dataclasses.replace(row, fit=exact[row.model]) for row in rows]
+    rows = [row.replaced(fit=exact[row.model]) for row in rows]
     assert recommend(rows)[0] == "simple"
     rows = [as_if("simple", 8, 5 * errors), as_if("many", 20, 3 * errors)]
     assert recommend(rows)[0] == "many"
@@ -374,7 +374,7 @@ def test_a_wrong_check_point_decides_nothing():
     models = ("affine2d", "poly2", "affine3d", "dlt")
     before, after = compare(points, models, size=(1000, 1000)), compare(moved, models, size=(1000, 1000))
     assert after.recommended == before.recommended
-    assert "11 check points" in after.reason
+    assert "11 check points" in after.recommendation.reason
     best = after.best
     assert best is not None
     assert best.fit is not None
@@ -431,7 +431,7 @@ def test_twenty_parameters_on_fourteen_points_do_not_win_by_chance():
     assert true["poly3d2"] > 1.9 * min(true.values())
     assert done.recommended == "dlt"
     assert true["dlt"] < 1.05 * min(true.values())
-    assert f"poly3d2 has {left_out['poly3d2']:.3g} px with 20 parameters, and " in done.reason
+    assert f"poly3d2 has {left_out['poly3d2']:.3g} px with 20 parameters, and " in done.recommendation.reason
 
 
 @pytest.mark.slow

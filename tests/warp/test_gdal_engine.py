@@ -32,7 +32,7 @@ from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -121,7 +121,7 @@ def rpc_of(model: SensorModel) -> RpcExport | None:
         return None
 
 
-def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple[float, float, WarpResult]:
+def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple[float, float, WarpRecord]:
     """Return the largest difference (px) of the engines, the share of pixels of one alone, and what GDAL's says."""
     source, grid, found = ramp(folder), GRID, []
     ours = rectify(model, source, surface, grid, folder / "ours.tif", driver="GTiff")
@@ -245,7 +245,7 @@ def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path)
     with pytest.raises(InputError, match=r"output\.dem_interpolation"):
         commands.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
     assert not list((tmp_path / "cubic").glob("*.tif"))
-    arrays = WarpResult(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
+    arrays = WarpRecord(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]
     assert not arrays.notes(1_000_000_000)
     assert not dataclasses.replace(arrays, transformer="RPC").notes(512_000_000)

@@ -25,7 +25,7 @@ from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.job import WarpResult
+from ortho_pipeline.warp.job import WarpRecord
 from ortho_pipeline.warp.lattice import Lattices, OutputBlock, Terrain
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -59,7 +59,7 @@ def compare(
     *,
     height: float = np.nan,
     surface: Surface | None = None,
-) -> tuple[float, int, WarpResult]:
+) -> tuple[float, int, WarpRecord]:
     """Return the worst error (px) of all output pixels that show the image, their number, and what the warp says."""
     columns, rows = np.meshgrid(np.arange(grid.width) + 0.5, np.arange(grid.height) + 0.5)
     x, y = grid.xy(columns.ravel(), rows.ravel())
