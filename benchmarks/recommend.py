@@ -27,7 +27,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "estimation"))
 from known_scenes import DEVELOPMENT, HELD_OUT, KnownScene, known_scene
 
-from ortho_pipeline.estimation.comparison import ComparedModel, available_models, compare
+from ortho_pipeline.estimation.choice.comparison import ComparedModel, available_models, compare
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.geodesy.crs import ground_transform
 

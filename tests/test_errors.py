@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.estimation.comparison import compare
+from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.imaging.registration import Transform

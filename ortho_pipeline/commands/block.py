@@ -15,12 +15,11 @@ import numpy as np
 
 from ortho_pipeline import plugins
 from ortho_pipeline.block.adjustment import adjust as adjust_block
-from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.fit import BlockFit, ObjectRms
 from ortho_pipeline.block.intersection import Intersection
 from ortho_pipeline.block.intersection import intersect as intersect_rays
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
-from ortho_pipeline.block.records import ObjectRms
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of

@@ -23,7 +23,7 @@ from ortho_pipeline.commands.scene_fit import (
 )
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.choice import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.files.process_limits import one_blas_thread

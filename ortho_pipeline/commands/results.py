@@ -14,7 +14,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import OrthoError, ReportError, error_document
-from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit

@@ -52,7 +52,7 @@ def sensors() -> dict[str, Any]:
         }
         for name, sensor in host.sensors.items()
     ]
-    return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": [entry.to_json() for entry in host.broken]}
+    return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": json_value(host.broken)}
 
 
 @with_items
@@ -238,9 +238,9 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
         "proj": proj_info(),
         "grids": grids(),
         "fetched": fetched,
-        "plugins": [entry.to_json() for entry in host.plugins()],
+        "plugins": json_value(host.plugins()),
         "sensors": list(host.sensors),
-        "broken": [entry.to_json() for entry in host.broken],
+        "broken": json_value(host.broken),
         "cpus": os.cpu_count(),
     }
 

@@ -17,7 +17,7 @@ from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import CoverageError, InputError
-from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.choice import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.estimation.fit import Fit, fit

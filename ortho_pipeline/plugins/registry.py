@@ -54,10 +54,6 @@ class Provenance:
         """Whether it comes along with the package."""
         return self.distribution.lower().replace("_", "-").replace(".", "-") == BUNDLED
 
-    def to_json(self) -> dict[str, str]:
-        """Return the fields as JSON values."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
 class Broken:
@@ -70,10 +66,6 @@ class Broken:
 
     def __str__(self) -> str:
         return f"plugin {self.plugin!r} of {self.distribution} {self.version} is left out: {self.error}"
-
-    def to_json(self) -> dict[str, str]:
-        """Return the fields as JSON values."""
-        return dict(vars(self))
 
 
 class Registry:

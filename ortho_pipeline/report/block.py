@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.records import BlockAdjustment, BlockPoint, Ray, merged
+from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document

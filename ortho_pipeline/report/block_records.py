@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from ortho_pipeline.block.fit import BlockAdjustment
 from ortho_pipeline.block.network import NetworkRecord
-from ortho_pipeline.block.records import BlockAdjustment
 from ortho_pipeline.estimation.records import NoticeDocument
 from ortho_pipeline.files.json.records import Pair, Record, Words
 from ortho_pipeline.report.records import InputFile, MapScaleRecord, RpcRecord, Size

@@ -47,7 +47,7 @@ def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
 
 
 def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
-    from ortho_pipeline.block.records import AdjustedImage  # few scenes come from a block
+    from ortho_pipeline.block.fit import AdjustedImage  # few scenes come from a block
 
     image = AdjustedImage.read({name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""

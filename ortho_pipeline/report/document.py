@@ -21,7 +21,7 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.records import Adjustment, Point, Rmse, RmseOfView, RmsesOfView, is_known

@@ -12,7 +12,7 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.display.notices import doubted
-from ortho_pipeline.estimation.comparison import ComparedModel
+from ortho_pipeline.estimation.choice.comparison import ComparedModel
 from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.estimation.spatial.correlation import Covariance
 from ortho_pipeline.options.texts import counted

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.records import (
     Adjustment,
     Count,

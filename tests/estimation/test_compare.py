@@ -23,15 +23,15 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.choice.expected_error import expectation
-from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
-from ortho_pipeline.estimation.comparison import (
+from ortho_pipeline.estimation.choice.comparison import (
     ComparedModel,
     ComparisonRecord,
     available_models,
     choose_models,
     compare,
 )
+from ortho_pipeline.estimation.choice.expected_error import expectation
+from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform

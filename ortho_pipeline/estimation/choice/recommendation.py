@@ -27,7 +27,7 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
-    from ortho_pipeline.estimation.comparison import ComparedModel
+    from ortho_pipeline.estimation.choice.comparison import ComparedModel
 
 #: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
 _SIGNIFICANTLY_WORSE = 0.05

@@ -9,9 +9,6 @@ from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.report.matching import Candidate
 from ortho_pipeline.report.records import SceneReport
 
-#: What is said of a match that the matcher kept and the adjustment did not.
-LEFT_OUT = "left out"
-
 
 @dataclass(frozen=True)
 class Shown:

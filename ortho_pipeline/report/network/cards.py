@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from ortho_pipeline.block.records import Ray
+from ortho_pipeline.block.fit import Ray
 from ortho_pipeline.display.numbers import px
 from ortho_pipeline.estimation.records import is_known
 from ortho_pipeline.options.texts import counted

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 
 #: Kind of point or figure -> mark and colour.

@@ -15,7 +15,7 @@ from typing import Any
 
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.estimation.comparison import ComparisonRecord
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.records import Rmse, Rmses
 from ortho_pipeline.hookspecs import Scene
