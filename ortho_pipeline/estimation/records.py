@@ -189,6 +189,11 @@ class Point(Record):
     shown_lon_lat: Residual | None = None
 
     @property
+    def length(self) -> float | None:
+        """Length of the residual, px."""
+        return math.hypot(*self.residual) if is_known(self.residual) else None
+
+    @property
     def kind(self) -> Literal["control", "check", "out"]:
         """The mark that it is drawn with."""
         if self.role == "control" and not self.used:

@@ -214,3 +214,8 @@ class SceneReport(Record):
     warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...] = ()
     headline: Headline
+
+    @property
+    def matched_places(self) -> frozenset[Pair]:
+        """Places in the image that were looked for in a reference."""
+        return frozenset() if self.matching is None else frozenset(one.image for one in self.matching.candidates)

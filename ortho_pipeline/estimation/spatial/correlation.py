@@ -107,6 +107,11 @@ class Covariance(Record):
     verdict: Verdict
     statement: str
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether there were points enough for a test, and classes of distance."""
+        return self.p_joint is not None and len(self.classes) > 1
+
 
 class Covariances(Record):
     """Of control and of check points, never of both together."""
@@ -115,18 +120,11 @@ class Covariances(Record):
     check: Covariance | None = None
 
     @property
-    def drawn_role(self) -> Literal["control", "check"] | None:
-        """The points whose analysis is drawn: check points where they could be tested, else control."""
-        roles: tuple[Literal["check", "control"], ...] = ("check", "control")
-        for role in roles:
-            found = self.of(role)
-            if found is not None and found.p_joint is not None and len(found.classes) > 1:
-                return role
-        return None
-
-    def of(self, role: Literal["control", "check"]) -> Covariance | None:
-        """Return the analysis of the points of a role."""
-        return self.check if role == "check" else self.control
+    def drawn(self) -> tuple[Literal["control", "check"], Covariance] | None:
+        """The points whose analysis is drawn, and it: check points where they could be tested, else control."""
+        if self.check is not None and self.check.is_tested:
+            return "check", self.check
+        return None if self.control is None or not self.control.is_tested else ("control", self.control)
 
 
 def analyse(

@@ -79,7 +79,7 @@ def write_report_html(
         provenance=list(flat({**report.scene.facts, **_brief(report.provenance)})),
         inputs=report.provenance.inputs,
         plots={name: drawing.svg() for name, drawing in plots(report).items()},
-        plotted_role=report.covariance.drawn_role,
+        plotted_role=report.covariance.drawn and report.covariance.drawn[0],
         plot_style=style_sheet(),
         preview=base64.b64encode(png).decode() if png else None,
         over_ortho=None if over_ortho is None else over_ortho.svg(),
