@@ -53,7 +53,7 @@ def fit(
     _require_points(request)
     adjusted = adjust(resolved := adjustable(request))
     return FitResult(
-        adjusted.scene, adjusted.fit, adjusted.warnings(resolved.surface), tuple(adjusted.removed_json()), points.near,
+        adjusted.scene, adjusted.fit, adjusted.warnings(resolved.surface), adjusted.removed, points.near,
         adjusted.matched,
     )  # fmt: skip
 

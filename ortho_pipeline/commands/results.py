@@ -15,10 +15,12 @@ from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import OrthoError, ReportError, error_document
 from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
+from ortho_pipeline.estimation.family_fit import Removed
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import part_of_outputs, staged, together, write_text
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.storage.delivery import address_of, delivered
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
@@ -74,7 +76,7 @@ class FitResult:
     scene: Scene
     fit: Fit
     warnings: tuple[Notice, ...] = ()
-    removed: tuple[Mapping[str, Any], ...] = ()
+    removed: tuple[Removed, ...] = ()
     near: float | None = None
     matched: Matched | None = None
 
@@ -94,7 +96,7 @@ class FitResult:
             "model": document.pop("model"),
             "model_source": self.scene.model_source,
             **document,
-            "removed": [dict(one) for one in self.removed],
+            "removed": json_value(self.removed),
             **({} if self.matching is None else {"matching": self.matching.to_json()}),
             "map_scale": None if scale is None else scale.to_json(),
             "covariance": analyse_fit(self.fit, near=self.near).to_json(),

@@ -82,10 +82,6 @@ class Adjusted:
         """What was matched, and what its points say of the fit; None where nothing was."""
         return None if self.matched is None else self.matched.tested_by(self.fit)
 
-    def removed_json(self) -> list[dict[str, Any]]:
-        """Return the removed parameters as JSON values."""
-        return [{"name": one.name, "t": one.t, "p": one.p} for one in self.removed]
-
     def warnings(self, surface: Surface | None) -> tuple[Notice, ...]:
         """Return what people ought to know before they trust the numbers."""
         scene, adjusted, points = self.scene, self.fit, self.fit.points

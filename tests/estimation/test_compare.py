@@ -192,7 +192,7 @@ def test_prune_takes_out_what_the_points_do_not_justify(tiny):
     assert {"col_shift", "row_shift"} <= set(result.fit.param_names)
     assert len(result.removed) >= 2
     assert any("do not justify" in text for text in result.warnings)
-    assert [one["name"] for one in result.to_json()["removed"]] == [one["name"] for one in result.removed]
+    assert [one["name"] for one in result.to_json()["removed"]] == [one.name for one in result.removed]
 
 
 @pytest.mark.parametrize(

@@ -245,7 +245,9 @@ def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path)
     with pytest.raises(InputError, match=r"output\.dem_interpolation"):
         commands.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
     assert not list((tmp_path / "cubic").glob("*.tif"))
-    arrays = WarpRecord(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
+    arrays = WarpRecord(
+        max_error_px=0.0, tolerance_px=0.1, pixels=10_000_000, valid_pixels=1, transformer="GEOLOC_ARRAY"
+    )
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]
     assert not arrays.notes(1_000_000_000)
     assert not dataclasses.replace(arrays, transformer="RPC").notes(512_000_000)
