@@ -6,7 +6,6 @@ coordinates that the engine used.
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -250,4 +249,4 @@ def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path)
     )
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]
     assert not arrays.notes(1_000_000_000)
-    assert not dataclasses.replace(arrays, transformer="RPC").notes(512_000_000)
+    assert not arrays.replaced(transformer="RPC").notes(512_000_000)
