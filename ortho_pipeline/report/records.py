@@ -127,11 +127,6 @@ class FlatGround(Record):
     coverage: float | None
     constant_height: float
 
-    @property
-    def is_flat(self) -> bool:
-        """True."""
-        return True
-
 
 class Dem(Record):
     """The DEM, and how its heights were understood."""
@@ -155,11 +150,6 @@ class Dem(Record):
     items: tuple[str, ...] = ()
     documents: tuple[str, ...] = ()
     declared_in: Literal["files", "items"] | None = None
-
-    @property
-    def is_flat(self) -> bool:
-        """False."""
-        return False
 
 
 class RpcRecord(Record):
