@@ -18,7 +18,7 @@ import pyproj
 from ortho_studies.bilsat.truth import FOCAL_LENGTH, MAP_CRS, PITCH, SIZE, BilsatScene
 from ortho_studies.simulation.scanner import LineScanner
 
-from ortho_pipeline.estimation.comparison import compare
+from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.rpc import export_rpc

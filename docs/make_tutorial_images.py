@@ -290,7 +290,7 @@ def panoramic(path: Path) -> None:
             axes.axhline(0, color="0.7", linewidth=0.8)
             axes.plot(points.image[:, 0], off[:, 0], "o", markersize=4, color="tab:blue", label="column")
             axes.plot(points.image[:, 0], off[:, 1], "s", markersize=3, color="tab:orange", label="row")
-            axes.set_title(f"{name}: {found.rmse('control')['total']:.3g} px", fontsize=10)
+            axes.set_title(f"{name}: {found.rmse('control').total:.3g} px", fontsize=10)
             axes.set_ylabel("residual, px")
         rows[1].set_xlabel("column")
         rows[0].legend(fontsize=8, loc="upper right")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.control.matching import match_scene as match_scene
     from ortho_pipeline.display.notices import Notice as Notice
     from ortho_pipeline.errors import OrthoError as OrthoError
-    from ortho_pipeline.estimation.comparison import compare as compare
+    from ortho_pipeline.estimation.choice.comparison import compare as compare
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
     from ortho_pipeline.estimation.observations.prior import Prior as Prior
@@ -80,7 +80,7 @@ _HOMES = {
     "SurfaceOptions": "options",
     "Vertical": "geodesy.crs",
     "adjust": "block.adjustment",
-    "compare": "estimation.comparison",
+    "compare": "estimation.choice.comparison",
     "export_rpc": "exchange.rpc",
     "fit": "estimation.fit",
     "from_geodataframe": "exchange.geodataframe",
@@ -133,7 +133,7 @@ if not TYPE_CHECKING:  # a checker knows the names from above, and no others
 #: What a notebook shows as a table: module and name of each type.
 _SHOWN = (
     ("hookspecs", "Scene"), ("points.table", "Points"), ("estimation.fit", "Fit"), ("block.fit", "BlockFit"),
-    ("estimation.comparison", "Comparison"),
+    ("estimation.choice.comparison", "ComparisonRecord"),
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from ortho_studies.simulation.scanner import LineScanner, simulate_points
 from ortho_studies.simulation.terrain import Terrain
 
 from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.estimation.comparison import compare
+from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.imaging.registration import Transform

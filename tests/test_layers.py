@@ -15,7 +15,7 @@ from pathlib import Path
 
 from house import House
 
-from ortho_pipeline.estimation import comparison
+from ortho_pipeline.estimation.choice import comparison
 from ortho_pipeline.models.correction import FREE
 from ortho_pipeline.options import CORRECTIONS, GROUPS, RESAMPLING, BlockOptions, options_of
 from ortho_pipeline.warp import job

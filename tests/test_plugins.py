@@ -81,7 +81,7 @@ def test_installed_plugin_is_found_with_distribution_and_version(install):
     host = Host(installed=True)
     assert "third" in host.sensors
     assert str(host.provenance("third")) == "third-party 1.2"
-    assert host.provenance("third").to_json()["module"] == "third_party_plugin"
+    assert host.provenance("third").module == "third_party_plugin"
     assert any(origin.distribution == "third-party" for origin in host.plugins())
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ortho_pipeline import host
 from ortho_pipeline.block.adjustment import adjust as adjust_block
-from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.fit import BlockFit, ObjectRms
 from ortho_pipeline.block.intersection import Intersection
 from ortho_pipeline.block.intersection import intersect as intersect_rays
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
@@ -36,6 +36,7 @@ from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.files import json_text, together, write_json, write_text
@@ -294,13 +295,13 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
         found.append(Notice("outside-of-image", text, count=number, points=names))
     if fit.parameters and fit.redundancy == 0:
         found.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and say nothing"))
-    checks = max((int(rms["n"]) for rms in _check_rms(fit) if rms), default=0)
+    checks = max((rms.n for rms in _check_rms(fit) if rms), default=0)
     if points.control.any() and checks < ENOUGH_CHECK_POINTS:
         found.append(few_check_points(checks))
     return list(dict.fromkeys(found))
 
 
-def _check_rms(fit: BlockFit) -> list[Mapping[str, Any] | None]:
+def _check_rms(fit: BlockFit) -> list[ObjectRms | Rmse | None]:
     return [fit.object_rms(), *(fit.image_rms(image, "check") for image in fit.points.images)]
 
 

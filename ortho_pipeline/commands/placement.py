@@ -54,7 +54,7 @@ class Placement(NamedTuple):
             "sensor": self.scene.sensor,
             "model": fit.model_name,
             "points": {"control": int(fit.points.control.sum()), "check": int(fit.points.check.sum())},
-            "rmse_px": {which: one and one["total"] for which, one in fit.to_json()["rmse"].items()},
+            "rmse_px": {which: one and one["total"] for which, one in fit.rmses.given().items()},
             "coverage": self.footprint.coverage,
             "grid": {
                 "crs": crs_text(grid.crs), "size": [grid.width, grid.height],

@@ -50,7 +50,7 @@ from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_
 from ortho_pipeline.surface import footprint
 
 if TYPE_CHECKING:
-    from ortho_pipeline.warp.job import WarpResult
+    from ortho_pipeline.warp.job import WarpRecord
     from ortho_pipeline.warp.layers.hiding import Hiding
 
 
@@ -285,7 +285,7 @@ def _warp(
     source: raster.RasterSource,
     path: Path | Hiding,
     progress: Progress,
-) -> WarpResult:
+) -> WarpRecord:
     # The compiled kernels take a while to load: beside the checksums.
     from ortho_pipeline.warp.engines import engine_of
     from ortho_pipeline.warp.job import WarpJob

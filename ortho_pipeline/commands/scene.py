@@ -55,7 +55,7 @@ def sensors() -> dict[str, Any]:
     return {
         "schema_version": SCHEMA_VERSION,
         "sensors": listed,
-        "broken": [entry.to_json() for entry in plugins.broken],
+        "broken": json_value(plugins.broken),
     }
 
 
@@ -247,10 +247,10 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
         "proj": proj_info(),
         "grids": grids(),
         "fetched": fetched,
-        "plugins": [entry.to_json() for entry in plugins.plugins()],
+        "plugins": json_value(plugins.plugins()),
         "sensors": list(plugins.sensors),
         "formats": list(plugins.formats),
-        "broken": [entry.to_json() for entry in plugins.broken],
+        "broken": json_value(plugins.broken),
         "cpus": os.cpu_count(),
     }
 

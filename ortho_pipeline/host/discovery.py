@@ -16,7 +16,7 @@ from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.hookspecs import Format, Scene, Sensor
 from ortho_pipeline.host.contract import scene_faults
-from ortho_pipeline.host.registry import Broken, Provenance, Registry
+from ortho_pipeline.host.registry import Broken, Origin, Registry
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
@@ -67,7 +67,7 @@ class Host:
             self._registry.register_installed()
         for plugin in plugins:
             name = plugin.__name__
-            self._registry.register(plugin, Provenance(name, name, "(registered by a script)", ""))
+            self._registry.register(plugin, Origin(name, name, "(registered by a script)", ""))
         self.sensors = self._registry.sensors()
         self.models = self._registry.models()
 
@@ -76,7 +76,7 @@ class Host:
         """Return the host of the installed plugins; they are looked for once per process."""
         return _discovered()
 
-    def provenance(self, sensor: str) -> Provenance:
+    def provenance(self, sensor: str) -> Origin:
         """Return the plugin, distribution and version that a sensor or model family comes from.
 
         Raises
@@ -88,7 +88,7 @@ class Host:
             raise _unknown_sensor(sensor, self.sensors)
         return self._registry.origin[self._registry.owner[sensor]]
 
-    def plugins(self) -> tuple[Provenance, ...]:
+    def plugins(self) -> tuple[Origin, ...]:
         """Return the provenance of every plugin that is registered."""
         return tuple(self._registry.origin.values())
 

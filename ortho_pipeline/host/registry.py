@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Provenance:
+class Origin:
     """Where a plugin came from: its module, distribution and version."""
 
     plugin: str
@@ -49,10 +49,6 @@ class Provenance:
         """Whether it comes along with the package."""
         return self.distribution.lower().replace("_", "-").replace(".", "-") == BUNDLED
 
-    def to_json(self) -> dict[str, str]:
-        """Return the fields as JSON values."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
 class Broken:
@@ -65,10 +61,6 @@ class Broken:
 
     def __str__(self) -> str:
         return f"plugin {self.plugin!r} of {self.distribution} {self.version} is left out: {self.error}"
-
-    def to_json(self) -> dict[str, str]:
-        """Return the fields as JSON values."""
-        return dict(vars(self))
 
 
 class Registry:
@@ -87,7 +79,7 @@ class Registry:
 
     Attributes
     ----------
-    origin : dict of str to Provenance
+    origin : dict of str to Origin
         Of every plugin, by its name.
     owner : dict of str to str
         The plugin that a sensor, a model family, a format, a command or another offer belongs to.
@@ -103,19 +95,19 @@ class Registry:
         self._group = group or specs.PROJECT_NAME
         self._reserved = set(reserved)
         self._lenient = lenient
-        self.origin: dict[str, Provenance] = {}
+        self.origin: dict[str, Origin] = {}
         self.owner: dict[str, str] = {}
         self.broken: tuple[Broken, ...] = ()
 
     def register_installed(self) -> None:
         """Register the plugins that installed distributions name as entry points."""
         known: dict[int, tuple[str, str]] = {}  # each look at a name or a version parses all metadata
-        origins: list[tuple[Provenance, metadata.EntryPoint]] = []
+        origins: list[tuple[Origin, metadata.EntryPoint]] = []
         for entry in metadata.entry_points(group=self._group):
             if id(entry.dist) not in known:
                 told = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
                 known[id(entry.dist)] = told["Name"], told["Version"]
-            origins.append((Provenance(entry.name, entry.value, *known[id(entry.dist)]), entry))
+            origins.append((Origin(entry.name, entry.value, *known[id(entry.dist)]), entry))
         # Bundled ones first: what they offer is theirs.
         for origin, entry in sorted(origins, key=lambda one: (not one[0].bundled, one[1].name)):
             if origin.bundled:
@@ -128,7 +120,7 @@ class Registry:
                 continue
             self.register(plugin, origin)
 
-    def register(self, plugin: Any, origin: Provenance) -> None:
+    def register(self, plugin: Any, origin: Origin) -> None:
         """Register one plugin, which came from `origin`."""
         name = f"{origin.plugin} ({origin})" if origin.version else origin.plugin
         with self._judged(origin):
@@ -210,7 +202,7 @@ class Registry:
         return MappingProxyType(dict(sorted(offers.items())))
 
     @contextlib.contextmanager
-    def _judged(self, origin: Provenance) -> Iterator[None]:
+    def _judged(self, origin: Origin) -> Iterator[None]:
         """Let an error of a plugin pass, or note it and go on."""
         try:
             yield

@@ -8,31 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
+from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.estimation.blunders import contradicting
+from ortho_pipeline.estimation.records import Rmse, is_known
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.points.rows import ROLES
-from ortho_pipeline.report.adjustment_records import Rmse, is_known
-from ortho_pipeline.report.block_records import (
-    BlockAdjustment,
-    BlockHeadline,
-    BlockImage,
-    BlockPoint,
-    BlockProvenance,
-    BlockReport,
-    Ray,
-    VariancesRecord,
-    merged,
-)
+from ortho_pipeline.report.block_records import BlockHeadline, BlockImage, BlockProvenance, BlockReport
 from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
-from ortho_pipeline.report.network.facts import found_network, network_record, placed, suffices_for, thinly_covered
+from ortho_pipeline.report.network.facts import found_network, placed, suffices_for, thinly_covered
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
@@ -92,10 +83,7 @@ def build_report(
             rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
             **places[label],
         )
-    adjustment, noted = (
-        BlockAdjustment.model_validate(json_value(fit.to_json())),
-        to_document([*warnings, *parted, *thinly_covered(places)]),
-    )
+    adjustment, noted = fit.record, to_document([*warnings, *parted, *thinly_covered(places)])
     return BlockReport(
         images=images,
         adjustment=adjustment,
@@ -105,7 +93,7 @@ def build_report(
         headline=_corrected(
             headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
         ),
-        network=network_record(network),
+        network=network,
         map_scale=None if refuted(noted["notices"]) else suffices,
     )
 

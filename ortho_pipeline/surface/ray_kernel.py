@@ -32,8 +32,6 @@ _STEPS = 8
 _LAST = 0.01
 #: A ray is followed from so much above the highest sample (m): more than rounding.
 _MARGIN = 1e-4
-#: Squares that are looked at for whether a ray is above their steep cells.
-_SQUARES = 9
 
 
 class Terrain(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.warp import engine, gdal_engine
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 
@@ -24,7 +24,7 @@ class Engine(Protocol):
     @property
     def tile_maker(self) -> Callable[[WarpJob], engine.TileMaker] | None: ...
 
-    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         """Write an ortho; what the engine cannot do is an `InputError`."""
 
 

@@ -95,7 +95,7 @@ def figures(solution: Solution, surface: Surface) -> dict[str, Any]:
             name: {"value": value, "sigma": sigma}
             for name, value, sigma in zip(fit.param_names, fit.values, fit.sigmas, strict=True)
         }),
-        "rmse": json_value(fit.rmses), "rmse_m": json_value(rmse_metres(fit)), "sigma0": fit.sigma0,
+        "rmse": fit.rmses.given(), "rmse_m": rmse_metres(fit).given(), "sigma0": fit.sigma0,
         "redundancy": fit.redundancy,
         "notices": [str(one) for one in solution.adjusted.warnings(surface)],
     }  # fmt: skip
@@ -131,7 +131,7 @@ def _headline(fit: Fit | None) -> dict[str, Any]:
     relative = bool((fit.points.groups[fit.used] >= 0).any())
     to = ", relative to the reference" if relative else ""
     check, loo = fit.rmse("check"), fit.rmse("loo") if fit.redundancy else None
-    checks = 0 if check is None else int(check["n"])
+    checks = 0 if check is None else check.n
     which, found = ("loo", loo) if loo is not None and checks < LEAST_CHECK_POINTS else ("check", check)
     if found is None:
         return {"px": None, "m": None, "what": "not tested: nothing is left over to test the fit with"}
@@ -139,11 +139,9 @@ def _headline(fit: Fit | None) -> dict[str, Any]:
         what = f"{counted(checks, 'check point')} that took no part{to}"
         few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if checks < ENOUGH_CHECK_POINTS else ""
     else:
-        what = f"{counted(int(found['n']), 'control point')}, each left out in turn{to}"
+        what = f"{counted(found.n, 'control point')}, each left out in turn{to}"
         few = "; no check points were kept apart"
         if check is not None:
-            few = f"; {counted(checks, 'check point')} ({check['total']:.2f} px): too few to judge by"
-    ground = rmse_metres(fit).get(which)
-    return json_value({
-        "px": found["total"], "m": ground and ground.get("total"), "n": found["n"], "what": f"RMSE at {what}{few}",
-    })  # fmt: skip
+            few = f"; {counted(checks, 'check point')} ({check.total:.2f} px): too few to judge by"
+    ground = getattr(rmse_metres(fit), which)
+    return {"px": found.total, "m": ground and json_value(ground.total), "n": found.n, "what": f"RMSE at {what}{few}"}

@@ -33,7 +33,7 @@ from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
-from ortho_pipeline.batch.records import FileState, Record
+from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError
@@ -282,13 +282,16 @@ def _yaml(path: Path) -> Any:
 def _record_seed(folder: Path) -> bytes:
     state = FileState.of("ortho", seeds.SAMPLE / "gcps.csv", name="gcps.csv")
     facts = {"rmse_px": {"control": 0.5}, "lean_m_per_m": 0.1}
-    record = Record("one", "0" * 64, "done", (state,), (state,), "0" * 64, 1.5, facts, None, "run")
+    record = RunRecord(
+        name="one", key="0" * 64, status="done", inputs=(state,), outputs=(state,), siblings="0" * 64, seconds=1.5,
+        facts=facts, run="run",
+    )  # fmt: skip
     record.write(folder / "record.json")
     return (folder / "record.json").read_bytes()
 
 
 def _record(path: Path) -> Any:
-    record = Record.read(path)
+    record = RunRecord.at(path)
     if record is None:
         return []
     # What `ortho run` does with it.

@@ -24,7 +24,7 @@ from ortho_measure.project import JOURNAL, Project
 from ortho_measure.session import open_session
 
 from ortho_pipeline import commands
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.shared.leases import Lease, Leases, lease_document
 from ortho_pipeline.files import together
 from ortho_pipeline.files.whole import Outputs
@@ -138,7 +138,7 @@ def read_result(path: Path) -> list[Any]:
     store.put("one.result.json", path.read_bytes())
     found = leases.result("one")
     assert leases.finished() == {"one"}
-    return [] if found is None else [found.seconds, found.facts, Record.parse(found.text().encode()) == found]
+    return [] if found is None else [found.seconds, found.facts, RunRecord.parse(found.text().encode()) == found]
 
 
 # -- projects of `ortho measure` -------------------------------------------------------------------------------------

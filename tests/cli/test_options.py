@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from ortho_pipeline import commands
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.display.notices import Notice
@@ -86,8 +86,8 @@ def test_names_of_options_are_shown_as_flags() -> None:
 
 def test_errors_that_come_back_from_a_record_name_options_as_they_are_typed(tmp_path) -> None:
     refused = error_document(InputError("far away", remedy=Text("allow it with ", Setting("scene.allow_network"))))
-    Record("scene", "", "failed", error=refused).write(tmp_path / "record.json")
-    found = Record.read(tmp_path / "record.json")
+    RunRecord(name="scene", key="", status="failed", error=refused).write(tmp_path / "record.json")
+    found = RunRecord.at(tmp_path / "record.json")
     assert found is not None
     assert found.error == refused
     assert found.error is not None

@@ -91,7 +91,7 @@ def case(count: int = 40, rejected: int = 6, *, reference: str = "ortho.tif", **
     )
     done = fit(ImageCorrection(CAMERA, "shift", (500.0, 500.0), np.zeros(6)), points, name="camera+shift")
     scene = Scene("simulated", "folder/scene.tif", 1000, 1000, {"camera": CAMERA}, "from a seed", {})
-    return Case(matches, done, reports.build_report(scene=scene, fit=done, matching=matched.to_json()))
+    return Case(matches, done, reports.build_report(scene=scene, fit=done, matching=matched.tested_by(done)))
 
 
 @pytest.fixture(scope="module")

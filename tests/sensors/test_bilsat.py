@@ -61,7 +61,7 @@ def test_rigorous_model_recovers_an_independent_camera(tilt):
     from_survey = FrameCamera.from_geocentric(XS, scene.survey(0).position, heights=(700, 1900))
     for start in (from_survey, resect(exact, XS)):
         result = fit(start, exact, robust=False)
-        assert result.rmse("control")["total"] < 1e-9
+        assert result.rmse("control").total < 1e-9
         centre = geocentric(result.model.perspective_centre[None])[0]
         assert np.linalg.norm(centre - scene.camera.position) < 1e-6
         axes = result.model.rotation @ result.model.working_frame.axes * [[1], [-1], [-1]]

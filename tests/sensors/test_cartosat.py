@@ -354,7 +354,7 @@ NO_ATTITUDE = {"sigma_attitude_deg": "none", "sigma_rate_rad_s": "none"}
 @pytest.mark.slow
 @pytest.mark.parametrize("view", ["fore", "aft"])
 def test_without_the_constraints_of_attitude_nine_points_determine_nothing(pair_folder, view):
-    assert fitted(pair_folder, view, 9).rmse("check")["total"] < 1.0
+    assert fitted(pair_folder, view, 9).rmse("check").total < 1.0
     with pytest.raises(DegeneratePoints):
         fitted(pair_folder, view, 9, **NO_ATTITUDE)
 

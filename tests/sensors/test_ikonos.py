@@ -638,7 +638,7 @@ def test_components_share_one_adjustment(tmp_path, correction):
     first, second = (commands.fit(image, PointOptions(gcps=gcps, correction=correction)).fit for image in images)
     assert first.used.sum() == second.used.sum() == 12
     assert isinstance(first.model.model, Pieces)
-    np.testing.assert_allclose(first.rmse("control")["total"], second.rmse("control")["total"], rtol=1e-6)
+    np.testing.assert_allclose(first.rmse("control").total, second.rmse("control").total, rtol=1e-6)
     # One correction of the whole plane: seen from either component it moves the same place alike.
     places = np.array([[20.0, 30.0], [380.0, 200.0], [1700.0, 100.0]])
     offset = np.array([1600.0, -37.0])

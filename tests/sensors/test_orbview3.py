@@ -143,7 +143,7 @@ def test_a_small_family_is_far_off_on_an_original_scene(delivery):
     for family in ("affine14", "affine12", "affine3d", "dlt"):
         options = PointOptions(f"{stem}_gcps.csv", fit_model=family)
         found = commands.fit(f"{stem}.tif", options)
-        totals[family] = found.fit.rmse("control")["total"] * 24
+        totals[family] = found.fit.rmse("control").total * 24
         said = [text for text in found.warnings if "original scene" in text]
         assert said == [text for name, text in ortho_orbview3.UNSUITED.items() if name == family]
     # Also when the search for gross errors has taken the worst points out.

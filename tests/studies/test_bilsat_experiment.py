@@ -29,7 +29,7 @@ def test_the_level_of_the_paper_comes_from_tilt_and_noise():
         design = np.column_stack([np.ones(len(flat)), flat - flat.mean(axis=0)])
         misses = points.image - design @ np.linalg.lstsq(design, points.image)[0]
         plane.append(np.sqrt((misses**2).sum(axis=1).mean()))
-        rigorous.append(fit(resect(points, XS), points, robust=False).rmse("control")["total"])
+        rigorous.append(fit(resect(points, XS), points, robust=False).rmse("control").total)
     # Table 5: poly1 with 44 points 3.00 px; table 3: rigorous 0.99 px.
     assert 2.2 < np.median(plane) < 4.0
     assert 0.85 < np.median(rigorous) < 1.1

@@ -154,7 +154,7 @@ def test_the_model_itself_is_adjusted_from_the_survey_and_from_zero_angles(produ
     assert np.abs(from_zero.fit.model.ground_to_image(ground) - image).max() < 0.5
     # Two points are enough with what the survey knows.
     few = PointOptions(product / "gcps.csv", correction="model", select="even:2")
-    assert commands.fit(product / "bilsat.tif", few).fit.rmse("check")["total"] < 2.5
+    assert commands.fit(product / "bilsat.tif", few).fit.rmse("check").total < 2.5
 
 
 def test_a_model_without_parameters_of_its_own_says_so(tiny):

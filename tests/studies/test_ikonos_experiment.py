@@ -164,7 +164,7 @@ def table():
     rows = []
     for seed in range(40):
         points = ikonos.Realisation.scene_of(seed).measure(seed)
-        rows.append([fit_family(name, points, robust=False).rmse("check")["total"] for name in ikonos.TABLE_2])
+        rows.append([fit_family(name, points, robust=False).rmse("check").total for name in ikonos.TABLE_2])
     return np.array(rows)
 
 

@@ -205,4 +205,4 @@ def test_points_of_components_are_measured_in_the_component_that_they_lie_in(tmp
     for path in images:
         found = commands.fit(path, PointOptions(gcps=cut["gcps"])).fit
         assert len(found.points) == 40
-        np.testing.assert_allclose(found.rmse("check")["total"], expected.rmse("check")["total"], atol=1e-3)
+        np.testing.assert_allclose(found.rmse("check").total, expected.rmse("check").total, atol=1e-3)

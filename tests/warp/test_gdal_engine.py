@@ -6,7 +6,6 @@ coordinates that the engine used.
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -123,7 +122,7 @@ def rpc_of(model: SensorModel) -> RpcExport | None:
         return None
 
 
-def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple[float, float, WarpResult]:
+def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple[float, float, WarpRecord]:
     """Return the largest difference (px) of the engines, the share of pixels of one alone, and what GDAL's says."""
     source, grid, found = ramp(folder), GRID, []
     ours = rectify(model, source, surface, grid, folder / "ours.tif", driver="GTiff")
@@ -247,7 +246,9 @@ def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path)
     with pytest.raises(InputError, match=r"output\.dem_interpolation"):
         commands.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
     assert not list((tmp_path / "cubic").glob("*.tif"))
-    arrays = WarpResult(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
+    arrays = WarpRecord(
+        max_error_px=0.0, tolerance_px=0.1, pixels=10_000_000, valid_pixels=1, transformer="GEOLOC_ARRAY"
+    )
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]
     assert not arrays.notes(1_000_000_000)
-    assert not dataclasses.replace(arrays, transformer="RPC").notes(512_000_000)
+    assert not arrays.replaced(transformer="RPC").notes(512_000_000)

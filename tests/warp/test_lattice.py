@@ -27,7 +27,7 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
-from ortho_pipeline.warp.job import WarpResult
+from ortho_pipeline.warp.job import WarpRecord
 from ortho_pipeline.warp.lattice import Lattices, OutputBlock, Terrain
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -61,7 +61,7 @@ def compare(
     *,
     height: float = np.nan,
     surface: Surface | None = None,
-) -> tuple[float, int, WarpResult]:
+) -> tuple[float, int, WarpRecord]:
     """Return the worst error (px) of all output pixels that show the image, their number, and what the warp says."""
     columns, rows = np.meshgrid(np.arange(grid.width) + 0.5, np.arange(grid.height) + 0.5)
     x, y = grid.xy(columns.ravel(), rows.ravel())

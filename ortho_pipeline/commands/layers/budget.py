@@ -28,7 +28,7 @@ from ortho_pipeline.surface.dem import DemSurface
 
 if TYPE_CHECKING:
     from ortho_pipeline.raster.regridded import Regridded
-    from ortho_pipeline.warp.job import WarpResult
+    from ortho_pipeline.warp.job import WarpRecord
     from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
     from ortho_pipeline.warp.layers.hiding import Hiding
 
@@ -197,7 +197,7 @@ def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | No
 
 
 def write_layers(
-    placed: Placement, known: Known | None, warped: WarpResult, files: Mapping[str, Path]
+    placed: Placement, known: Known | None, warped: WarpRecord, files: Mapping[str, Path]
 ) -> AccuracyLayer | None:
     """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
     if known is None:

@@ -107,6 +107,25 @@ class Covariance(Record):
     verdict: Verdict
     statement: str
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether there were points enough for a test, and classes of distance."""
+        return self.p_joint is not None and len(self.classes) > 1
+
+
+class Covariances(Record):
+    """Of control and of check points, never of both together."""
+
+    control: Covariance | None = None
+    check: Covariance | None = None
+
+    @property
+    def drawn(self) -> tuple[Literal["control", "check"], Covariance] | None:
+        """The points whose analysis is drawn, and it: check points where they could be tested, else control."""
+        if self.check is not None and self.check.is_tested:
+            return "check", self.check
+        return None if self.control is None or not self.control.is_tested else ("control", self.control)
+
 
 def analyse(
     xy: ArrayLike,
@@ -174,25 +193,17 @@ def analyse(
     return found.replaced(statement=" ".join(_sentences(found)))
 
 
-def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, Covariance | None]:
-    """Analyse the residuals of a fit on the ground (m, true east and north), control and check apart.
-
-    Returns
-    -------
-    dict
-        ``control`` (points that were used) and ``check``, each None where there is no such point.
-    """
+def analyse_fit(fit: Fit, *, near: float | None = None) -> Covariances:
+    """Analyse the residuals of a fit on the ground (m, true east and north), control (used) and check points apart."""
     points = fit.points
     if not len(points):
-        return {"control": None, "check": None}
-    shifts = in_metres(fit, fit.residuals)
-    where = _on_the_ground(fit)
-    return {
-        "control": analyse(where[fit.used], shifts[fit.used], near=near, design=_design(fit)[fit.used])
-        if fit.used.any()
-        else None,
-        "check": analyse(where[points.tests], shifts[points.tests], near=near) if points.check.any() else None,
-    }
+        return Covariances()
+    shifts, where, control, check = in_metres(fit, fit.residuals), _on_the_ground(fit), None, None
+    if fit.used.any():
+        control = analyse(where[fit.used], shifts[fit.used], near=near, design=_design(fit)[fit.used])
+    if points.check.any():
+        check = analyse(where[points.tests], shifts[points.tests], near=near)
+    return Covariances(control=control, check=check)
 
 
 def _on_the_ground(fit: Fit) -> Array:

@@ -458,4 +458,5 @@ class _State:
 
     def image_by(self, vector: Array, look: Array | float = 0.0) -> Array:
         """Return d(image) ``(N, 2, P)`` of changes of the vector ``(N, 3, P)`` and of u, v themselves ``(N, 2, P)``."""
-        return self.solved @ (self.by_vector @ vector - look)
+        changed: Array = self.solved @ (self.by_vector @ vector - look)
+        return changed

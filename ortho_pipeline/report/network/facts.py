@@ -9,37 +9,19 @@ import numpy as np
 
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC
-from ortho_pipeline.block.network import Network, network_of
+from ortho_pipeline.block.network import NetworkRecord, network_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.control_hull import COVERED, empty_parts
-from ortho_pipeline.report.block_records import Angles, ImagePairRecord, NetworkRecord
 from ortho_pipeline.report.map_scale import MapScaleRecord, judge
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
 
 
-def network_record(network: Network) -> NetworkRecord:
-    """Return the network as the report has it."""
-    known = network.angles_deg[np.isfinite(network.angles_deg)]
-    angles = None
-    if len(known):
-        low, high = float(known.min()), float(known.max())
-        angles = Angles(points=len(known), least=low, median=float(np.median(known)), greatest=high)
-    pairs = [
-        ImagePairRecord(first=one.first, second=one.second, points=one.points, angle_deg=one.angle_deg)
-        for one in network.pairs
-    ]
-    return NetworkRecord(
-        pairs=tuple(pairs), angles=angles, parts=network.parts, largest_deg=tuple(json_value(network.angles_deg))
-    )
-
-
-def found_network(fit: BlockFit) -> tuple[Network, tuple[Notice, ...]]:
+def found_network(fit: BlockFit) -> tuple[NetworkRecord, tuple[Notice, ...]]:
     """Return the network of a block, and a notice if it falls into parts."""
     network = network_of(fit)
     if len(network.parts) < 2:

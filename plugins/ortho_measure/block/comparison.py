@@ -1,7 +1,7 @@
 """Corrections of a block compared: each adjusted to the same points, judged by what took no part, and one recommended.
 
-As `ortho compare` does it of one scene (`estimation.comparison`): gross errors are left out for all alike, and of
-corrections within 5 % of the smallest error the one with the fewest parameters is taken.
+As `ortho compare` does it of one scene (`estimation.choice.comparison`): gross errors are left out for all alike, and
+of corrections within 5 % of the smallest error the one with the fewest parameters is taken.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 
-#: Smaller differences of the error, as a factor, are not worth a parameter (as in `estimation.comparison`).
+#: Smaller differences of the error, as a factor, are not worth a parameter (as in `estimation.choice.comparison`).
 _WORTH = 1.05
 #: Fewer points than this are too few to choose by.
 _FEWEST = 3

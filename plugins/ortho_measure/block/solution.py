@@ -111,16 +111,16 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         return {"px": None, "m": None, "what": "not tested: no points yet"}
     to = ", relative to the reference" if relative else ""
     found = fit.object_rms()
-    if found is None or found["n"] < LEAST_CHECK_POINTS:
-        without = _left_out_in_turn(fit, solution.left_out, to, 0 if found is None else int(found["n"]))
+    if found is None or found.n < LEAST_CHECK_POINTS:
+        without = _left_out_in_turn(fit, solution.left_out, to, 0 if found is None else found.n)
         if found is None or without["m"] is not None:
             return without
     rays = [one for one in (fit.image_rms(image, "check") for image in fit.points.images) if one is not None]
-    count = sum(int(one["n"]) for one in rays)
-    total = float(np.sqrt(sum(one["n"] * one["total"] ** 2 for one in rays) / count)) if count else None
-    few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if found["n"] < ENOUGH_CHECK_POINTS else ""
-    text = f"RMSE in plan, {found['h']:.3f} m in height, at {counted(found['n'], 'check point')}, {KEPT_OUT}{to}{few}"
-    told: dict[str, Any] = json_value({"px": total, "m": found["plan"], "n": found["n"], "what": text})
+    count = sum(one.n for one in rays)
+    total = float(np.sqrt(sum(one.n * one.total**2 for one in rays) / count)) if count else None
+    few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if found.n < ENOUGH_CHECK_POINTS else ""
+    text = f"RMSE in plan, {found.h:.3f} m in height, at {counted(found.n, 'check point')}, {KEPT_OUT}{to}{few}"
+    told: dict[str, Any] = json_value({"px": total, "m": found.plan, "n": found.n, "what": text})
     return told
 
 

@@ -280,4 +280,4 @@ def _numbers(result: Fit | None) -> list[float]:
     if result is None:
         return [np.nan] * len(QUANTITIES)
     control, check = result.rmse("control"), result.rmse("check")
-    return [float(part[key]) if part else np.nan for part in (control, check) for key in ("col", "row", "total")]
+    return [getattr(part, key) if part else np.nan for part in (control, check) for key in ("col", "row", "total")]

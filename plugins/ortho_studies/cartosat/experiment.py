@@ -330,7 +330,7 @@ def _found(result: BlockFit | None, geocentric: bool) -> Array:
     if result is None:
         return np.full(len(RMS) + len(OTHERS) + 1, np.nan)
     seen = [result.image_rms(view, "check") for view in VIEWS]
-    image = [part[key] if part else np.nan for part in seen for key in ("col", "row")]
+    image = [getattr(part, key) if part else np.nan for part in seen for key in ("col", "row")]
     misses = object_residuals(result, geocentric)
     rms = np.sqrt((misses**2).mean(axis=0))
     extremes = np.stack([misses.min(axis=0), misses.max(axis=0)], axis=1).ravel()

@@ -320,7 +320,7 @@ def _check_error(make: Callable[..., Fit], *given: Any, **options: Any) -> float
 
 def _rms(found: Fit, which: str) -> float:
     numbers = found.rmse(which)
-    return float("nan") if numbers is None else float(numbers["total"])
+    return float("nan") if numbers is None else numbers.total
 
 
 # -- what is said of them --------------------------------------------------------------------------------------------

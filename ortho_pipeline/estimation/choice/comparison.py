@@ -11,17 +11,19 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.recommendation import recommend
-from ortho_pipeline.estimation.choice.row import Row
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
 from ortho_pipeline.estimation.fit import SIGNIFICANCE, Fit, Prior, fit
+from ortho_pipeline.estimation.records import LeftOut, NoticeDocument
+from ortho_pipeline.files.json.records import Count, Record, Words
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.correction import FREE
 from ortho_pipeline.options.texts import Text
@@ -35,35 +37,50 @@ CORRECTIONS = tuple(FREE)
 _CLEAR_SIGHTED = 2.0
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """All rows, what was left out of all of them, and the recommendation (None where nothing can be said)."""
+class PointCounts(Record):
+    """Numbers of points."""
 
-    rows: tuple[Row, ...]
-    left_out: tuple[tuple[str, str], ...]
-    recommended: str | None
+    control: Count
+    check: Count
+
+
+class Recommendation(Record):
+    """The model to take, null where nothing can be said, and what speaks for it."""
+
+    model: str | None
+    criterion: Literal["check", "leave-one-out", "none"]
     reason: str
-    criterion: str
-    control: int = 0
-    check: int = 0
-    model_crs: str | None = None
-    notes: tuple[Notice, ...] = field(default=())
+
+
+class ComparisonRecord(Record):
+    """Models that ortho compare fitted to the same points, and its recommendation."""
+
+    schema_version: Count
+    image: str
+    sensor: str
+    model_crs: str | None
+    points: PointCounts
+    rows: tuple[ComparedModel, ...]
+    left_out: tuple[LeftOut, ...]
+    recommendation: Recommendation
+    warnings: tuple[Words, ...]
+    notices: tuple[NoticeDocument, ...] = ()
+    files: dict[str, str]
 
     @property
-    def best(self) -> Row | None:
+    def recommended(self) -> str | None:
+        """The recommended model."""
+        return self.recommendation.model
+
+    @property
+    def best(self) -> ComparedModel | None:
         """The recommended row."""
         return next((row for row in self.rows if row.model == self.recommended), None)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the part of ``ortho compare --json`` that is about models."""
-        return {
-            "model_crs": self.model_crs,
-            "points": {"control": self.control, "check": self.check},
-            "rows": [row.to_json() for row in self.rows],
-            "left_out": [{"id": name, "reason": reason} for name, reason in self.left_out],
-            "recommendation": {"model": self.recommended, "criterion": self.criterion, "reason": self.reason},
-            **to_document(self.notes),
-        }
+    def noted(self, notices: Sequence[Notice]) -> Self:
+        """Return it with more notices."""
+        more = to_document(notices)
+        return self.replaced(warnings=(*self.warnings, *more["warnings"]), notices=(*self.notices, *more["notices"]))
 
 
 def available_models(own: SensorModel | None = None) -> dict[str, tuple[int, int, int]]:
@@ -127,8 +144,10 @@ def compare(
     ridge: float | str | None = "auto",
     significance: float = SIGNIFICANCE,
     robust: bool = True,
-) -> Comparison:
+) -> ComparisonRecord:
     """Fit every model to the same control points and hold them against the same check points.
+
+    Image and sensor are empty: they are not known here.
 
     Parameters
     ----------
@@ -168,17 +187,16 @@ def compare(
         if isinstance(found, Fit) and unsuited and name in unsuited:
             warning = Notice("unsuited-model", unsuited[name], model=name)
             found = replace(found, warnings=(*found.warnings, warning))
-        parameters, minimum, dimensions = known[name]
-        rows.append(
-            Row(name, parameters, minimum, dimensions, fit=found) if isinstance(found, Fit)
-            else Row(name, parameters, minimum, dimensions, error=found)
-        )  # fmt: skip
+        rows.append(ComparedModel.of(name, known[name], found))
     corrections = () if own is None else [own_name(own, name) for name in (*CORRECTIONS, OWN)]
     recommended, reason, criterion = recommend(rows, preferred=corrections, unsuited=tuple(unsuited or ()), size=size)
-    return Comparison(
-        tuple(rows), tuple(blunders.items()), recommended, reason, criterion,
-        control=int(kept.control.sum()), check=int(kept.check.sum()), model_crs=crs,
-        notes=uncovered(kept.image[kept.control], size),
+    return ComparisonRecord(
+        schema_version=1, image="", sensor="", model_crs=crs,
+        points=PointCounts(control=kept.control.sum(), check=kept.check.sum()),
+        rows=tuple(rows),
+        left_out=tuple(LeftOut(id=name, reason=reason) for name, reason in blunders.items()),
+        recommendation=Recommendation.model_validate({"model": recommended, "criterion": criterion, "reason": reason}),
+        **to_document(uncovered(kept.image[kept.control], size)), files={},
     )  # fmt: skip
 
 

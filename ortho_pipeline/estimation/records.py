@@ -1,17 +1,21 @@
-"""The adjustment of a scene as records: its points, parameters and their tests, and root mean squares.
+"""What an adjustment results in, as it is published: points, parameters and their tests, and root mean squares.
 
 Numbers that do not exist are None. A residual is measured minus predicted, in pixels (column, row).
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeGuard
+import math
+from typing import Annotated, Any, Literal, Self, TypeGuard
 
+import numpy as np
 import pydantic
 
 from ortho_pipeline.estimation.blunders import OutlyingPoint
+from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.files.json.records import Count, Pair, Record, Words
+from ortho_pipeline.models.base import Array
 
 #: Of a point for which it may be unknown.
 Residual = tuple[float | None, float | None]
@@ -44,6 +48,14 @@ class Rmse(Record):
     total: float
     n: Count
 
+    @classmethod
+    def of(cls, residuals: Array) -> Self | None:
+        """Return that of residuals ``(N, 2)``; None for no residuals."""
+        if not len(residuals):
+            return None
+        col, row = (residuals**2).mean(axis=0)
+        return cls(col=math.sqrt(col), row=math.sqrt(row), total=math.sqrt(col + row), n=len(residuals))
+
 
 class RmseOnGround(Record):
     """Root mean square in metres on the ground."""
@@ -52,6 +64,12 @@ class RmseOnGround(Record):
     y: float
     total: float
     n: Count
+
+    @classmethod
+    def of(cls, shifts: Array) -> Self | None:
+        """Return that of shifts ``(N, 2)`` in metres; None for none."""
+        found = Rmse.of(shifts)
+        return None if found is None else cls(x=found.col, y=found.row, total=found.total, n=found.n)
 
 
 class RmseOfView(Record):
@@ -119,6 +137,12 @@ class CommonError(Record):
     estimate_m: Pair
     estimate_sigma_m: Pair
 
+    @classmethod
+    def of(cls, common: CommonUnknown) -> Self:
+        """Return what is published of the unknown."""
+        estimate, left = common.value * common.sigma, np.sqrt(np.diag(common.left)) * common.sigma
+        return cls(points=common.points, sigma_m=common.sigma, estimate_m=tuple(estimate), estimate_sigma_m=tuple(left))
+
 
 class Statistics(Record):
     """Tests of the parameters; ridge is the regularisation, condition that of the design."""
@@ -163,6 +187,11 @@ class Point(Record):
     height_m: float | None = None
     lon_lat: Residual | None = None
     shown_lon_lat: Residual | None = None
+
+    @property
+    def length(self) -> float | None:
+        """Length of the residual, px."""
+        return math.hypot(*self.residual) if is_known(self.residual) else None
 
     @property
     def kind(self) -> Literal["control", "check", "out"]:
