@@ -11,7 +11,7 @@
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
 #                 and manual pages in out/man
-#   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, the tutorials (Chromium)
+#   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, tutorials, notebooks (Chromium)
 #   make constraints  pin the newest packages in tools/constraints.txt, with their hashes
 #   make pin-image    pin the base image of the Dockerfile by its digest (needs docker)
 #   make clean    remove .venv, caches and out/
@@ -94,6 +94,8 @@ packages:
 docs: setup
 	@$(BIN)/python docs/make_tutorial_images.py
 	$(BIN)/python docs/make_reference.py
+	$(BIN)/python docs/make_notebooks.py --pages
+	$(BIN)/python docs/make_commands.py
 	$(BIN)/python docs/make_man.py
 	rm -rf docs/__pycache__
 	$(BIN)/python tools/requirements.py docs | $(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt -r /dev/stdin
@@ -106,6 +108,7 @@ images: setup
 	$(BIN)/python docs/make_measure_images.py
 	$(BIN)/python docs/make_report_images.py
 	$(BIN)/python docs/make_tutorial_images.py
+	$(BIN)/python docs/make_notebooks.py
 
 constraints: setup
 	@$(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt uv

@@ -32,13 +32,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pyproj
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
-from ortho_pipeline.simulation.scanner import LineScanner
 
 GSD, PIXELS = 2.5, 4800
 #: Distance (degrees) of the middles of images; each covers 12 km, so a point is in about six of them.

@@ -14,11 +14,11 @@ from pathlib import Path
 from fit import scanner
 from ortho_ikonos.metadata import read_metadata
 from ortho_orbview3.label import read_label
-from ortho_pipeline.contract import model_faults
 
 from ortho_pipeline.batch.config import read_config
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc
+from ortho_pipeline.host.contract import model_faults
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points import read_points
 

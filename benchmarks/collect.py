@@ -1,8 +1,8 @@
-"""All benchmarks, one after the other, into docs/performance.json, and the table of docs/performance.md from it.
+"""All benchmarks, one after the other, into docs/performance.json, and the tables of both pages from it.
 
     python benchmarks/collect.py                     all
     python benchmarks/collect.py --only warp         one of them; may be repeated, the others stay as they are
-    python benchmarks/collect.py --table             the table of docs/performance.md, from the file
+    python benchmarks/collect.py --table             the tables of both pages, from the file
 
 A benchmark that fails, or a figure that is not what was asked for, is noted there and stops nothing.
 """
@@ -21,12 +21,20 @@ from pathlib import Path
 from typing import Any
 
 HOME = Path(__file__).resolve().parents[1]
-FILE, PAGE = HOME / "docs" / "performance.json", HOME / "docs" / "performance.md"
+FILE = HOME / "docs" / "performance.json"
+#: For users: one row for each CRS of the DEM. For engineers: all programs.
+USER_PAGE, PAGE = HOME / "docs" / "performance.md", HOME / "docs" / "engineering" / "performance.md"
 OURS, CUBIC = "ortho rectify, bilinear", "ortho rectify, cubic"
 COPY, EXACT = "gdal_translate (copy)", "gdalwarp exact, bilinear"
+#: Benchmark -> the CRS of its DEM, as the table for users calls it.
+DEMS = {"warp-lonlat": "EPSG:4326", "warp": "the CRS of the ortho"}
 #: Name -> the words of a benchmark, and whether it writes JSON.
 BENCHMARKS: dict[str, tuple[list[str], bool]] = {
     "warp": (["warp.py", "--rounds", "5"], True),
+    "warp-lonlat": (
+        ["warp.py", "--rounds", "5", "--dem-crs", "EPSG:4326", "--program", OURS, "--program", EXACT],
+        True,
+    ),
     "scaling": (["warp.py", "--scaling"], True),
     "points": (["points.py"], True),
     "fit": (["fit.py"], False),
@@ -70,8 +78,24 @@ def targets(told: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     return listed
 
 
-def table(document: Mapping[str, Any]) -> str:
+def row_of(runs: Mapping[str, Sequence[Mapping[str, float]]], dem: str) -> dict[str, Any]:
+    """Return the row of the table for users: seconds of both programs, and their ratios."""
+    told = summary({OURS: runs[OURS], EXACT: runs[EXACT]})
+    ratios = {part: told[EXACT][part][0] for part in ("wall_ratio", "cpu_ratio")}
+    return {"dem": dem, "ours": told[OURS]["wall"], "exact": told[EXACT]["wall"], **ratios}
+
+
+def user_table(document: Mapping[str, Any]) -> str:
     """Return the table of docs/performance.md."""
+    lines = ["| DEM in | `ortho rectify` | exact `gdalwarp` | ratio | ratio in CPU time |", "|---|---|---|---|---|"]
+    for row in document["dems"]:
+        ours, exact, wall, cpu = (f"{row[part]:.2g}" for part in ("ours", "exact", "wall_ratio", "cpu_ratio"))
+        lines.append(f"| {row['dem']} | {ours} s | {exact} s | **{wall}** | {cpu} |")
+    return "\n".join(lines)
+
+
+def table(document: Mapping[str, Any]) -> str:
+    """Return the table of docs/engineering/performance.md."""
     lines = [
         "| program | wall s | CPU s | memory MB | wall time of ours = 1 | CPU time of ours = 1 |",
         "|---|---|---|---|---|---|",
@@ -89,11 +113,12 @@ def table(document: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def write_table(document: Mapping[str, Any]) -> None:
-    """Write the table of docs/performance.md between its marks."""
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    after = rest.split(END)[1]
-    PAGE.write_text(f"{before}{BEGIN}\n{table(document)}\n{END}{after}", encoding="utf-8")
+def write_tables(document: Mapping[str, Any]) -> None:
+    """Write the tables of both pages between their marks."""
+    for page, text in ((USER_PAGE, user_table(document)), (PAGE, table(document))):
+        before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+        after = rest.split(END)[1]
+        page.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
 
 
 def run(words: Sequence[str], writes_json: bool) -> dict[str, Any]:
@@ -119,12 +144,16 @@ def merged(document: Mapping[str, Any], name: str, told: Mapping[str, Any]) -> d
     """Return the document with the result of a benchmark."""
     found = dict(told.get("found", {}))
     out = {**document, "others": dict(document.get("others", {}))}
+    if name in DEMS and found and told.get("exit") == 0:
+        rows = {row["dem"]: row for row in document.get("dems", [])}
+        rows[DEMS[name]] = row_of(found["headline"], DEMS[name])
+        out["dems"] = [rows[dem] for dem in DEMS.values() if dem in rows]
     if name in ("warp", "scaling") and found:
         out |= found
         if name == "warp":
             out["ratios"] = summary(found["headline"])
             out["targets"] = targets(out["ratios"])
-    else:
+    elif name not in DEMS or not found:
         out["others"][name] = dict(told)
     return out
 
@@ -144,7 +173,7 @@ def main() -> None:
     # Of a file that somebody else has written, too.
     document = merged(document, "warp", {"found": {"headline": document["headline"]}})
     FILE.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    write_table(document)
+    write_tables(document)
     for one in document["targets"]:
         print(f"{'met' if one['met'] else 'NOT MET':8s}{one['asked']}: {one['found']:.3g}")
 

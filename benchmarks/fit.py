@@ -15,9 +15,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pyproj
-from ortho_bilsat.truth import FOCAL_LENGTH, MAP_CRS, PITCH, SIZE, BilsatScene
+from ortho_studies.bilsat.truth import FOCAL_LENGTH, MAP_CRS, PITCH, SIZE, BilsatScene
+from ortho_studies.simulation.scanner import LineScanner
 
-from ortho_pipeline.estimation.comparison import compare
+from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.rpc import export_rpc
@@ -25,7 +26,6 @@ from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.frame.resection import resect
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import LineScanner
 
 SIMPLE = ("poly1", "poly2", "poly3", "rfm1", "rfm2", "rfm3", "projective", "dlt")
 FOURTEEN = (

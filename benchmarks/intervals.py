@@ -35,6 +35,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pyproj
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
@@ -43,7 +44,6 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT, PIXELS = 33.35, 37.25, 4000
 ERRORS, CONTROL = (0.0, 0.2, 0.5, 1.0), (4, 6, 9, 20)

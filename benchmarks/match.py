@@ -49,13 +49,13 @@ sys.path.insert(0, {tests!r})
 from pathlib import Path
 from trials import matches
 from ortho_pipeline.exchange.rpc import read_rpc
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 folder, points = Path(sys.argv[1]), int(sys.argv[2])
 found = []
 for warm in (True, False):
     wall, cpu = time.perf_counter(), time.process_time()
     kept = matches(
-        folder / "scene.tif", read_rpc(folder / "scene.tif"), Surface.open(folder / "dem.tif", "ellipsoid"),
+        folder / "scene.tif", read_rpc(folder / "scene.tif"), open_dem(folder / "dem.tif", "ellipsoid"),
         [folder / "reference.tif"], search=20.0, points=100 if warm else points, threads=2,
     )
     found = [time.perf_counter() - wall, time.process_time() - cpu]

@@ -19,16 +19,16 @@ from pathlib import Path
 
 import numpy as np
 import pyproj
+from ortho_measure.block.session import open_block_session
+from ortho_measure.serving.tiles import Tiles
+from ortho_measure.session import open_session
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal, gdal_array, osr
 
 from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
-from ortho_pipeline.measure.block.session import open_block_session
-from ortho_pipeline.measure.serving.tiles import Tiles
-from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.writing import write_dem
 
 gdal.UseExceptions()

@@ -27,7 +27,7 @@ import numpy as np
 from warp import Job
 
 from ortho_pipeline.models import RPC
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.rays import meet_surface
 
 POINTS = 2_000_000
@@ -113,7 +113,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="ortho_bench_") as folder:
         job = Job(Path(folder), 12000)
         job.write_dem()
-        model, surface = job.model(), Surface.open(job.dem, "ellipsoid")
+        model, surface = job.model(), open_dem(job.dem, "ellipsoid")
         random = np.random.default_rng(0)
         image = random.uniform(100, 11900, (POINTS, 2))
         heights = random.uniform(500, 900, POINTS)

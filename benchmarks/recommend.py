@@ -27,8 +27,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "estimation"))
 from known_scenes import DEVELOPMENT, HELD_OUT, KnownScene, known_scene
 
-from ortho_pipeline.estimation.choice.row import Row
-from ortho_pipeline.estimation.comparison import available_models, compare
+from ortho_pipeline.estimation.choice.compared_model import ComparedModel
+from ortho_pipeline.estimation.choice.comparison import available_models, compare
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.geodesy.crs import ground_transform
 
@@ -54,7 +54,7 @@ def plan(half: str, count: int) -> list[tuple[int, str, int, int]]:
     return scenes
 
 
-def errors_of(scene: KnownScene, rows: Mapping[str, Row]) -> tuple[dict[str, float], dict[str, float]]:
+def errors_of(scene: KnownScene, rows: Mapping[str, ComparedModel]) -> tuple[dict[str, float], dict[str, float]]:
     """Return the true error (px) of each model over the scene, and that to be expected before noise is drawn."""
     true, risk = {}, {}
     for name, row in rows.items():
@@ -86,12 +86,12 @@ def _risk(scene: KnownScene, fit: Fit, ground: np.ndarray, miss: np.ndarray) -> 
 
 
 def choices(
-    scene: KnownScene, rows: Mapping[str, Row], recommended: str | None, risk: Mapping[str, float]
+    scene: KnownScene, rows: Mapping[str, ComparedModel], recommended: str | None, risk: Mapping[str, float]
 ) -> dict[str, str | None]:
     """Return what each rule takes."""
     fits = {name: row.fit for name, row in rows.items() if row.fit is not None}
     left_out = {
-        name: float(found["total"])
+        name: found.total
         for name, fit in fits.items()
         if (found := fit.rmse("loo" if fit.model.params.size else "control")) and fit.redundancy > 0
     }

@@ -1,6 +1,7 @@
 """Orthorectification speed beside GDAL (and OTB where it is installed), in one run, alternating.
 
     python benchmarks/warp.py                  the 12000 x 12000 job, three rounds: a table
+    python benchmarks/warp.py --dem-crs EPSG:4326    the same with a DEM in longitude and latitude
     python benchmarks/warp.py --scaling        1000² to 40000², 32 bands, Float32, JPEG 2000, one thread
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
     python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
@@ -39,6 +40,7 @@ from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.engine import rectify
 from ortho_pipeline.warp.job import WarpJob
 from ortho_pipeline.warp.layers.accuracy import Budget, write_accuracy
@@ -63,6 +65,7 @@ class Job:
     side: int
     bands: int = 1
     kind: str = "uint16"
+    dem_crs: str = f"EPSG:{UTM}"
 
     @property
     def image(self) -> Path:
@@ -71,7 +74,7 @@ class Job:
 
     @property
     def dem(self) -> Path:
-        return self.folder / f"dem_{self.side}.tif"
+        return self.folder / f"dem_{self.side}_{self.dem_crs.replace(':', '')}.tif"
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -108,7 +111,10 @@ class Job:
             )  # fmt: skip
         elif not self.image.exists():
             self._write_image(sparse)
-        if not self.dem.exists():
+        if not self.dem.exists() and self.dem_crs != f"EPSG:{UTM}":
+            original = Job(self.folder, self.side).make(sparse=sparse)
+            gdal.Warp(str(self.dem), str(original.dem), dstSRS=self.dem_crs, resampleAlg="bilinear", dstNodata=-9999)
+        elif not self.dem.exists():
             self.write_dem()
         return self
 
@@ -216,6 +222,7 @@ def ours(job: Job, out: Path, kernel: str = "bilinear", *extra: str) -> list[str
 API = """
 import sys, pyproj
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.warp.engine import rectify
@@ -224,7 +231,7 @@ image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))
 model = rpc_of_dataset(open_dataset(image))[0]
 def make():
-    surface = Surface.open(dem, "ellipsoid")
+    surface = open_dem(dem, "ellipsoid")
     rectify(WarpJob(model, RasterSource(image), surface, grid, driver="GTiff"), out)
 """
 
@@ -363,7 +370,7 @@ def table(runs: dict[str, list[Run]], megapixels: float, base: str) -> str:
 
 def alone(job: Job, model: SensorModel | None = None, kernel: str = "bilinear") -> float:
     """Return the seconds of the warp alone, in this process, with kernels loaded: no start-up, no report."""
-    surface, (xmin, ymin, xmax, ymax) = Surface.open(job.dem, "ellipsoid"), job.extent
+    surface, (xmin, ymin, xmax, ymax) = open_dem(job.dem, "ellipsoid"), job.extent
     grid = Grid.of_extent(pyproj.CRS.from_epsg(UTM), (xmin, ymin, xmax, ymax), (GSD, GSD))
     out = job.folder / "alone.tif"
     source = RasterSource(job.image)
@@ -441,7 +448,7 @@ def layers(job: Job, pairs: int) -> dict[str, list[tuple[float, float]]]:
         hiding = Hiding(out, heights, job.folder / "mask.tif")
         rectify(WarpJob(model, source, surface, grid, driver="GTiff"), hiding)
 
-    dem, dsm = Surface.open(job.dem, "ellipsoid"), Surface.open(job.write_dsm(), "ellipsoid")
+    dem, dsm = open_dem(job.dem, "ellipsoid"), open_dem(job.write_dsm(), "ellipsoid")
     todo = {
         "accuracy, DEM of 30 m": (accuracy, dem), "hidden left empty, DEM of 30 m": (empty, dem),
         "mask of hidden, DEM of 30 m": (mask, dem), "hidden left empty, DSM of 1 m": (empty, dsm),
@@ -560,6 +567,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where scenes are kept between runs (default: a temporary one)")
     parser.add_argument("--json", type=Path, help="write all runs there")
     parser.add_argument("--pairs", type=int, default=5, help="of runs, with --layers and --cog")
+    parser.add_argument("--dem-crs", default=f"EPSG:{UTM}", help="of the table; by default that of the ortho")
     parser.add_argument("--program", action="append", help="of the table, only this one; may be repeated")
     for option in ("scaling", "kernels", "accuracy", "layers", "cog"):
         parser.add_argument(f"--{option}", action="store_true")
@@ -577,7 +585,7 @@ def main() -> None:
         elif arguments.accuracy:
             document["accuracy"] = accuracy(folder, arguments.side)
         else:
-            job = Job(folder, arguments.side)
+            job = Job(folder, arguments.side, dem_crs=arguments.dem_crs)
             apart(job.make)
             runs = cogs(job, arguments.pairs) if arguments.cog else headline(job, arguments.rounds, arguments.program)
             print(f"{job.side} x {job.side} UInt16, {job.megapixels:.0f} Mpx out; {document['machine']}\n")

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from ortho_studies.simulation.terrain import Landscape, Terrain
 from osgeo import gdal
 from scipy.ndimage import uniform_filter
 from sessions import run
@@ -21,7 +22,6 @@ from sessions import run
 import ortho_pipeline as op
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.drawing import plot_network
-from ortho_pipeline.simulation.terrain import Landscape, Terrain
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -137,7 +137,7 @@ def matches(path: Path) -> None:
     found = op.match_scene(
         op.open_scene("sample_data/scene.tif"),
         op.MatchOptions(reference=["sample_data/reference.tif"], points=100),
-        op.Surface.open("sample_data/dem.tif"),
+        op.open_dem("sample_data/dem.tif"),
     ).matches
     kept = np.flatnonzero(found.reason == "")[::8][:8]
     figure, rows = plt.subplots(2, len(kept), figsize=(12, 3.3), layout="constrained")
@@ -209,7 +209,7 @@ def network(path: Path) -> None:
 def heights(path: Path) -> None:
     """Draw the DEM minus the heights of intersected ties."""
     points = np.genfromtxt("heights.csv", delimiter=",", names=True, skip_header=2, usecols=(1, 2, 3))
-    surface = op.Surface.open("sample_data/cartosat/dem.tif")
+    surface = op.open_dem("sample_data/cartosat/dem.tif")
     off = surface.heights(np.stack([points["x"], points["y"]], axis=1), "EPSG:4326") - points["h"]
     figure, axes = plt.subplots(figsize=(7, 5.2), layout="constrained")
     shown = axes.scatter(points["x"], points["y"], c=off, cmap="viridis", vmin=-60, vmax=0, edgecolors="0.4")
@@ -290,7 +290,7 @@ def panoramic(path: Path) -> None:
             axes.axhline(0, color="0.7", linewidth=0.8)
             axes.plot(points.image[:, 0], off[:, 0], "o", markersize=4, color="tab:blue", label="column")
             axes.plot(points.image[:, 0], off[:, 1], "s", markersize=3, color="tab:orange", label="row")
-            axes.set_title(f"{name}: {found.rmse('control')['total']:.3g} px", fontsize=10)
+            axes.set_title(f"{name}: {found.rmse('control').total:.3g} px", fontsize=10)
             axes.set_ylabel("residual, px")
         rows[1].set_xlabel("column")
         rows[0].legend(fontsize=8, loc="upper right")

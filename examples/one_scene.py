@@ -36,9 +36,9 @@ found = op.compare(
     size=(scene.width, scene.height),
 )  # fmt: skip
 for row in found.rows:
-    by_check = "-" if row.fit is None else f"{row.fit.rmse('check')['total']:.3f}"
+    by_check = "-" if row.error else f"{row.rmse.check.total:.3f}"
     print(f"{row.model:16} {row.parameters:2} parameters   check points {by_check} px")
-print(f"Recommended: {found.recommended}. {found.reason}")
+print(f"Recommended: {found.recommended}. {found.recommendation.reason}")
 
 # %% [markdown]
 # ## Adjust, and look at the fit (a notebook shows tables)

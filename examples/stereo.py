@@ -34,7 +34,7 @@ block = op.adjust(start, points)
 for name, model in block.models.items():
     print(name, dict(zip(model.param_names, np.round(model.params, 2).tolist(), strict=True)))
 rms = block.object_rms("check")
-print(f"sigma0 {block.sigma0:.2f} px; check points: {rms['plan']:.0f} m in plan, {rms['h']:.0f} m in height")
+print(f"sigma0 {block.sigma0:.2f} px; check points: {rms.plan:.0f} m in plan, {rms.h:.0f} m in height")
 print(block.gauge)
 
 # %% [markdown]

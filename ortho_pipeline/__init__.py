@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.control.matching import match_scene as match_scene
     from ortho_pipeline.display.notices import Notice as Notice
     from ortho_pipeline.errors import OrthoError as OrthoError
-    from ortho_pipeline.estimation.comparison import compare as compare
+    from ortho_pipeline.estimation.choice.comparison import compare as compare
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
     from ortho_pipeline.estimation.observations.prior import Prior as Prior
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene as Scene
     from ortho_pipeline.hookspecs import Sensor as Sensor
     from ortho_pipeline.hookspecs import hookimpl as hookimpl
+    from ortho_pipeline.host import open_scene as open_scene
     from ortho_pipeline.models import RPC as RPC
     from ortho_pipeline.models import ImageCorrection as ImageCorrection
     from ortho_pipeline.models import SensorModel as SensorModel
@@ -43,7 +45,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.options import PointOptions as PointOptions
     from ortho_pipeline.options import SceneOptions as SceneOptions
     from ortho_pipeline.options import SurfaceOptions as SurfaceOptions
-    from ortho_pipeline.plugins import open_scene as open_scene
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
     from ortho_pipeline.points import write_points as write_points
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.report.notebook.charts import plot as plot
     from ortho_pipeline.report.notebook.tables import html as html
     from ortho_pipeline.surface.base import Surface as Surface
+    from ortho_pipeline.surface.dem import open_dem as open_dem
 
 __version__: str
 
@@ -78,7 +80,7 @@ _HOMES = {
     "SurfaceOptions": "options",
     "Vertical": "geodesy.crs",
     "adjust": "block.adjustment",
-    "compare": "estimation.comparison",
+    "compare": "estimation.choice.comparison",
     "export_rpc": "exchange.rpc",
     "fit": "estimation.fit",
     "from_geodataframe": "exchange.geodataframe",
@@ -87,7 +89,8 @@ _HOMES = {
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
-    "open_scene": "plugins",
+    "open_dem": "surface.dem",
+    "open_scene": "host",
     "ortho_array": "commands.arrays.lazy",
     "plot": "report.notebook.charts",
     "read_block_points": "block.point_files",
@@ -102,24 +105,35 @@ _HOMES = {
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
+
+def _lazily(door: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return `__getattr__` for the module `door`: it loads each name from its home when the name is first used."""
+
+    def load(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {door!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"ortho_pipeline.{homes[name]}"), name)
+        setattr(sys.modules[door], name, value)
+        return value
+
+    return load
+
+
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
+    _load = _lazily(__name__, _HOMES)
 
     def __getattr__(name: str) -> Any:
         if name == "__version__":
             from importlib.metadata import version
 
             return version("ortho-pipeline")
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+        return _load(name)
 
 
 #: What a notebook shows as a table: module and name of each type.
 _SHOWN = (
     ("hookspecs", "Scene"), ("points.table", "Points"), ("estimation.fit", "Fit"), ("block.fit", "BlockFit"),
-    ("estimation.comparison", "Comparison"),
+    ("estimation.choice.comparison", "ComparisonRecord"),
 )  # fmt: skip
 
 

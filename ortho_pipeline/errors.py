@@ -68,12 +68,19 @@ class OrthoError(Exception):
         self.remedy = remedy
         super().__init__(message)
 
+    def complete(self, file: object, field: str | None, remedy: str | None) -> None:
+        """Add what the error does not say itself."""
+        if self.file is None and isinstance(file, str | PathLike):
+            self.file = str(fspath(file))
+        self.field = self.field or field
+        self.remedy = self.remedy or remedy
+
     def __str__(self) -> str:
         where = ": ".join(part for part in (self.file, self.field) if part)
         text = f"{where}: {self.message}" if where else self.message
         return f"{text}\n  Remedy: {self.remedy}" if self.remedy else text
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         # Keyword-only arguments do not survive the default pickling, and errors cross process borders in batch runs.
         return _rebuild, (type(self), self.message, self.file, self.field, self.remedy)
 
@@ -90,12 +97,8 @@ def completed(
     try:
         yield
     except OrthoError as error:
-        if of is not None and error.field != of:
-            raise
-        if error.file is None and isinstance(file, str | PathLike):
-            error.file = str(fspath(file))
-        error.field = error.field or field
-        error.remedy = error.remedy or remedy
+        if of is None or error.field == of:
+            error.complete(file, field, remedy)
         raise
 
 
@@ -116,15 +119,20 @@ def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]],
     def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
         @functools.wraps(function)
         def reading(*args: _P.args, **named: _P.kwargs) -> _R:
-            with completed(args[0] if args else None, field=field, remedy=remedy):
+            try:
                 return function(*args, **named)
+            except OrthoError as error:
+                error.complete(args[0] if args else None, field, remedy)
+                raise
 
         return reading
 
     return decorate
 
 
-def _rebuild(kind, message, file, field, remedy):
+def _rebuild(
+    kind: type[OrthoError], message: str, file: str | None, field: str | None, remedy: str | None
+) -> OrthoError:
     return kind(message, file=file, field=field, remedy=remedy)
 
 
@@ -161,7 +169,7 @@ class NotConverged(ModelError):
 
 
 class PluginError(OrthoError):
-    """A plugin broke the contract of hookspecs.py."""
+    """A plugin broke the contract of `ortho_pipeline.plugin`."""
 
 
 class StorageError(OrthoError):

@@ -1,11 +1,10 @@
-"""All that a plugin author reads.
+"""The hooks, and what plugins return from them; authors import all of it from `ortho_pipeline.plugin`.
 
 A plugin is a module that is named in the entry-point group ``ortho_pipeline`` of an installed distribution
 (``tinysat = "tinysat_plugin"`` under ``[project.entry-points.ortho_pipeline]``). It translates what a vendor wrote
 into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole of a plugin::
 
-    from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-    from ortho_pipeline.exchange.rpc import rpc_of_dataset
+    from ortho_pipeline.plugin import Scene, Sensor, hookimpl, rpc_of_dataset
 
     @hookimpl
     def ortho_sensors():
@@ -19,11 +18,14 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-Files beside an image are found from ``ortho_pipeline.files.locations.place(dataset.GetDescription())``, which has the
-methods of `pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+Files beside an image are found from ``ortho_pipeline.plugin.place(dataset.GetDescription())``, which has the methods of
+`pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
 
-The host tries every scene at a few points before it works with it (`ortho_pipeline.plugins.contract`). Test more with
+The host tries every scene at a few points before it works with it (`ortho_pipeline.host.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
+
+The hooks stand here and not in `ortho_pipeline.plugin`: that module names readers and commands, and rooms below those
+use `Scene` too.
 
 A package that adds commands to ``ortho`` names a module in the group ``ortho_pipeline_commands``, which implements
 `ortho_commands`. That module is imported by ``ortho --help``: it declares the commands and imports nothing heavy. So
@@ -50,10 +52,11 @@ if TYPE_CHECKING:
 PROJECT_NAME = "ortho_pipeline"
 #: The entry-point groups, and the hooks that are called in the modules which each names.
 GROUPS = {
-    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_studies"),
+    PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_formats"),
     "ortho_pipeline_commands": ("ortho_commands",),
 }
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
+#: Marks a function of a plugin as a hook.
 hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 
@@ -259,82 +262,33 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """The outcome of a simulation: its files by name, and what to try with them (text for the terminal)."""
+class Format:
+    """A format that sensor models are written in, by ``ortho export --format NAME``.
 
-    files: Mapping[str, Path]
-    text: str
+    ::
 
-
-@dataclass(frozen=True)
-class Reproduced:
-    """The outcome of an experiment: a document of JSON values, its text for the terminal, and its page of HTML."""
-
-    document: Mapping[str, Any]
-    text: str
-    page: Callable[[], str]
-
-
-@dataclass(frozen=True)
-class StudyOption:
-    """An option of ``ortho simulate NAME``: a keyword argument of `Study.simulate`.
+        @hookimpl
+        def ortho_formats():
+            yield Format("corners", "ground of the four corners", "_corners.json", write_corners)
 
     Parameters
     ----------
     name : str
-        The keyword; on the command line with dashes, unless `flag` says otherwise.
-    help : str
-        One line.
-    kind : type
-        int, float, or bool (a switch).
-    default : optional
-        None where the simulation has a default of its own.
-    low, high : float, optional
-        The least and the greatest value.
-    unit : str
-        Shown in place of the value.
-    flag : str
-        The switch as it is typed (``--rpc/--no-rpc``).
-    """
-
-    name: str
-    help: str
-    kind: type = float
-    default: Any = None
-    low: float | None = None
-    high: float | None = None
-    unit: str = ""
-    flag: str = ""
-
-
-@dataclass(frozen=True)
-class Study:
-    """Scenes of known truth of one sensor, and the experiment of a paper on them.
-
-    The first line of the docstrings of both functions is what ``--help`` says.
-
-    Parameters
-    ----------
-    name : str
-        ``ortho simulate NAME`` and ``ortho reproduce NAME``; unique among all plugins.
+        As it is typed: lower case, digits and dashes; unique among all plugins.
     title : str
-        One line for the lists of both commands.
-    simulate : callable(folder, *, seed, **options) -> Simulated, optional
-        Writes a product with its DEM and points. Its files appear together, or none does.
-    reproduce : callable(realisations, *, progress) -> Reproduced, optional
-        Computes what a paper has tables of; calls `progress` with the share that is done (0 to 1).
-    options : tuple of StudyOption
-        Of `simulate`, besides the seed.
-    realisations : int
-        How often noise is drawn where the user does not say.
+        One line for ``ortho export --help``, such as "RPC as text".
+    ending : str
+        What the name of the file ends with, after the stem of the image: ``_corners.json``. No two formats share one.
+    write : callable(export, path) -> float
+        Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance in
+        pixels between the file and the model. Raises `InputError` for a model that the format cannot express. If it
+        fails, the host removes the file.
     """
 
     name: str
     title: str
-    simulate: Callable[..., Simulated] | None = None
-    reproduce: Callable[..., Reproduced] | None = None
-    options: tuple[StudyOption, ...] = ()
-    realisations: int = 100
+    ending: str
+    write: Callable[[Any, Path], float | None]
 
 
 @dataclass(frozen=True)
@@ -381,8 +335,8 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 
 
 @hookspec
-def ortho_studies() -> Iterable[Study]:
-    """Return simulated scenes and experiments; called for ``ortho simulate`` and ``ortho reproduce`` alone."""
+def ortho_formats() -> Iterable[Format]:
+    """Return the formats that this plugin writes sensor models in."""
     raise NotImplementedError
 
 

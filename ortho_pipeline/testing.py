@@ -24,10 +24,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import described
 from ortho_pipeline.hookspecs import Scene, Sensor
+from ortho_pipeline.host.contract import model_faults, scene_faults, sensor_faults
 from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.plugins.contract import model_faults, scene_faults, sensor_faults
 
 #: Ground to image to ground to image has to close within this (pixels).
 CLOSURE = 1e-5
@@ -129,7 +129,7 @@ def _assert_none(faults: Iterator[str]) -> None:
 
 def _check_foreign(sensor: Sensor) -> None:
     """Check that a sensor leaves datasets alone that nobody can take for its own."""
-    from ortho_pipeline.raster.source import gdal
+    from osgeo import gdal
 
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "foreign.tif"))
@@ -302,7 +302,7 @@ def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArra
         raise AssertionError(f"to_dict must be plain JSON values: {error}") from error
     if data["kind"] not in KINDS:
         # A kind that a plugin brings is known once the plugin is found.
-        from ortho_pipeline.plugins import Host
+        from ortho_pipeline.host import Host
 
         Host.discover()
     _check_copy(model_from_dict(json.loads(text)), model, ground, image, "to_dict")

@@ -17,10 +17,12 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from ortho_bilsat.simulation import write_product
-from ortho_cartosat.simulation import write_product as write_cartosat
-from ortho_ikonos.simulation import write_product as write_ikonos
-from ortho_orbview3.simulation import write_product as write_orbview3
+from ortho_studies.bilsat.simulation import write_product
+from ortho_studies.cartosat.simulation import write_product as write_cartosat
+from ortho_studies.ikonos.simulation import write_product as write_ikonos
+from ortho_studies.orbview3.simulation import write_product as write_orbview3
+from ortho_studies.simulation.scanner import LineScanner, SimulatedPoints, render, simulate_points
+from ortho_studies.simulation.terrain import Landscape, Terrain
 from osgeo import gdal
 
 from ortho_pipeline.exchange.rpc import write_rpc_txt
@@ -29,8 +31,6 @@ from ortho_pipeline.files import whole_or_nothing, write_text
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.points import Points, write_points
-from ortho_pipeline.simulation.scanner import LineScanner, SimulatedPoints, render, simulate_points
-from ortho_pipeline.simulation.terrain import Landscape, Terrain
 from ortho_pipeline.surface.writing import write_dem as write_dem_file
 
 gdal.UseExceptions()

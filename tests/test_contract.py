@@ -15,10 +15,10 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.estimation.fit import Prior
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.host import Host
+from ortho_pipeline.host.contract import model_faults, sensor_faults
 from ortho_pipeline.models import KINDS
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.plugins import Host
-from ortho_pipeline.plugins.contract import model_faults, sensor_faults
 
 gdal.UseExceptions()
 SIZE = (120, 90)

@@ -15,8 +15,8 @@ import click
 import pytest
 
 import ortho_pipeline
+from ortho_pipeline.cli.program import COMMANDS as HOST
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.plugins import Host
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("sample_data/**/*.md")])
@@ -55,14 +55,15 @@ COMMANDS = [pytest.param(line, id=f"{page.name}: {line[:60]}") for page in PAGES
 @pytest.fixture
 def with_tinysat(monkeypatch):
     """Have the plugin that docs/plugins.md builds."""
-    from ortho_pipeline.commands import studies
+    from ortho_studies import studies
 
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "ortho_tinysat"))
     import ortho_tinysat_flight
     import ortho_tinysat_study
 
     monkeypatch.setitem(cli.commands, "flight", ortho_tinysat_flight.flight)
-    monkeypatch.setattr(studies, "studies", lambda: {"tinysat": ortho_tinysat_study.STUDY, **Host.discover().studies})
+    installed = studies.studies()
+    monkeypatch.setattr(studies, "studies", lambda: {"tinysat": ortho_tinysat_study.STUDY, **installed})
     yield
     for name in ("ortho_tinysat_study", "ortho_tinysat_flight", "ortho_tinysat"):
         sys.modules.pop(name, None)
@@ -89,12 +90,48 @@ def test_links_lead_somewhere(page):
             assert os.path.exists(page.parent / target), f"{page.name} links to {target}"
 
 
-@pytest.mark.parametrize("group", ["simulate", "reproduce"])
-def test_every_study_is_in_the_table_of_commands(group):
-    command = cli.get_command(click.Context(cli), group)
-    text = (ROOT / "docs/cli.md").read_text()
-    for name in command.list_commands(click.Context(command)):
-        assert f"| `ortho {group} {name} " in text
+def test_every_command_has_a_group_and_a_page(tmp_path):
+    """Each is in one group of docs/cli.md, and its generated page is in the same group of the site."""
+    import make_commands
+
+    make_commands.main(tmp_path)
+    names = cli.list_commands(click.Context(cli))
+    assert set(names) <= {path.stem for path in tmp_path.iterdir()}
+    rows = re.findall(r"^\| (.*?) \|", (ROOT / "docs/cli.md").read_text(), re.MULTILINE)
+    grouped, group = {}, ""
+    for row in rows:
+        found = re.findall(r"`ortho ([a-z-]+)`", row)
+        group = group if found else row
+        grouped |= dict.fromkeys(found, group)
+    assert sorted(grouped) == names
+    (listed,) = re.findall(r"- Commands: .*\n((?: {6}.*\n)+)", (ROOT / "mkdocs.yml").read_text())
+    site = {}
+    for line in listed.splitlines():
+        name = re.search(r"commands/([a-z-]+)\.md", line)
+        group = group if name else line.strip(" -:")
+        site |= {name[1]: group} if name else {}
+    assert site == grouped
+
+
+def test_the_page_of_a_command_has_all_of_its_help(tmp_path):
+    """Each option is in a table, the examples are in a block; a bar in a cell does not end it."""
+    import make_commands
+
+    make_commands.main(tmp_path)
+    for name in HOST:
+        text, command = (tmp_path / f"{name}.md").read_text(), cli.get_command(click.Context(cli), name)
+        assert "## More options" not in text, name
+        for option in command.params:
+            if isinstance(option, click.Option) and option.name != "help":
+                assert re.search(rf"^\| `[^`]*--{make_commands.long_name(option)}\b", text, re.MULTILINE), (
+                    name,
+                    option.name,
+                )
+        for row in re.findall(r"^\|.*$", text, re.MULTILINE):
+            assert len(re.split(r"(?<!\\)\|", row)) in (4, 5), row
+    assert (
+        "\northo rectify scene.tif --gcps gcps.geojson --dem dem.tif -o out\n" in (tmp_path / "rectify.md").read_text()
+    )
 
 
 def test_every_public_name_has_a_page_of_its_docstring(tmp_path):
@@ -136,7 +173,7 @@ def test_changes_stand_by_version():
     assert "- " not in intro.splitlines()
 
 
-@pytest.mark.parametrize("page", ["SECURITY.md", "docs/reliability.md"])
+@pytest.mark.parametrize("page", ["SECURITY.md", "docs/engineering/reliability.md"])
 def test_tests_that_hold_promises_are_there(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     named = set(re.findall(r"`(?:[\w/]+\.py::)?(test_\w+)`", text))

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 
 from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.estimation.comparison import compare
+from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.imaging.registration import Transform
@@ -18,8 +20,6 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.points.selection import select_control
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 ROOT = Path(__file__).resolve().parents[1]
 #: What sentences count.

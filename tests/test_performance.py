@@ -1,4 +1,4 @@
-"""docs/performance.json holds what docs/performance.md shows, in the form in which `make bench` writes it."""
+"""docs/performance.json holds what both pages on performance show, in the form in which `make bench` writes it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def collect() -> ModuleType:
     return module
 
 
-def test_the_table_of_the_page_is_that_of_the_file(collect: ModuleType) -> None:
+def test_the_tables_of_the_pages_are_those_of_the_file(collect: ModuleType) -> None:
     document = json.loads(collect.FILE.read_text(encoding="utf-8"))
-    page = collect.PAGE.read_text(encoding="utf-8")
-    shown = page.split(collect.BEGIN)[1].split(collect.END)[0].strip()
-    assert shown == collect.table(document), "python benchmarks/collect.py --table"
+    for page, expected in ((collect.PAGE, collect.table), (collect.USER_PAGE, collect.user_table)):
+        shown = page.read_text(encoding="utf-8").split(collect.BEGIN)[1].split(collect.END)[0].strip()
+        assert shown == expected(document), "python benchmarks/collect.py --table"
     assert document["ratios"] == collect.summary(document["headline"])
     assert document["targets"] == collect.targets(document["ratios"])
     assert {"cpu", "system", "python", "gdal", "numpy"} <= set(document["machine"])
@@ -50,6 +50,19 @@ def test_ratios_are_of_runs_within_a_round(collect: ModuleType) -> None:
         "exact gdalwarp takes at least 20 times the CPU": True,
         "bilinear takes at most 512 MB": True,
     }
+
+
+def test_each_crs_of_the_dem_has_its_row(collect: ModuleType) -> None:
+    document = json.loads(collect.FILE.read_text(encoding="utf-8"))
+    runs = {
+        collect.OURS: [{"wall": 2.0, "cpu": 3.0, "memory": 1.0}],
+        collect.EXACT: [{"wall": 30.0, "cpu": 60.0, "memory": 1.0}],
+    }
+    after = collect.merged(document, "warp-lonlat", {"exit": 0, "found": {"headline": runs}})
+    row = {"dem": "EPSG:4326", "ours": 2.0, "exact": 30.0, "wall_ratio": 15.0, "cpu_ratio": 20.0}
+    assert after["dems"] == [row, document["dems"][1]]
+    assert "| EPSG:4326 | 2 s | 30 s | **15** | 20 |" in collect.user_table(after)
+    assert after["headline"] == document["headline"]
 
 
 def test_a_benchmark_that_fails_is_noted_and_stops_nothing(collect: ModuleType, tmp_path: Path) -> None:

@@ -15,9 +15,9 @@ from ortho_pipeline import commands
 from ortho_pipeline.cli.signals import Terminated
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.exchange.rpc import rpc_metadata, write_rpc_txt
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
+from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.host import Host
 from ortho_pipeline.models import RPC, SensorModel
-from ortho_pipeline.plugins import Host
 
 gdal.UseExceptions()
 
@@ -81,7 +81,7 @@ def test_installed_plugin_is_found_with_distribution_and_version(install):
     host = Host(installed=True)
     assert "third" in host.sensors
     assert str(host.provenance("third")) == "third-party 1.2"
-    assert host.provenance("third").to_json()["module"] == "third_party_plugin"
+    assert host.provenance("third").module == "third_party_plugin"
     assert any(origin.distribution == "third-party" for origin in host.plugins())
 
 
@@ -172,7 +172,7 @@ def test_hook_without_marker_or_with_other_arguments_is_an_error():
 @pytest.mark.parametrize(
     ("offered", "message"),
     [
-        (["alpha"], "returned str instead of Sensor"),
+        (["alpha"], "ortho_sensors yields str, not Sensor"),
         ([make_sensor(name=" a ")], "not a name"),
         ([make_sensor(recognises=None)], "must be callable"),
         ([make_sensor(options={"band": 3})], "options"),
@@ -341,42 +341,3 @@ def test_rpc_option_is_enough_for_a_file_without_rpc(tmp_path):
 def test_rpc_sensor_warns_of_a_crop_with_the_rpc_of_the_whole(tmp_path):
     scene = Host([ortho_rpc]).open_scene(make_image(tmp_path / "a.tif", make_rpc(col_off=5000.0)))
     assert "crop" in scene.warnings[0]
-
-
-# -- studies ---------------------------------------------------------------------------------------------------------
-
-
-def test_studies_are_collected_when_they_are_asked_for():
-    called = []
-    module = make_plugin(make_sensor())
-    module.ortho_studies = hookimpl(lambda: called.append(1) or [Study("mine", "Mine")])
-    host = Host([module])
-    assert not called
-    assert list(host.studies) == ["mine"]
-    assert host.studies
-    assert called == [1]
-
-
-@pytest.mark.parametrize(
-    ("offered", "message"),
-    [
-        ([3], "yields int, not Study"),
-        ([Study("mine", ""), Study("mine", "")], "the study 'mine' twice"),
-        (None, "ortho_studies returned NoneType"),
-    ],
-)
-def test_studies_that_are_none_name_their_plugin(offered, message):
-    module = make_plugin(make_sensor())
-    module.ortho_studies = hookimpl(lambda: offered)
-    with pytest.raises(PluginError, match=message):
-        _ = Host([module]).studies
-
-
-def test_what_is_no_study_is_refused_with_those_that_there_are(tmp_path):
-    from ortho_pipeline.commands import studies
-
-    with pytest.raises(InputError, match=r"there are: bilsat, cartosat, ikonos, orbview3"):
-        studies.simulate("landsat", tmp_path)
-    with pytest.raises(InputError, match=r"no option 'tilt' .*off_nadir"):
-        studies.simulate("bilsat", tmp_path, tilt=3)
-    assert not list(tmp_path.iterdir())

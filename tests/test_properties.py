@@ -21,7 +21,6 @@ from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_metadata, rpc_of_fields, write_rpb, write_rpc_txt
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import (
     KINDS,
     RPC,
@@ -43,7 +42,8 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.runtime.process_limits import Resources
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp import engine as warp
 
 SEEDS = st.integers(0, 10_000)
@@ -334,7 +334,7 @@ def test_an_ortho_depends_on_no_tiles_memory_or_threads(
 ) -> None:
     from osgeo import gdal
 
-    source, surface = RasterSource(tiny.image), Surface.open(tiny.dem, "ellipsoid")
+    source, surface = RasterSource(tiny.image), open_dem(tiny.dem, "ellipsoid")
     utm = pyproj.CRS(32734)
     centre = pyproj.Transformer.from_crs(4326, utm, always_xy=True).transform(tiny.model.lon_off, tiny.model.lat_off)
     grid = Grid.of_extent(utm, (centre[0] - 900, centre[1] - 700, centre[0] + 900, centre[1] + 700), (4.8, 4.8))

@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 import typing
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +19,7 @@ import pytest
 import shapely
 
 import ortho_pipeline as op
-from ortho_pipeline import commands
+from ortho_pipeline import commands, plugin
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 
@@ -27,9 +28,13 @@ ROOT = Path(__file__).resolve().parent.parent
 # -- types
 
 
-def test_the_package_is_typed_and_its_lazy_names_are_those_that_checkers_know() -> None:
+def test_the_package_is_typed() -> None:
     assert files("ortho_pipeline").joinpath("py.typed").is_file()
-    package = ast.parse((ROOT / "ortho_pipeline" / "__init__.py").read_text())
+
+
+@pytest.mark.parametrize("door", [op, commands, plugin], ids=lambda door: door.__name__)
+def test_lazy_names_are_those_that_checkers_know(door) -> None:
+    package = ast.parse(Path(door.__file__).read_text())
     (known,) = (node for node in package.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
     homes = {
         alias.name: node.module.removeprefix("ortho_pipeline.")
@@ -37,10 +42,29 @@ def test_the_package_is_typed_and_its_lazy_names_are_those_that_checkers_know() 
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     }
-    assert homes == op._HOMES
-    assert set(op.__all__) == set(homes)
-    for name in op.__all__:
-        assert getattr(op, name) is not None
+    assert homes == door._HOMES
+    assert set(door.__all__) == set(homes)
+    for name in door.__all__:
+        assert getattr(door, name) is not None
+
+
+def test_all_modules_of_public_names_are_typed_strictly() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["mypy"]["overrides"]
+    (strict,) = (set(one["module"]) for one in settings if one.get("disallow_untyped_defs"))
+    homes = {f"ortho_pipeline.{home}" for door in (op, plugin) for home in door._HOMES.values()}
+    homes |= {getattr(getattr(op, name), "__module__", "") for name in op.__all__}
+    homes |= {getattr(getattr(plugin, name), "__module__", "") for name in plugin.__all__}
+    homes = {name for name in homes if name.startswith("ortho_pipeline")} - {"ortho_pipeline.commands.arrays.lazy"}
+    assert homes | {"ortho_pipeline", "ortho_pipeline.plugin", "ortho_pipeline.testing"} == strict
+
+
+def test_what_declares_a_command_loads_no_more_than_the_hooks() -> None:
+    code = (
+        "import sys; from ortho_pipeline.plugin import Subcommand, hookimpl; "
+        "print(*sorted(name for name in sys.modules if name.startswith(('ortho_pipeline.', 'numpy', 'osgeo'))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["ortho_pipeline.hookspecs", "ortho_pipeline.plugin"]
 
 
 USER_SCRIPT = """

@@ -65,7 +65,12 @@ def test_what_is_installed_from_it_works(unpacked, tmp_path):
     assert not json.loads(run(ortho, "doctor", "--json", cwd=tmp_path)).get("broken")
     sensors = json.loads(run(ortho, "sensors", "--json", cwd=tmp_path))
     bundled = {path.name.removeprefix("ortho_") for path in (ROOT / "plugins").glob("ortho_*")}
-    assert {one["name"] for one in sensors["sensors"]} >= bundled - {"asp"}
+    assert {one["name"] for one in sensors["sensors"]} >= bundled - {"asp", "measure", "studies"}
+    assert all(f"\n  {name} " in run(ortho, "--help", cwd=tmp_path) for name in ("measure", "reproduce", "simulate"))
+    made = json.loads(run(ortho, "simulate", "bilsat", "--size", 256, "-o", "simulated", "--json", cwd=tmp_path))
+    assert (tmp_path / made["files"]["image"]).is_file()
+    page = "import importlib.resources as r; print(r.files('ortho_measure').joinpath('page', 'index.html').is_file())"
+    assert run(python, "-c", page, cwd=tmp_path).strip() == "True"
     assert not sensors["broken"]
     words = ("--gcps", sample / "gcps.geojson", "--dem", sample / "dem.tif", "-o", "out", "--json")
     made = json.loads(run(ortho, "rectify", sample / "scene.tif", *words, cwd=tmp_path))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import importlib
+import inspect
 import json
 import os
 import re
@@ -14,9 +17,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_studies import hookspecs as of_studies
 from osgeo import gdal
 
-from ortho_pipeline import hookspecs
+from ortho_pipeline import hookspecs, plugin
+from ortho_pipeline.exchange.export import Export
 from ortho_pipeline.testing import check_sensor_model
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -180,17 +185,43 @@ def test_the_tutorial_is_the_example():
         assert "\n\n\n".join(parts) + "\n" == (EXAMPLE / name).read_text(encoding="utf-8"), name
 
 
-KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Study, hookspecs.Subcommand)
+KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Format, Export, hookspecs.Subcommand, of_studies.Study)
 
 
 def test_everything_that_an_author_can_use_is_in_the_tutorial():
     hooks = [name for name, value in vars(hookspecs).items() if hasattr(value, "ortho_pipeline_spec")]
-    assert len(hooks) == 4
+    hooks += [name for name, value in vars(of_studies).items() if hasattr(value, "ortho_studies_spec")]
+    assert len(hooks) == 5
     fields = [field.name for kind in KINDS for field in dataclasses.fields(kind)]
     for name in hooks + fields:
         assert f"`{name}`" in TUTORIAL, f"{name} is not explained in docs/plugins.md"
 
 
+def described(name: str) -> str | None:
+    """Return the docstring of a name of `plugin`, or the comment above it where it is a value."""
+    value, home = getattr(plugin, name), importlib.import_module(f"ortho_pipeline.{plugin._HOMES[name]}")
+    if (inspect.isclass(value) or inspect.isfunction(value)) and inspect.getdoc(value):
+        return inspect.getdoc(value)
+    stated = re.search(rf"^((?:#: .*\n)+)(?:\w+, )*{name}\b.*? = ", inspect.getsource(home), re.MULTILINE)
+    return stated and stated[1]
+
+
+def test_every_name_for_plugins_is_documented():
+    rows = re.search(r"\n## What you can import\n(.*?)\n## ", TUTORIAL, re.DOTALL)[1].splitlines()
+    listed = [name for row in rows if row[:1] == "|" for name in re.findall(r"`(\w+)`", row.split("|")[1])]
+    assert set(listed) == set(plugin.__all__)
+    assert not [name for name in plugin.__all__ if not described(name)]
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLE.rglob("*.py")), ids=lambda path: path.name)
+def test_the_example_imports_what_is_public(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    named = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    named |= {one.name for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}
+    hosts = {name for name in named if name.partition(".")[0] == "ortho_pipeline"}
+    assert hosts <= {"ortho_pipeline", "ortho_pipeline.plugin", "ortho_pipeline.testing"}
+
+
 def test_the_example_stays_small():
-    assert len((EXAMPLE / "ortho_tinysat.py").read_text(encoding="utf-8").splitlines()) < 110
+    assert len((EXAMPLE / "ortho_tinysat.py").read_text(encoding="utf-8").splitlines()) < 125
     assert not os.access(EXAMPLE / "__init__.py", os.F_OK)

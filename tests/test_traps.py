@@ -1,4 +1,4 @@
-"""Traps of the field (docs/reliability.md) that no test of a module holds."""
+"""Traps of the field (docs/engineering/reliability.md) that no test of a module holds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_rpc_of_an_image_is_used_and_not_its_control_points(tiny):
 
 def test_every_trap_has_a_test_that_exists():
     root = Path(__file__).resolve().parent
-    page = (root.parent / "docs" / "reliability.md").read_text(encoding="utf-8")
+    page = (root.parent / "docs" / "engineering" / "reliability.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| .* \| `([\w/.]+)::(\w+)` \|$", page, re.MULTILINE)
     assert [int(number) for number, _, _ in rows] == list(range(1, 46))
     for _, file, name in rows:

@@ -3,16 +3,23 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.prior import Prior
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.ellipsoid import geocentric
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models import SensorModel
+from ortho_pipeline.plugin import (
+    Export,
+    Format,
+    InputError,
+    Prior,
+    Scene,
+    Sensor,
+    SensorModel,
+    geocentric,
+    hookimpl,
+    place,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +104,12 @@ def open_scene(dataset: Any, *, mounting: str = "0") -> Scene:
 
 
 @hookimpl
-def ortho_studies() -> Iterable[Study]:
-    from ortho_tinysat_study import STUDY  # here: few commands need it, and all would wait for it
+def ortho_formats() -> Iterable[Format]:
+    yield Format("tinysat", "TinySat-1 flight with roll and delay", "_flight.json", write_flight)
 
-    yield STUDY
+
+def write_flight(export: Export, path: Path) -> float:
+    if not isinstance(export.model, StraightScanner):
+        raise InputError("only TinySat-1 has such a flight", field="formats", remedy="take another format")
+    path.write_text(json.dumps({"camera": export.model.to_dict()}))
+    return 0.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from ortho_pipeline.hookspecs import Subcommand, hookimpl
+from ortho_pipeline.plugin import Subcommand, hookimpl
 
 
 @hookimpl

@@ -2,10 +2,7 @@
 
 import click
 
-from ortho_pipeline.cli.machine.terminal import say
-from ortho_pipeline.cli.options import image_argument, json_option
-from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_json
+from ortho_pipeline.plugin import Command, image_argument, json_option, print_json, say
 
 
 @click.command(cls=Command)
@@ -18,10 +15,9 @@ def flight(image: str, as_json: bool) -> None:
     """
     import numpy as np  # here: the help of the command does not need it
 
-    import ortho_pipeline as op
-    from ortho_pipeline.geodesy.ellipsoid import geodetic
+    from ortho_pipeline.plugin import geodetic, open_scene
 
-    model = op.open_scene(image, "tinysat").model
+    model = open_scene(image, "tinysat").model
     height = float(geodetic(np.array([model.position]))[0, 2])
     speed = float(np.linalg.norm(model.velocity))
     if as_json:

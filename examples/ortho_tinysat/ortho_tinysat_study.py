@@ -1,16 +1,17 @@
 """Scenes of known truth for TinySat-1, and an experiment: how well six control points tell roll and delay."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pyproj
+from ortho_studies.hookspecs import Reproduced, Simulated, Study, StudyOption, hookimpl
 from ortho_tinysat import StraightScanner
 from osgeo import gdal
 
 import ortho_pipeline as op
-from ortho_pipeline.geodesy.ellipsoid import geocentric
-from ortho_pipeline.hookspecs import Reproduced, Simulated, Study, StudyOption
+from ortho_pipeline.plugin import geocentric
 
 LON, LAT, SIZE, ROLL, DELAY = 12.5, 41.9, (120, 90), 1e-4, 0.004
 
@@ -64,3 +65,8 @@ def reproduce(realisations: int, *, progress=None) -> Reproduced:
 
 NOISE = StudyOption("noise", "Of the measurements.", float, 0.3, low=0.0, unit="PX")
 STUDY = Study("tinysat", "A TinySat-1 scene over Rome", simulate, reproduce, (NOISE,), realisations=200)
+
+
+@hookimpl
+def ortho_studies() -> Iterable[Study]:
+    yield STUDY

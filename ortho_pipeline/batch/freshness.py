@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.plan import Job
-from ortho_pipeline.batch.records import Digests, FileState, Record, key_of, siblings
+from ortho_pipeline.batch.records import Digests, FileState, RunRecord, key_of, siblings
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import confined
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import is_address, is_far, url_of
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.files.locations import Location
+from ortho_pipeline.stores.objects import Objects
 
 #: Larger files beside an image are not metadata.
 _COMPANION_BYTES = 5_000_000
@@ -27,12 +26,12 @@ _COMPANION_BYTES = 5_000_000
 DIGESTS = Digests()
 
 
-def is_scene(record: Record) -> bool:
+def is_scene(record: RunRecord) -> bool:
     """Tell whether a record is that of a finished scene, with all that a summary says of one."""
     return record.status == "done" and bool(record.facts)
 
 
-def inputs_as_recorded(record: Record, job: Job, checksums: bool = False) -> tuple[FileState, ...] | None:
+def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> tuple[FileState, ...] | None:
     """Return the inputs of a scene with their present dates; None if they, settings or software are not as recorded.
 
     Parameters
@@ -62,7 +61,7 @@ def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
     return states
 
 
-def as_recorded(record: Record, job: Job) -> bool:
+def as_recorded(record: RunRecord, job: Job) -> bool:
     """Tell whether inputs and outputs have the content that the record states, whatever their dates say."""
     with confined(job.output):
         try:
@@ -82,21 +81,21 @@ def far_states(job: Job) -> tuple[FileState, ...]:
         If the store does not answer.
     """
     found = []
-    for address in sorted({url_of(path) for _, path in job.request.files if is_far(path)}):
-        if not is_address(address):
+    for address in sorted({Location(path).url for _, path in job.request.files if Location(path).is_far}):
+        if not Location(address).is_address:
             continue
         folder, _, name = address.rpartition("/")
         try:
             size, tag = Objects(folder, allow_network=job.request.scene.allow_network).stated(name)
         except FileNotFoundError as error:
             raise InputError("there is no such object", file=address, remedy="check the address") from error
-        found.append(FileState("far input", address, size, 0, "", tag))
+        found.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
     return tuple(found)
 
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
     """Return the files in whose folders a new name could change the scene."""
-    return [path for _, path in job.request.named if os.path.isabs(path) and not is_far(path)]
+    return [path for _, path in job.request.named if os.path.isabs(path) and not Location(path).is_far]
 
 
 def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
@@ -115,7 +114,7 @@ def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
     return known
 
 
-def untouched(record: Record, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
+def untouched(record: RunRecord, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
     """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made.
 
     Of a scene with inputs in a store this is not known here.
@@ -123,7 +122,7 @@ def untouched(record: Record, job: Job, listings: dict[Path, Sequence[str]]) -> 
     return _files_untouched(record, job, record.inputs) and record.siblings == siblings(folders(job), listings)
 
 
-def _files_untouched(record: Record, job: Job, recorded: Sequence[FileState]) -> bool:
+def _files_untouched(record: RunRecord, job: Job, recorded: Sequence[FileState]) -> bool:
     return (
         is_scene(record)
         and all(one.untouched() for one in record.inputs)
@@ -132,11 +131,11 @@ def _files_untouched(record: Record, job: Job, recorded: Sequence[FileState]) ->
     )
 
 
-def reads_the_same(record: Record, job: Job) -> bool:
+def reads_the_same(record: RunRecord, job: Job) -> bool:
     """Tell whether a scene among other neighbours than before would be made from the same files."""
     try:
         far = tuple(one for one in record.inputs if one.tag)
-        near = replace(record, inputs=tuple(one for one in record.inputs if not one.tag))
+        near = record.replaced(inputs=tuple(one for one in record.inputs if not one.tag))
         if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job)):
             return False
         with confined(job.output):

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.locations import VsiPath, is_address, is_far, is_on_web, located, url_of
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.files.locations import Location, VsiPath, located
 from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.stores.objects import Objects
 
 _WALKS, _PATTERN_BYTES = 2, 1000
 #: No store has more objects behind a pattern.
@@ -38,9 +38,9 @@ class Places:
 
     def __init__(self, file: str | os.PathLike[str], root: str | os.PathLike[str] | None, allow_network: bool) -> None:
         self.file: str | os.PathLike[str] = file
-        self.far, self.allow_network = is_far(file), allow_network
+        self.far, self.allow_network = Location(file).is_far, allow_network
         self.base = Path() if self.far else Path(os.path.abspath(file)).parent
-        self.address = url_of(file).rpartition("/")[0] if self.far else ""
+        self.address = Location(file).url.rpartition("/")[0] if self.far else ""
         self.root = self.base.resolve() if root is None else Path(root).resolve()
 
     def inside(self, text: str, field: str) -> Path:
@@ -68,13 +68,13 @@ class Places:
 
     def of(self, text: str, field: str) -> Place:
         """Return the place of a file: a path, or what lies at an address."""
-        if is_address(text):
+        if Location(text).is_address:
             return self._located(text, field)
         return self._located(self._address(text, field), field) if self.far else self.inside(text, field)
 
     def name(self, text: str, field: str) -> str:
         """Return the place of a file as text: an absolute path, or an address."""
-        if is_address(text):
+        if Location(text).is_address:
             self._located(text, field)
             return text
         return self._address(text, field) if self.far else str(self.inside(text, field))
@@ -87,8 +87,8 @@ class Places:
                 f"{pattern[:60]!r} is too long a search", file=self.file, field=field,
                 remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
             )  # fmt: skip
-        if is_address(pattern) or self.far:
-            text = pattern if is_address(pattern) else self._address(pattern, field)
+        if Location(pattern).is_address or self.far:
+            text = pattern if Location(pattern).is_address else self._address(pattern, field)
             return [self._located(address, field) for address in self._listed(text, field)]
         # Nothing outside of the root is searched either.
         parts = pattern.split("/")
@@ -124,7 +124,7 @@ class Places:
         scheme, _, rest = pattern.partition("://")
         parts = rest.split("/")
         fixed = list(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
-        if is_on_web(pattern) or not fixed:
+        if Location(pattern).is_on_web or not fixed:
             raise InputError(
                 "a web server is not searched", file=self.file, field=field,
                 remedy="name the images one by one, or by a pattern in a store (s3, gs, az)",

@@ -15,15 +15,14 @@ from typing import Any
 
 import pyproj
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
 from ortho_pipeline.batch.places import Place, Places
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
 from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.locations import VsiPath, is_address, located, place
-from ortho_pipeline.files.stac.item import is_item
+from ortho_pipeline.files.locations import Location, VsiPath, located, place
 from ortho_pipeline.options import (
     MatchOptions,
     MosaicOptions,
@@ -165,7 +164,7 @@ def versions() -> dict[str, Any]:
         **{name: metadata.version(name) for name in packages},
         "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
         "proj": pyproj.proj_version_str,
-        "plugins": sorted(f"{one.plugin} ({one})" for one in plugins.Host.discover().plugins()),
+        "plugins": sorted(f"{one.plugin} ({one})" for one in host.Host.discover().plugins()),
     }
 
 
@@ -225,7 +224,7 @@ class _Planner:
         names = [entry.name for _, entry in entries if entry.name is not None]
         name = self._filled(names[-1] if names else "{stem}", image, f"{where}.name")
         scene, shown = self._scene(settings, image, where), image
-        if isinstance(image, Path) and is_item(image):
+        if isinstance(image, Path) and Location(image).is_item:
             asset, scene = resolved(image, scene)
             shown = self.places.of(str(asset), f"{where}.image")
         request = Request(
@@ -263,7 +262,7 @@ class _Planner:
             values["dem"] = self._raster_of(values["dem"], scene, f"{where}.surface.dem")
         for cell in () if values["dem"] is None else matching_files(values["dem"]) or ():
             self.places.inside(cell, f"{where}.surface.dem")
-        if values["source"] is not None and not is_address(values["source"]):
+        if values["source"] is not None and not Location(values["source"]).is_address:
             values["source"] = self._file(values["source"], image, f"{where}.surface.source")
         values["fill"] = str(values["fill"])
         if isinstance(values["sigma"], str):

@@ -8,7 +8,6 @@ Checksums are taken again only of files whose size or time of change differ from
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import logging
@@ -16,15 +15,15 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pydantic
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import listing
+from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.options.texts import Text
 from ortho_pipeline.report.wording import refuted
 
@@ -35,8 +34,7 @@ _log = logging.getLogger(__name__)
 MAX_BYTES = 50_000_000
 
 
-@dataclass(frozen=True)
-class FileState:
+class FileState(Record):
     """A file at the time of its checksum; `role` says what it is to the scene.
 
     Of an object in a store there is no date. Its `tag` is the one that the store gave this version.
@@ -53,7 +51,9 @@ class FileState:
     def of(cls, role: str, path: Path, digest: Callable[..., str] = files.sha256, name: str | None = None) -> FileState:
         """Return the state of a file, which is recorded under `name` (its path without one)."""
         stat = path.stat()
-        return cls(role, name or str(path), stat.st_size, stat.st_mtime_ns, digest(path))
+        return cls(
+            role=role, path=name or str(path), bytes=stat.st_size, mtime_ns=stat.st_mtime_ns, sha256=digest(path)
+        )
 
     def untouched(self, folder: Path | None = None) -> bool:
         """Tell whether size and time of change are those recorded; `folder` is that of a relative path."""
@@ -78,8 +78,7 @@ class FileState:
             return False
 
 
-@dataclass(frozen=True)
-class Record:
+class RunRecord(Record):
     """Inputs and outputs of a scene.
 
     Parameters
@@ -106,7 +105,7 @@ class Record:
     outputs: tuple[FileState, ...] = ()
     siblings: str = ""
     seconds: float = 0.0
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: Mapping[str, Any] = pydantic.Field(default_factory=dict)
     error: Mapping[str, Any] | None = None
     run: str = ""
 
@@ -124,7 +123,7 @@ class Record:
         files.write_text(path, self.text())
 
     @classmethod
-    def read(cls, path: Path) -> Record | None:
+    def at(cls, path: Path) -> Self | None:
         """Return the record, or None where there is none of this version that can be understood."""
         if not path.is_file():
             return None
@@ -136,20 +135,20 @@ class Record:
         return found
 
     @classmethod
-    def parse(cls, data: bytes) -> Record | None:
+    def parse(cls, data: bytes) -> Self | None:
         """Return the record of a text that somebody else may have written, None if it cannot be understood."""
         try:
             document = files.parse_json(data, "record", "run again")
             if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):
                 return None
-            record = _checked().validate_python(document)
+            record = cls.read(document)
             if record.facts:
-                _facts().validate_python(record.facts)
+                Facts.read(record.facts)
                 refuted(record.facts["notices"])  # what a page says of them needs their members
             if record.error is not None:
-                _error().validate_python(record.error)
+                Failure.read(record.error)
                 told = {key: text if text is None else Text.read(text) for key, text in record.error.items()}
-                record = replace(record, error=told)
+                record = record.replaced(error=told)
         except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None
         # What is outside of the scene's folder is not ours to judge, or to remove.
@@ -164,8 +163,7 @@ class Record:
         return all(one.same(folder) for one in self.outputs)
 
 
-@dataclass(frozen=True)
-class Facts:
+class Facts(Record):
     """What a summary says of a scene that is done."""
 
     sensor: str
@@ -180,8 +178,7 @@ class Facts:
     notices: Sequence[Mapping[str, Any]]
 
 
-@dataclass(frozen=True)
-class Problem:
+class Failure(Record):
     """What a summary says of a scene that failed."""
 
     kind: str
@@ -194,22 +191,6 @@ class Problem:
 
 #: Roles of the outputs that every scene has which is done.
 _OUTPUTS = {"ortho", "report", "html"}
-
-
-@functools.cache
-def _facts() -> pydantic.TypeAdapter[Facts]:
-    return pydantic.TypeAdapter(Facts)
-
-
-@functools.cache
-def _error() -> pydantic.TypeAdapter[Problem]:
-    return pydantic.TypeAdapter(Problem)
-
-
-@functools.cache
-def _checked() -> pydantic.TypeAdapter[Record]:
-    """Return what makes a record of a document whose values are of the types that its fields say."""
-    return pydantic.TypeAdapter(Record)
 
 
 def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versions: Mapping[str, Any]) -> str:

@@ -30,17 +30,17 @@ from ortho_pipeline.batch.freshness import (
     untouched,
 )
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
-from ortho_pipeline.batch.records import FileState, Record, key_of, locked, siblings
+from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
-from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.process_limits import Progress
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
 #: A larger file is not a report on a mosaic.
@@ -72,7 +72,7 @@ def make_scene(job: Job, checksums: bool = False) -> Outcome:
 
 def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
     clear_up(job.record)
-    record = Record.read(job.record)
+    record = RunRecord.at(job.record)
     # What an earlier run wrote, and this one may not write any more.
     before = record.outputs if record is not None else ()
     try:
@@ -87,7 +87,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             seconds = good.seconds if mine else time.monotonic() - begin
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
         if record is not None:
-            Record(job.name, "", "started", outputs=before).write(job.record)
+            RunRecord(name=job.name, key="", status="started", outputs=before).write(job.record)
         asked = job.request
         result = commands.rectify(
             asked.image, job.folder, scene=asked.scene, points=asked.points, surface=asked.surface, match=asked.match,
@@ -100,15 +100,17 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             raise result.failure
         report = result.document["report"]
         read = (*as_read(job, report), *far)
-        done = Record(
-            job.name, key_of(read, job.configuration, job.versions), "done", read, made, listing,
-            time.monotonic() - begin, _facts(report), run=job.run,
+        done = RunRecord(
+            name=job.name, key=key_of(read, job.configuration, job.versions), status="done", inputs=read, outputs=made,
+            siblings=listing, seconds=time.monotonic() - begin, facts=_facts(report), run=job.run,
         )  # fmt: skip
         done.write(job.record)
         return Outcome(job.name, "done", done.seconds, paths_of(done, job), done.facts)
     except Exception as error:
         told = error_document(error)
-        failed = Record(job.name, "", "failed", outputs=before, seconds=time.monotonic() - begin, error=told)
+        failed = RunRecord(
+            name=job.name, key="", status="failed", outputs=before, seconds=time.monotonic() - begin, error=told
+        )
         with contextlib.suppress(OrthoError):
             failed.write(job.record)
         # Without its report an ortho is there, but not finished: the next run makes the scene again.
@@ -128,14 +130,14 @@ def _check_versions(job: Job) -> None:
                          remedy="install the same versions everywhere")  # fmt: skip
 
 
-def _still_good(record: Record | None, job: Job, listing: str, checksums: bool) -> Record | None:
+def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: bool) -> RunRecord | None:
     """Return the record with the present dates if inputs, settings and outputs have the content recorded."""
     if record is None or not is_scene(record) or not record.intact(job.folder, checksums):
         return None
     read = inputs_as_recorded(record, job, checksums)
     if read is None:
         return None
-    fresh = replace(record, inputs=read, siblings=listing, outputs=_restated(record.outputs, job.folder))
+    fresh = record.replaced(inputs=read, siblings=listing, outputs=_restated(record.outputs, job.folder))
     if fresh != record:
         fresh.write(job.record)
     return fresh
@@ -143,7 +145,7 @@ def _still_good(record: Record | None, job: Job, listing: str, checksums: bool) 
 
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
     """Return outputs of unchanged content with their present dates."""
-    return tuple(replace(one, mtime_ns=(folder / one.path).stat().st_mtime_ns) for one in outputs)
+    return tuple(one.replaced(mtime_ns=(folder / one.path).stat().st_mtime_ns) for one in outputs)
 
 
 def _remove(folder: Path, names: set[str]) -> None:
@@ -212,7 +214,7 @@ def run(
         If the file is wrong, or another run works in the output folder. What is wrong with a scene is its outcome.
     """
     planned = config if isinstance(config, Plan) else plan(config, allow_network=allow_network)
-    if store is None and is_far(planned.path):
+    if store is None and Location(planned.path).is_far:
         raise InputError(
             "what a pipeline file of another machine asks for goes to a store", file=planned.path, field="output",
             remedy="give a folder of objects for the outputs, such as s3://bucket/prefix, or copy the file",
@@ -253,7 +255,7 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
     listings: dict[Path, Sequence[str]] = {}
     listed = []
     for job in planned.jobs:
-        record = Record.read(job.record)
+        record = RunRecord.at(job.record)
         state = "new" if record is None else record.status
         if state == "done" and record is not None and not untouched(record, job, listings):
             state = "done" if reads_the_same(record, job) else "changed"
@@ -302,7 +304,7 @@ class _Run:
         left = any(name.endswith(".part") for name in os.listdir(self.planned.output / STATE))
         listings: dict[Path, Sequence[str]] = {}
         for job in jobs:
-            record = None if self.checksums else Record.read(job.record)
+            record = None if self.checksums else RunRecord.at(job.record)
             if record is not None and untouched(record, job, listings):
                 if left:
                     with contextlib.suppress(OrthoError):
@@ -363,9 +365,9 @@ class _Mosaic:
             for job in jobs
         ]  # fmt: skip
         # What the records know of the orthos need not be taken again.
-        known = [Record.read(job.record) for job in jobs]
+        known = [RunRecord.at(job.record) for job in jobs]
         self.inputs = tuple(
-            replace(state, role=job.name, path=str(job.folder / state.path))
+            state.replaced(role=job.name, path=str(job.folder / state.path))
             for job, record in zip(jobs, known, strict=True)
             for state in (record.outputs if record else ())
             if state.role in ("ortho", "accuracy")
@@ -374,7 +376,7 @@ class _Mosaic:
         self.key = key_of(self.inputs, {**asdict(self.settings), "order": list(order.items())}, versions())
 
     def make(self, crew: Crew) -> dict[str, Any]:
-        record = Record.read(self.record)
+        record = RunRecord.at(self.record)
         if record is not None and record.key == self.key and record.intact(self.output):
             # A record may lie: what it vouches for is read as any other file, and made again if it is not a report.
             with contextlib.suppress(InputError):
@@ -393,7 +395,7 @@ class _Mosaic:
         if failure is not None:
             return {**document, "status": "done", "error": error_document(failure)}
         made = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
-        Record("mosaic", self.key, "done", self.inputs, made).write(self.record)
+        RunRecord(name="mosaic", key=self.key, status="done", inputs=self.inputs, outputs=made).write(self.record)
         return {**document, "status": "done"}
 
     def _seams(self, pairs: Sequence[Overlap], crew: Crew) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ortho_pipeline.batch.freshness import as_recorded, untouched
 from ortho_pipeline.batch.plan import RUN_FILES, Job, Plan, plan
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, summary_of
 from ortho_pipeline.errors import InputError, error_document
@@ -28,7 +28,7 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
     begin, found = time.monotonic(), []
     listings: dict[Path, Sequence[str]] = {}
     for job in planned.jobs:
-        record = Record.read(job.record)
+        record = RunRecord.at(job.record)
         if record is None or record.status not in ("done", "failed"):
             found.append(Outcome(job.name, "missing"))
         elif record.status == "failed":
@@ -45,6 +45,6 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
     return result
 
 
-def paths_of(record: Record, job: Job) -> dict[str, str]:
+def paths_of(record: RunRecord, job: Job) -> dict[str, str]:
     """Return the outputs of a scene by what they are."""
     return {one.role: str(job.folder / one.path) for one in record.outputs}

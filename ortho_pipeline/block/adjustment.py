@@ -24,7 +24,7 @@ from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.settling import Heights
-from ortho_pipeline.block.heights.source import DemHeights, begun
+from ortho_pipeline.block.heights.source import DemHeights, started
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
@@ -38,11 +38,11 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import marks_warning
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.base import Surface
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
@@ -83,7 +83,7 @@ def adjust(
     exclude : collection of str
         Ids of points that take no part.
     heights : DemHeights or Surface, optional
-        A DEM that says the height of each tie, and of each control point without one, as an observation.
+        A DEM. Its height at each tie, and at each control point without a height, is an observation.
 
     Raises
     ------
@@ -100,9 +100,9 @@ def adjust(
     stated = points.of_rays(order)
     dem = None if heights is None else DemHeights.of(heights)
     problem, state, whole = _prepared(chosen, stated, priors or {}, exclude, dem)
-    under = None if dem is None else Heights.under(dem, problem, state.local)
-    if under is not None:
-        problem = under.applied(problem, state.local)
+    dem_heights = None if dem is None else Heights.under(dem, problem, state.local)
+    if dem_heights is not None:
+        problem = dem_heights.applied(problem, state.local)
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
@@ -113,7 +113,7 @@ def adjust(
     common = CommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
-    solved, inside, under = _first(problem, state, selection, whole, under, robust)
+    solved, inside, dem_heights = _first(problem, state, selection, whole, dem_heights, robust)
     rejected, near = tuple[GrossError, ...](), solved.state
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
@@ -127,28 +127,33 @@ def adjust(
     gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
-    solved, found, common, under = _weighed(solved, inside, common, under)
+    solved, found, common, dem_heights = _weighed(solved, inside, common, dem_heights)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
     notes += uncertain_images(solved, stated)
-    return _result(solved, found, common, under, inside, points, order, chosen, gauge, rejected, notes)
+    return _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
 
 
 def _first(
-    problem: BlockProblem, state: State, selection: Selection, whole: Selection, under: Heights | None, robust: bool
+    problem: BlockProblem,
+    state: State,
+    selection: Selection,
+    whole: Selection,
+    dem_heights: Heights | None,
+    robust: bool,
 ) -> tuple[Solved, Selection, Heights | None]:
-    """Return the solution of everything, what takes part in it, and the heights of the DEM under it."""
+    """Return the solution of everything, what takes part in it, and the heights of the DEM."""
     # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
     tolerance = NEAR if robust and not problem.unstated.any() else EXACT
     solved = attempt(problem, state, whole, tolerance)
     held = _held(solved, state, selection, whole) if robust else None
     _refuse_many_outside(solved if held is None else held, whole)
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
-    if under is not None:
-        solved, under = under.settled(solved, inside, tolerance)
+    if dem_heights is not None:
+        solved, dem_heights = dem_heights.settled(solved, inside, tolerance)
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
-    return solved, inside, under
+    return solved, inside, dem_heights
 
 
 def _held(solved: Solved, start: State, selection: Selection, whole: Selection) -> Solved | None:
@@ -216,7 +221,7 @@ def _prepared(
     problem = BlockProblem(points, models, frame, known, pseudo_of(models, points, priors))
     local = _at_known(problem, local, rays)
     if dem is not None:
-        local = begun(dem, problem, State(models, local), rays)
+        local = started(dem, problem, State(models, local), rays)
     seen = rays & np.isfinite(predict(frame, models, points, local)).all(axis=1)
     ground = points.control & takes_part
     nowhere = ~problem.active(Selection.of(seen, ground))
@@ -291,7 +296,7 @@ def _started(problem: BlockProblem, state: State, selection: Selection) -> Block
 
 
 def _weighed(
-    solved: Solved, selection: Selection, common: CommonError | None, under: Heights | None
+    solved: Solved, selection: Selection, common: CommonError | None, dem_heights: Heights | None
 ) -> tuple[Solved, Posterior, CommonError | None, Heights | None]:
     """Return the solution with the sigmas that the observations have, what is known of these, and common errors."""
     if common is not None:
@@ -309,11 +314,11 @@ def _weighed(
         before = solved
         solved, common = common.settled(solved, selection)
         found = found if solved is before else posterior(solved)
-    if under is not None:
+    if dem_heights is not None:
         before = solved
-        solved, under = under.settled(solved, selection)
+        solved, dem_heights = dem_heights.settled(solved, selection)
         found = found if solved is before else posterior(solved)
-    return solved, found, common, under
+    return solved, found, common, dem_heights
 
 
 def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
@@ -339,7 +344,7 @@ def _result(
     solved: Solved,
     found: Posterior,
     common: CommonError | None,
-    under: Heights | None,
+    dem_heights: Heights | None,
     selection: Selection,
     points: BlockPoints,
     order: Index,
@@ -365,8 +370,8 @@ def _result(
     object_residuals = problem.frame.apart(known, local)
     used_ground = selection.ground & active
     covariance, of_points = _with_common(covariance, common)
-    covariance, of_heights = _with_common(covariance, None if under is None else under.common)
-    told = None if under is None else under.result(solved)
+    covariance, of_heights = _with_common(covariance, None if dem_heights is None else dem_heights.common)
+    taken = None if dem_heights is None else dem_heights.record(solved)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     ground_covariance = ground_covariance + of_heights
@@ -391,11 +396,11 @@ def _result(
         variances=variances,
         gauge=gauge,
         common_error=common,
-        heights=told,
+        heights=taken,
         shared_errors=shared,
         rejected=rejected,
         outlying=doubts,
-        warnings=(*notices(doubts, points, object_residuals), *notes, *([] if told is None else told.notices())),
+        warnings=(*notices(doubts, points, object_residuals), *notes, *([] if taken is None else taken.notices())),
         condition=solved.condition,
         iterations=solved.iterations,
     )

@@ -13,22 +13,134 @@ import pyproj
 from ortho_pipeline.block.common_error import CommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.heights.settling import HeightsUsed
+from ortho_pipeline.block.heights.settling import HeightsRecord
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.known_points import ContradictedPoint
 from ortho_pipeline.block.reliability.suspects import GrossError
-from ortho_pipeline.block.variances.components import Variances
+from ortho_pipeline.block.variances.components import Variances, VariancesRecord
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.fit import root_mean_square
+from ortho_pipeline.estimation.records import CommonError as CommonErrorRecord
+from ortho_pipeline.estimation.records import NoticeDocument, Parameter, Residual, Rmse, Role
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
+from ortho_pipeline.files.json.records import Count, Record, Words
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import ROLES
+
+Triple = tuple[float, float, float]
+#: Of a point of which it may be unknown.
+OnGround = tuple[float | None, float | None, float | None]
+
+
+class RmseByRole(Record):
+    """Over the points of each role in one image."""
+
+    control: Rmse | None
+    check: Rmse | None
+    tie: Rmse | None
+
+    @property
+    def all(self) -> Rmse | None:
+        """Over the points of all roles."""
+        return merged(self.control, self.check, self.tie)
+
+
+class ImageRms(Record):
+    """At the adjusted ground, at the known ground, and at the known ground with the models as they were."""
+
+    residuals: RmseByRole
+    back_projected: RmseByRole
+    raw_residuals: RmseByRole
+
+
+class AdjustedImage(Record):
+    """The adjusted parameters of an image, and how well its rays fit."""
+
+    parameters: dict[str, Parameter]
+    rays: Count
+    rms: ImageRms
+
+
+class ObjectRms(Record):
+    """Root mean squares on the ground, in plan and height, and the least and greatest residual."""
+
+    x: float
+    y: float
+    h: float
+    plan: float
+    n: Count
+    min: Triple
+    max: Triple
+
+
+class ObjectRmsByRole(Record):
+    """Of control points, whose ground was used, and of check points, whose ground was not."""
+
+    control: ObjectRms | None
+    check: ObjectRms | None
+
+
+class BlockPoint(Record):
+    """A point: its adjusted longitude, latitude and height, its sigma in metres, and known minus adjusted ground."""
+
+    id: str
+    role: Role
+    used_ground: bool
+    ground: OnGround
+    sigma: OnGround
+    residual: OnGround
+
+
+class Ray(Record):
+    """A point in an image: its residual at the adjusted ground, and at the known ground."""
+
+    id: str
+    image: str
+    used: bool
+    measured: Residual
+    residual: Residual
+    back_projected: Residual
+
+
+class BlockAdjustment(Record):
+    """The adjustment of all images and points together; gauge names what defines the datum."""
+
+    gauge: str
+    sigma0: float | None
+    redundancy: int
+    degrees_of_freedom: float
+    condition: float | None
+    iterations: Count
+    variances: VariancesRecord
+    images: dict[str, AdjustedImage]
+    object_rms: ObjectRmsByRole
+    points: tuple[BlockPoint, ...]
+    rays: tuple[Ray, ...]
+    rejected: tuple[GrossError, ...]
+    outlying: tuple[ContradictedPoint, ...]
+    warnings: tuple[Words, ...]
+    notices: tuple[NoticeDocument, ...]
+    common_error: CommonErrorRecord | None = None
+    shared_errors: dict[str, SharedErrors] | None = None
+    heights: HeightsRecord | None = None
+
+
+def merged(*parts: Rmse | None) -> Rmse | None:
+    """Return the root mean squares of several groups together; None where there is no point."""
+    groups = [part for part in parts if part]
+    number = sum(part.n for part in groups)
+    if not number:
+        return None
+    col, row = (
+        sum(part.n * square**2 for part, square in zip(groups, squares, strict=True)) / number
+        for squares in ([part.col for part in groups], [part.row for part in groups])
+    )
+    return Rmse(col=math.sqrt(col), row=math.sqrt(row), total=math.sqrt(col + row), n=number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +157,7 @@ class BlockFit:
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
-    estimate. `heights` is what a DEM said of ties. Of images whose neighbouring measurements share errors,
+    estimate. `heights` is what was taken from a DEM. Of images whose neighbouring measurements share errors,
     `shared_errors` says what they do, and covariances have grown by it.
     """
 
@@ -71,7 +183,7 @@ class BlockFit:
     outlying: tuple[ContradictedPoint, ...] = ()
     warnings: tuple[Notice, ...] = ()
     common_error: CommonError | None = None
-    heights: HeightsUsed | None = None
+    heights: HeightsRecord | None = None
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
     iterations: int = 0
@@ -80,7 +192,7 @@ class BlockFit:
         found = self.object_rms()
         checks = ""
         if found:
-            checks = f"; RMSE {found['plan']:.2f} m, height {found['h']:.2f} m at {counted(found['n'], 'check point')}"
+            checks = f"; RMSE {found.plan:.2f} m, height {found.h:.2f} m at {counted(found.n, 'check point')}"
         sigma0 = "unknown" if self.sigma0 is None else f"{self.sigma0:.3g}"
         size = f"{counted(len(self.models), 'image')}, {counted(len(self.points), 'point')}"
         return f"<block of {size}: sigma0 {sigma0}{checks}>"
@@ -113,7 +225,7 @@ class BlockFit:
         """Return the known ground ``(N, 3)`` in another CRS; NaN for ties."""
         return self.points.known_in(crs)
 
-    def image_rms(self, image: str, role: str, which: str = "back_projected") -> dict[str, float | int] | None:
+    def image_rms(self, image: str, role: str, which: str = "back_projected") -> Rmse | None:
         """Return root mean squares (px) of reprojection residuals of an image over a role; None where there is none.
 
         Parameters
@@ -129,78 +241,77 @@ class BlockFit:
         if role == "control" and which != "residuals":
             rays &= self.used_ground[self.points.point]
         values = getattr(self, which)[rays]
-        return root_mean_square(values[np.isfinite(values).all(axis=1)])
+        return Rmse.of(values[np.isfinite(values).all(axis=1)])
 
-    def object_rms(self, role: str = "check") -> dict[str, Any] | None:
+    def object_rms(self, role: str = "check") -> ObjectRms | None:
         """Return root mean squares, least and greatest of the object-space residuals (m) of a role; None for none."""
         values = self.object_residuals[self.points.roles == role]
         values = values[np.isfinite(values).all(axis=1)]
         if not len(values):
             return None
         east, north, up = np.sqrt((values**2).mean(axis=0)).tolist()
-        return {
-            "x": east, "y": north, "h": up, "plan": math.hypot(east, north), "n": len(values),
-            "min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist(),
+        return ObjectRms(
+            x=east, y=north, h=up, plan=math.hypot(east, north), n=len(values), min=values.min(axis=0).tolist(),
+            max=values.max(axis=0).tolist(),
+        )  # fmt: skip
+
+    @property
+    def record(self) -> BlockAdjustment:
+        """What is published of it (docs/engineering/formats.md)."""
+        shared: dict[str, Any] = {} if self.common_error is None else {
+            "common_error": CommonErrorRecord.of(self.common_error)
         }  # fmt: skip
+        if self.shared_errors:
+            shared["shared_errors"] = dict(self.shared_errors)
+        if self.heights is not None:
+            shared["heights"] = self.heights
+        return BlockAdjustment(
+            gauge=self.gauge,
+            sigma0=self.sigma0,
+            redundancy=self.redundancy,
+            degrees_of_freedom=self.degrees_of_freedom,
+            condition=json_value(self.condition),
+            iterations=self.iterations,
+            variances=self.variances.record,
+            images={image: self._image(image) for image in self.points.images},
+            object_rms=ObjectRmsByRole(control=self.object_rms("control"), check=self.object_rms("check")),
+            points=self._points(),
+            rays=self._rays(),
+            rejected=self.rejected,
+            outlying=self.outlying,
+            **to_document(self.warnings),
+            **shared,
+        )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the section ``adjustment`` of the block's document (docs/formats/block-points.md)."""
-        points = self.points
-        values = dict(zip(self.parameters, zip(self.values, self.sigmas, strict=True), strict=True))
-        return {
-            "gauge": self.gauge,
-            "sigma0": self.sigma0,
-            "redundancy": self.redundancy,
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "condition": json_value(self.condition),
-            "iterations": self.iterations,
-            "variances": self.variances.to_json(),
-            **({} if self.common_error is None else {"common_error": self.common_error.to_json()}),
-            **({} if self.heights is None else {"heights": self.heights.to_json()}),
-            **(
-                {"shared_errors": {k: v.to_json() for k, v in self.shared_errors.items()}} if self.shared_errors else {}
-            ),
-            "images": {
-                image: {
-                    "parameters": {
-                        name: {"value": float(value), "sigma": float(sigma)}
-                        for (of, name), (value, sigma) in values.items()
-                        if of == image
-                    },
-                    "rays": int((self.used_rays & (points.image == k)).sum()),
-                    "rms": {
-                        which: {role: self.image_rms(image, role, which) for role in ROLES}
-                        for which in ("residuals", "back_projected", "raw_residuals")
-                    },
-                }
-                for k, image in enumerate(points.images)
-            },
-            "object_rms": {role: self.object_rms(role) for role in ("control", "check")},
-            "points": [self._point(k) for k in range(len(points))],
-            "rays": [self._ray(k) for k in range(points.rays)],
-            "rejected": [one.to_json() for one in self.rejected],
-            "outlying": [one.to_json() for one in self.outlying],
-            **to_document(self.warnings),
-        }
+        """Return the section ``adjustment`` of the block's document (docs/engineering/formats.md)."""
+        return self.record.given()
 
-    def _point(self, k: int) -> dict[str, Any]:
-        points = self.points
-        return {
-            "id": points.ids[k],
-            "role": str(points.roles[k]),
-            "used_ground": bool(self.used_ground[k]),
-            "ground": json_value(self.ground[k]),
-            "sigma": json_value(np.sqrt(np.diag(self.ground_covariance[k]))),
-            "residual": json_value(self.object_residuals[k]),
-        }
+    def _image(self, image: str) -> AdjustedImage:
+        values = zip(self.parameters, self.values, self.sigmas, strict=True)
+        which = ("residuals", "back_projected", "raw_residuals")
+        by_role = {kind: RmseByRole(**{role: self.image_rms(image, role, kind) for role in ROLES}) for kind in which}
+        return AdjustedImage(
+            parameters={name: Parameter(value=one, sigma=sigma) for (of, name), one, sigma in values if of == image},
+            rays=int((self.used_rays & (self.points.image == self.points.images.index(image))).sum()),
+            rms=ImageRms(**by_role),
+        )
 
-    def _ray(self, k: int) -> dict[str, Any]:
+    def _points(self) -> tuple[BlockPoint, ...]:
         points = self.points
-        return {
-            "id": points.ids[points.point[k]],
-            "image": points.images[points.image[k]],
-            "used": bool(self.used_rays[k]),
-            "measured": json_value(points.measured[k]),
-            "residual": json_value(self.residuals[k]),
-            "back_projected": json_value(self.back_projected[k]),
-        }
+        columns = json_value([self.ground, self.ground_sigmas, self.object_residuals])
+        rows = zip(points.ids, points.roles.tolist(), self.used_ground, *columns, strict=True)
+        return tuple(
+            BlockPoint(id=name, role=role, used_ground=bool(used), ground=ground, sigma=sigma, residual=residual)
+            for name, role, used, ground, sigma, residual in rows
+        )
+
+    def _rays(self) -> tuple[Ray, ...]:
+        points = self.points
+        columns = json_value([points.measured, self.residuals, self.back_projected])
+        rows = zip(points.point, points.image, self.used_rays, *columns, strict=True)
+        return tuple(
+            Ray(id=points.ids[point], image=points.images[image], used=bool(used), measured=measured, residual=residual,
+                back_projected=projected)
+            for point, image, used, measured, residual, projected in rows
+        )  # fmt: skip

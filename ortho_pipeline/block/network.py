@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,55 +11,78 @@ from numpy.typing import NDArray
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import largest_angles, ray_angles
 from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.relative.joins import Join
+from ortho_pipeline.files.json.records import Count, Record
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
 
 Index = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class ImagePair:
-    """Two images, how many points both of them have rays of, and the median angle (degrees) between these rays."""
+class ImagePairRecord(Record):
+    """Two images, the number of points that both have rays of, and the median angle between these rays.
+
+    `sigma_px` and `sigma_m` are the standard deviation of their relative position along `azimuth_deg`, where it is
+    largest. The pair is `weak` if it exceeds the limit.
+    """
 
     first: str
     second: str
-    points: int
+    points: Count
     angle_deg: float
+    sigma_px: float | None = None
+    sigma_m: float | None = None
+    azimuth_deg: float | None = None
+    weak: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Network:
-    """The images of a block as nodes, and what ties them.
+class Angles(Record):
+    """The largest angle between two rays of each point, degrees, over the points that have two."""
 
-    Parameters
-    ----------
-    pairs : tuple of ImagePair
-        Those with points in common, in the order of the images.
-    angles_deg : ndarray (N,)
-        Largest angle between two rays of each point; NaN for points of one ray.
-    parts : tuple of tuple of str
-        Images that hang together by points in common, the largest part first; one part is what a block ought to be.
+    points: Count
+    least: float
+    median: float
+    greatest: float
+
+
+class NetworkRecord(Record):
+    """What ties the images: pairs with points in common, the angles at which rays meet, parts that hang together.
+
+    `largest_deg` has the largest angle of each point, in the order of the adjustment's points.
     """
 
-    pairs: tuple[ImagePair, ...]
-    angles_deg: Array
+    pairs: tuple[ImagePairRecord, ...]
+    angles: Angles | None
     parts: tuple[tuple[str, ...], ...]
+    largest_deg: tuple[float | None, ...]
 
 
-def network_of(fit: BlockFit) -> Network:
-    """Return the network of an adjusted block, by the rays that were used."""
+def network_of(fit: BlockFit, joins: Sequence[Join] = (), limit: float = math.inf) -> NetworkRecord:
+    """Return the network of an adjusted block, by the rays that were used; joins beyond a limit (px) are weak."""
     points = fit.points
     one, other, angles = ray_angles(points.point, _directions(fit))
     largest = largest_angles(points, one, angles)
     ends = np.sort(np.stack([points.image[one], points.image[other]], axis=1), axis=1)
     found, which = np.unique(ends, axis=0, return_inverse=True)
-    pairs = tuple(
-        ImagePair(
-            points.images[first], points.images[second], int((which.ravel() == k).sum()),
-            float(np.median(angles[which.ravel() == k])),
-        )
-        for k, (first, second) in enumerate(found.tolist())
+    relative = {(join.first, join.second): join.figures(limit) for join in joins}
+    return NetworkRecord(
+        pairs=tuple(
+            ImagePairRecord(
+                first=first, second=second, points=int((which.ravel() == k).sum()),
+                angle_deg=np.median(angles[which.ravel() == k]), **relative.get((first, second), {}),
+            )
+            for k, (first, second) in enumerate((points.images[a], points.images[b]) for a, b in found.tolist())
+        ),
+        angles=_angles(largest[np.isfinite(largest)]),
+        parts=_parts(points.images, found),
+        largest_deg=json_value(largest),
     )  # fmt: skip
-    return Network(pairs, largest, _parts(points.images, found))
+
+
+def _angles(known: Array) -> Angles | None:
+    if not len(known):
+        return None
+    return Angles(points=len(known), least=known.min(), median=np.median(known), greatest=known.max())
 
 
 def _directions(fit: BlockFit) -> Array:

@@ -111,7 +111,7 @@ class BlockPoints:
         if self.shape_image is not None:
             directions = checked_covariance(self.shape_image, rays)
             object.__setattr__(self, "shape_image", directions)
-            object.__setattr__(self, "_errors", ImageErrors(np.linalg.cholesky(directions)))
+            object.__setattr__(self, "_errors", ImageErrors(np.asarray(np.linalg.cholesky(directions))))
 
     def __repr__(self) -> str:
         roles = ", ".join(f"{(self.roles == role).sum()} {role}" for role in ROLES if (self.roles == role).any())
@@ -164,17 +164,17 @@ class BlockPoints:
     @property
     def control(self) -> NDArray[np.bool_]:
         """Which points are control ``(N,)``."""
-        return self.roles == "control"
+        return np.asarray(self.roles == "control")
 
     @property
     def check(self) -> NDArray[np.bool_]:
         """Which points are check points ``(N,)``."""
-        return self.roles == "check"
+        return np.asarray(self.roles == "check")
 
     @property
     def tie(self) -> NDArray[np.bool_]:
         """Which points are tie points ``(N,)``."""
-        return self.roles == "tie"
+        return np.asarray(self.roles == "tie")
 
     @property
     def rays(self) -> int:

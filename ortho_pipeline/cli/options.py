@@ -43,7 +43,7 @@ def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
-class _Nodata(click.ParamType):
+class _Nodata(click.ParamType):  # type: ignore[type-arg]
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
@@ -132,12 +132,12 @@ def _typed(option: Option) -> dict[str, Any]:
     }.get(option.kind, {})
 
 
-class _Integers(click.ParamType):
+class _Integers(click.ParamType):  # type: ignore[type-arg]
     """Whole numbers with commas between, each within the range of a type."""
 
     name = "integers"
 
-    def __init__(self, each: click.ParamType) -> None:
+    def __init__(self, each: click.ParamType) -> None:  # type: ignore[type-arg]
         self._each = each
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
@@ -248,11 +248,13 @@ def _scenes(
 _OF_IMAGES = ("sensor", "sensor_options", "allow_network", "roots")
 _RPC_OF_EACH = "Which RPC: 'tag' or 'sidecar' of all images, or a file of one; may be repeated."
 _OFFSET_OF_EACH = "First pixel of an image in the one that its model belongs to, where it is a crop; may be repeated."
+#: All options of a scene, as `SceneOptions`.
 scene_options = _grouped("scene", SceneOptions)
 #: The same for the images of a block, where a saved model cannot take the place of all.
 sensor_options = _of_each(*_OF_IMAGES)
 #: The same for one image or several.
 scenes_options = _of_each(*_OF_IMAGES, "model")
+#: All options of points in one image, as `PointOptions`.
 point_options = _grouped("points", PointOptions)
 block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
 #: The rest of that group, which is taken by its decorator too.
@@ -260,7 +262,9 @@ adjustment_options = click_options(
     "points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold", "dem_heights", "dem_bias",
     "dem_correlation", "dem_shift_sigma", "join_limit",
 )  # fmt: skip
+#: All options of heights, as `SurfaceOptions`.
 surface_options = _grouped("surface", SurfaceOptions)
+#: All options of matching with a reference, as `MatchOptions`.
 match_options = _grouped("match", MatchOptions)
 matching_options = _grouped(
     "match", MatchOptions, "reference", "reference_bands", "search", "search_rotation", "points", "reference_sigma"
@@ -269,6 +273,7 @@ reference_options = _grouped("match", MatchOptions, "reference", "reference_band
 tie_options = _grouped("match", MatchOptions, "search", "points")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")
+#: All options of the ortho, as `OutputOptions`.
 output_options = _grouped("output", OutputOptions)
 #: The file says which format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
@@ -276,7 +281,9 @@ mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balanc
 dry_run_option = click.option(
     "--dry-run", is_flag=True, help="Open and check everything, say what would be made, and make nothing."
 )
+#: The argument IMAGE.
 image_argument = click.argument("image", type=click.Path())
+#: One or several images.
 images_argument = click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 
 
@@ -288,6 +295,7 @@ def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
     return text
 
 
+#: The option ``-o DIR``, which is required.
 folder_option = click.option(
     "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", callback=_folder,
     help="Output folder.",

@@ -111,7 +111,7 @@ class Group(click.Group):
         cmd.help = with_examples(cmd.help, EXAMPLES.get(words, ()))
 
 
-class OneOrTwo(click.ParamType):
+class OneOrTwo(click.ParamType):  # type: ignore[type-arg]
     """One positive number, or two that are separated by a blank (as words) or a comma."""
 
     name = "number"
@@ -127,7 +127,7 @@ class OneOrTwo(click.ParamType):
         return numbers[0] if len(numbers) == 1 else numbers
 
 
-class Megabytes(click.ParamType):
+class Megabytes(click.ParamType):  # type: ignore[type-arg]
     """An amount of memory: MB, or with a unit (``2GB``); a million and more are bytes, as for gdalwarp."""
 
     name = "MB"

@@ -19,7 +19,8 @@ from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.results import CompareResult, FitResult, Result
-    from ortho_pipeline.files.process_limits import Progress
+    from ortho_pipeline.estimation.records import Rmse, RmseOnGround
+    from ortho_pipeline.runtime.process_limits import Progress
 
 #: Exit code of a command that made a part of what was asked for.
 PARTLY_DONE = 3
@@ -192,11 +193,10 @@ def print_models(models: list[dict[str, Any]]) -> None:
 
 def print_comparison(result: CompareResult, units: str) -> None:
     """Print the table of a comparison with its recommendation; `units` are ``px`` or ``m``."""
-    document = result.to_json()
-    rows, points = document["rows"], document["points"]
-    wide = max([len(row["model"]) for row in rows] + [5])
+    compared, points = result.comparison, result.comparison.points
+    wide = max([len(row.model) for row in compared.rows] + [5])
     axes = ("column", "row") if units == "px" else ("x", "y")
-    say(f"{counted(points['control'], 'control point')}, {counted(points['check'], 'check point')}; RMSE in {units}")
+    say(f"{counted(points.control, 'control point')}, {counted(points.check, 'check point')}; RMSE in {units}")
     say(
         f"\n{'':<{wide}}  {'':>6} {'control (the fit)':^28}  {'check':^28}  {'left out':>8} {'condi-':>8}\n"
         f"{'model':<{wide}}  {'param.':>6} "
@@ -204,39 +204,35 @@ def print_comparison(result: CompareResult, units: str) -> None:
         + f"{'in turn':>8} {'tion':>8}"
     )
     notes: list[str] = []
-    for row in rows:
-        mark = "*" if row["model"] == document["recommendation"]["model"] else " "
-        if row["error"]:
-            say(f"{row['model']:<{wide}}{mark} {row['parameters']:>6}    not fitted: {as_typed(row['error'])}")
+    for row in compared.rows:
+        mark = "*" if row.model == compared.recommended else " "
+        if row.error:
+            say(f"{row.model:<{wide}}{mark} {row.parameters:>6}    not fitted: {as_typed(row.error)}")
             continue
-        rmse = row["rmse" if units == "px" else "rmse_m"]
-        loo = _error(rmse["loo"]["total"] if rmse["loo"] else None)
-        condition = "-" if row["condition"] is None else f"{row['condition']:.3g}"
-        numbers = "  ".join(_errors(rmse[which], units) for which in ("control", "check"))
-        line = f"{row['model']:<{wide}}{mark} {row['parameters']:>6} {numbers}  {loo} {condition:>8}"
-        if row["warnings"]:
-            notes += [text for text in row["warnings"] if text not in notes]
-            line += "  " + ",".join(f"[{notes.index(text) + 1}]" for text in row["warnings"])
+        rmse = row.rmse if units == "px" else row.rmse_m
+        condition = "-" if row.condition is None else f"{row.condition:.3g}"
+        numbers = f"{_errors(rmse.control)}  {_errors(rmse.check)}"
+        loo = _error(rmse.loo.total if rmse.loo else None)
+        line = f"{row.model:<{wide}}{mark} {row.parameters:>6} {numbers}  {loo} {condition:>8}"
+        if row.warnings:
+            notes += [text for text in row.warnings if text not in notes]
+            line += "  " + ",".join(f"[{notes.index(text) + 1}]" for text in row.warnings)
         say(line)
     for number, text in enumerate(map(as_typed, notes), 1):
         say(f"\n[{number}] {text}" if number == 1 else f"[{number}] {text}")
-    for point in document["left_out"]:
-        say(f"\nleft out of all models: {point['id']} ({point['reason']})")
-    say(
-        f"\n* Recommended: {document['recommendation']['reason']}."
-        if document["recommendation"]["model"]
-        else f"\nNo recommendation: {document['recommendation']['reason']}."
-    )
-    for name, path in document["files"].items():
+    for point in compared.left_out:
+        say(f"\nleft out of all models: {point.id} ({point.reason})")
+    reason = compared.recommendation.reason
+    say(f"\n* Recommended: {reason}." if compared.recommended else f"\nNo recommendation: {reason}.")
+    for name, path in result.files.items():
         say(f"  {name:<10} {path}")
-    print_warnings(document["warnings"])
+    print_warnings(compared.warnings)
 
 
-def _errors(rmse: Mapping[str, Any] | None, units: str) -> str:
+def _errors(rmse: Rmse | RmseOnGround | None) -> str:
     if rmse is None:
         return f"{0:>4}{'-':>8}{'-':>8}{'-':>8}"
-    axes = ("col", "row") if units == "px" else ("x", "y")
-    return f"{rmse['n']:>4}" + "".join(_error(rmse[axis]) for axis in (*axes, "total"))
+    return f"{rmse.n:>4}" + "".join(_error(value) for name, value in rmse if name != "n")
 
 
 def _error(value: float | None) -> str:

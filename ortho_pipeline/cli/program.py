@@ -44,19 +44,14 @@ COMMANDS = {
     "intersect": ("block", "Intersect the rays of points that were measured in several IMAGEs: ground coordinates with "
                            "their sigmas."),
     "match": ("matching", "Find control points of IMAGE by matching it with orthoimages of the same place."),
-    "measure": ("measuring", "Measure points of an IMAGE in the browser, beside its reference in the geometry of the "
-                             "image, or of several."),
     "models": ("machine.installed", "List the models that can be fitted to points alone."),
     "mosaic": ("batch", "Make one raster of ORTHOs that lie on one grid, and measure how well they agree."),
     "rectify": ("scene.rectifying", "Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."),
     "register": ("scene.bands", "Bring single bands IMAGES onto one of them and write one image of all, which opens as "
                                 "the reference did."),
     "report": ("scene.rectifying", "Write the plots of a report, each as a picture of its own."),
-    "reproduce": ("studies", "Compute the tables of the papers that this package implements, beside the papers' "
-                             "numbers."),
     "run": ("batch", "Make the orthos of all scenes that PIPELINE.yaml names."),
     "sensors": ("machine.installed", "List the sensors that are installed."),
-    "simulate": ("studies", "Make scenes of known truth."),
     "ties": ("matching", "Find tie points between overlapping IMAGEs: places that two of them or more show, with their "
                          "covariances."),
 }  # fmt: skip
@@ -224,7 +219,7 @@ def _begin() -> None:
     """Prepare the process for a command, before it is loaded."""
     from ortho_pipeline.files.folders import ignore_working_folder
     from ortho_pipeline.files.locations import close_network
-    from ortho_pipeline.files.process_limits import share_freed_memory
+    from ortho_pipeline.runtime.process_limits import share_freed_memory
 
     share_freed_memory()
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.

@@ -52,7 +52,7 @@ def _ask_again(lost: Any) -> None:
     """Raise the exception of a signal a moment later once more; say what else a destructor cannot raise."""
     error = lost.exc_value
     if not isinstance(error, KeyboardInterrupt | Terminated):
-        from ortho_pipeline.files.process_limits import is_told_already
+        from ortho_pipeline.runtime.process_limits import is_told_already
 
         if not is_told_already(lost):
             sys.__unraisablehook__(lost)

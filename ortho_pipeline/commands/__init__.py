@@ -6,8 +6,9 @@ asked for.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ortho_pipeline import _lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.fitting import compare as compare
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.scene import doctor as doctor
     from ortho_pipeline.commands.scene import edge as edge
     from ortho_pipeline.commands.scene import forget_kept_files as forget_kept_files
+    from ortho_pipeline.commands.scene import formats as formats
     from ortho_pipeline.commands.scene import info as info
     from ortho_pipeline.commands.scene import kept_files as kept_files
     from ortho_pipeline.commands.scene import models as models
@@ -33,6 +35,7 @@ _NAMES = {
         "doctor",
         "edge",
         "forget_kept_files",
+        "formats",
         "info",
         "kept_files",
         "models",
@@ -41,15 +44,9 @@ _NAMES = {
     ),
 }
 #: Public name -> module that holds it.
-_HOMES = {name: module for module, names in _NAMES.items() for name in names}
+_HOMES = {name: f"commands.{module}" for module, names in _NAMES.items() for name in names}
 
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-
-    def __getattr__(name: str) -> Any:
-        if name not in _HOMES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
+    __getattr__ = _lazily(__name__, _HOMES)

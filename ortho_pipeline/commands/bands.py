@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import allowed, states, together, whole_or_nothing, write_json
-from ortho_pipeline.files.locations import archive_of, located, place
+from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_stack import stack_bands
 from ortho_pipeline.imaging.registration import Registration
@@ -77,7 +77,7 @@ def register(
                 "this path would be read and written", file=path, field="folder", remedy="choose another folder"
             )
     # Bands in an archive are those of the archive.
-    read = {archive_of(str(path)) or Path(path): "band" for path in paths}
+    read = {Location(path).archive or Path(path): "band" for path in paths}
     ledger = Ledger(read, states([*paths, opened.model_source]))
     with together(folder, files["image"].stem):
         if beside is not None:
@@ -96,7 +96,7 @@ def register(
 
 
 def _metadata_beside(scene: Scene, image: Path) -> Path | None:
-    sensor = plugins.Host.discover().sensors.get(scene.sensor)
+    sensor = host.Host.discover().sensors.get(scene.sensor)
     if sensor is None or sensor.metadata_beside is None or not place(scene.model_source).is_file():
         return None
     return sensor.metadata_beside(str(image))

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.block.adjustment import adjust as adjust_block
-from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.fit import BlockFit, ObjectRms
 from ortho_pipeline.block.intersection import Intersection
 from ortho_pipeline.block.intersection import intersect as intersect_rays
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints
-from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
@@ -38,6 +37,7 @@ from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
 from ortho_pipeline.files import json_text, together, write_json, write_text
@@ -117,8 +117,9 @@ def adjust(
         priors={label: start.priors for label, start in starts.items()}, hold=points.hold,
         heights=observed(points, surface, gathered.heights),
     )  # fmt: skip
-    joins = joins_of(fit)
-    notes += weak_joins(joins, points.join_limit, with_heights=fit.heights is not None)
+    if fit.heights is not None:
+        # The block has the last word on the accuracy of the DEM.
+        notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
     exported: dict[str, rpc.RpcExport] = {}
     for label in labels:
@@ -135,7 +136,6 @@ def adjust(
         exported=exported,
         provenance=record,
         warnings=[*_warnings(fit, starts), *notes],
-        joins=joins,
         join_limit=points.join_limit,
     )
     pictures = _pictures(starts, scenes[0])
@@ -179,7 +179,7 @@ def intersect(
     _check_paths(files, images, points, scenes, *models)
     table, notes = read_points(images, labels, points, scenes[0].allow_network)
     if models:
-        plugins.Host.discover()  # model families of plugins, which a file may name
+        host.Host.discover()  # model families of plugins, which a file may name
         files_of = dict(zip(labels, models, strict=True))
         chosen = {
             label: read_model_file(located(path, allow_network=scenes[0].allow_network)).model
@@ -305,13 +305,13 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
         found.append(Notice("outside-of-image", text, count=number, points=names))
     if fit.parameters and fit.redundancy == 0:
         found.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and say nothing"))
-    checks = max((int(rms["n"]) for rms in _check_rms(fit) if rms), default=0)
+    checks = max((rms.n for rms in _check_rms(fit) if rms), default=0)
     if points.control.any() and checks < ENOUGH_CHECK_POINTS:
         found.append(few_check_points(checks))
     return list(dict.fromkeys(found))
 
 
-def _check_rms(fit: BlockFit) -> list[Mapping[str, Any] | None]:
+def _check_rms(fit: BlockFit) -> list[ObjectRms | Rmse | None]:
     return [fit.object_rms(), *(fit.image_rms(image, "check") for image in fit.points.images)]
 
 

@@ -23,14 +23,14 @@ from ortho_pipeline.commands.scene_fit import (
 )
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.choice import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models import families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report import document as report
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 
 @with_items
@@ -53,7 +53,7 @@ def fit(
     _require_points(request)
     adjusted = adjust(resolved := adjustable(request))
     return FitResult(
-        adjusted.scene, adjusted.fit, adjusted.warnings(resolved.surface), tuple(adjusted.removed_json()), points.near,
+        adjusted.scene, adjusted.fit, adjusted.warnings(resolved.surface), adjusted.removed, points.near,
         adjusted.matched,
     )  # fmt: skip
 
@@ -116,11 +116,10 @@ def compare(
     best = compared.best
     if matched is not None:
         relative = () if best is None or best.fit is None else relative_to_reference(best.fit, match)
-        compared = replace(compared, notes=(*compared.notes, *matched.notices, *relative))
-    result = CompareResult(opened, compared, matched)
+        compared = compared.noted([*matched.notices, *relative])
+    compared = compared.replaced(image=str(opened.path), sensor=opened.sensor)
     if folder is None or best is None or best.fit is None:
-        return result
-    document = CompareResult(opened, compared).to_json()
+        return CompareResult(opened, compared, matched)
     chosen = replace(best.fit, warnings=(*best.fit.warnings, *relative_to_reference(best.fit, match)))
     stem = Path(image).stem
     files = {name: Path(folder) / f"{stem}{ENDINGS[name]}" for name in ("residuals", "style", "report", "html")}
@@ -131,11 +130,11 @@ def compare(
     asked = request.asked("scene", "surface", "match")
     record = provenance(request, opened, heights, resolved.ledger.hashed(), command, asked)
     made = report.build_report(
-        scene=opened, fit=chosen, surface=heights, comparison=document, near=points.near,
+        scene=opened, fit=chosen, surface=heights, comparison=compared, near=points.near,
         provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
     )  # fmt: skip
     write_report(made, chosen, files, matched, open_rasters(opened, request))
-    return replace(result, files=files)
+    return CompareResult(resolved.scene, compared, matched, files)
 
 
 def _require_points(request: Request) -> None:

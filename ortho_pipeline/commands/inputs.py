@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange import crop
@@ -54,7 +54,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
                                  remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")))  # fmt: skip
             given["rpc"] = options.rpc
         given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
-        return plugins.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
+        return host.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
             "a model file takes the place of the image's model", field="scene.model",
@@ -64,7 +64,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
             ),
         )  # fmt: skip
     dataset = raster.open_dataset(image, **options.access)
-    plugins.Host.discover()  # model families of plugins, which the file may name
+    host.Host.discover()  # model families of plugins, which the file may name
     saved = read_model_file(located(options.model, allow_network=options.allow_network))
     size = dataset.RasterXSize, dataset.RasterYSize
     offset = options.crop_offset
@@ -107,12 +107,12 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
     if needs_model or asked:
         return open_scene(image, options)
-    host = plugins.Host.discover()
-    dataset = host.open_image(image, **options.access)
+    plugins = host.Host.discover()
+    dataset = plugins.open_image(image, **options.access)
     try:
-        host.recognise(dataset)
+        plugins.recognise(dataset)
     except InputError:
-        if any(sensor.recognises(dataset) for sensor in host.sensors.values()):
+        if any(sensor.recognises(dataset) for sensor in plugins.sensors.values()):
             raise
         return Scene(POINTS_ONLY, Path(image), dataset.RasterXSize, dataset.RasterYSize, {}, "control points")
     return open_scene(image, options)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any, NamedTuple
 
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.display.notices import Notice, to_document
-from ortho_pipeline.errors import InputError, completed, of_option
+from ortho_pipeline.errors import completed, of_option
 from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay, scene_pixels
@@ -57,7 +54,7 @@ class Placement(NamedTuple):
             "sensor": self.scene.sensor,
             "model": fit.model_name,
             "points": {"control": int(fit.points.control.sum()), "check": int(fit.points.check.sum())},
-            "rmse_px": {which: one and one["total"] for which, one in fit.to_json()["rmse"].items()},
+            "rmse_px": {which: one and one["total"] for which, one in fit.rmses.given().items()},
             "coverage": self.footprint.coverage,
             "grid": {
                 "crs": crs_text(grid.crs), "size": [grid.width, grid.height],
@@ -84,9 +81,8 @@ def place_scene(resolved: Resolved) -> Placement:
         found = lay(model, surface, *size)
         found.require_coverage()
         model = found.fitted(model)
-        if output.like is not None:
-            grid = _grid_like(resolved.request)
-        else:
+        grid = resolved.grid
+        if grid is None:
             with of_option("output.crs"):
                 crs = map_crs(output.crs) if output.crs else None
             grid = choose_grid(
@@ -94,21 +90,6 @@ def place_scene(resolved: Resolved) -> Placement:
             )
         scene_pixels(model, found, grid)
     return Placement(adjusted, model, found.surface, found, grid, resolved.request)
-
-
-def _grid_like(request: Request) -> Grid:
-    """Return the grid of the raster that an ortho is to match."""
-    output = request.output
-    given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
-    if given:
-        raise InputError(
-            Text(Setting("output.like"), " gives the grid, and ", Setting(f"output.{given[0]}"), " would change it"),
-            field=f"output.{given[0]}",
-            remedy="leave out one of the two",
-        )  # fmt: skip
-    assert output.like is not None
-    with completed(os.fspath(output.like), field="output.like"):
-        return grid_of(output.like, **request.scene.access)
 
 
 def open_rasters(scene: Scene, request: Request) -> RasterSource:

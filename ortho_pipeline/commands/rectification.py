@@ -15,7 +15,7 @@ from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
 from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
-from ortho_pipeline.commands.resolved.request import Request, point_options
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import (
     ENDINGS,
     OF_REPORT,
@@ -29,13 +29,13 @@ from ortho_pipeline.commands.scene_fit import adjust, adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, ReportError, completed
-from ortho_pipeline.exchange import export as formats_of_models
 from ortho_pipeline.exchange import rpc
+from ortho_pipeline.exchange.export import FORMATS, Export, check_formats
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import retire, sha256
-from ortho_pipeline.files.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.host import Host
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text
@@ -46,10 +46,11 @@ from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.surface import footprint
 
 if TYPE_CHECKING:
-    from ortho_pipeline.warp.job import WarpResult
+    from ortho_pipeline.warp.job import WarpRecord
     from ortho_pipeline.warp.layers.hiding import Hiding
 
 
@@ -96,8 +97,9 @@ def rectify(
         For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
         written, an old side-car that would attach to the ortho.
     """
+    assert isinstance(points, PointOptions), "with_items makes options of points"
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
-    request = Request(image, scene, point_options(points), surface, match, output)
+    request = Request(image, scene, points, surface, match, output)
     files = outputs(folder, stem, output)
     inputs.check_paths(files, request, overwrite)
     require_heights(surface)
@@ -189,7 +191,7 @@ def export(
     image: str | os.PathLike[str],
     folder: str | os.PathLike[str],
     *,
-    formats: Sequence[str] = formats_of_models.FORMATS[:4],
+    formats: Sequence[str] = tuple(FORMATS)[:4],
     scene: SceneOptions = SceneOptions(),
     points: PointOptions = PointOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
@@ -201,9 +203,9 @@ def export(
     Parameters
     ----------
     formats : sequence of str
-        Some of `exchange.export.FORMATS`: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, csm.
+        Names of formats: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, and those of plugins, such as csm.
     force : bool
-        Accept an RPC that stands for the model only to more than 0.1 px.
+        Accept a file that is more than 0.1 px off the model.
 
     Returns
     -------
@@ -215,9 +217,8 @@ def export(
     InputError
         For an unknown format, a geolocation without heights, and as `fit`.
     """
-    formats = formats_of_models.check_formats(formats)
-    stem = Path(image).stem
-    files = {name: Path(folder) / f"{stem}{formats_of_models.ENDINGS[name]}" for name in formats}
+    chosen = check_formats(formats, Host.discover().formats)
+    files = {one.name: Path(folder) / f"{Path(image).stem}{one.ending}" for one in chosen}
     request = Request(image, scene, points, surface, match)
     inputs.check_paths(files, request)
     adjusted, heights = adjust(resolved := adjustable(request)), resolved.surface
@@ -227,14 +228,14 @@ def export(
     with completed(adjusted.scene.model_source, of="model"):
         if heights is not None:
             heights = footprint.facing(adjusted.model, heights, *size)
-        job = formats_of_models.Export(
+        job = Export(
             dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
             force=force,
         )  # fmt: skip
-        for name, path in files.items():
-            job.write(name, path)
+        for one in chosen:
+            job.write(one, files[one.name])
     document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
-    return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source))
+    return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source, chosen))
 
 
 # -- parts -----------------------------------------------------------------------------------------------------------
@@ -284,7 +285,7 @@ def _warp(
     source: raster.RasterSource,
     path: Path | Hiding,
     progress: Progress,
-) -> WarpResult:
+) -> WarpRecord:
     # The compiled kernels take a while to load: beside the checksums.
     from ortho_pipeline.warp.engines import engine_of
     from ortho_pipeline.warp.job import WarpJob

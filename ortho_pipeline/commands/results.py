@@ -14,22 +14,24 @@ from typing import Any, ParamSpec, TypeVar, cast
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import OrthoError, ReportError, error_document
-from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
+from ortho_pipeline.estimation.family_fit import Removed
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import part_of_outputs, staged, together, write_text
-from ortho_pipeline.files.storage.delivery import address_of, delivered
+from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.options.texts import Text
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale
-from ortho_pipeline.report.matching import MatchingRecord, matching_record
+from ortho_pipeline.report.matching import MatchingRecord
 from ortho_pipeline.report.notebook import tables
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import refuted
+from ortho_pipeline.stores.delivery import address_of, delivered
 
 SCHEMA_VERSION = 1
 #: How the names of a scene's outputs end, after its stem.
@@ -74,17 +76,17 @@ class FitResult:
     scene: Scene
     fit: Fit
     warnings: tuple[Notice, ...] = ()
-    removed: tuple[Mapping[str, Any], ...] = ()
+    removed: tuple[Removed, ...] = ()
     near: float | None = None
     matched: Matched | None = None
 
     @property
     def matching(self) -> MatchingRecord | None:
         """What was matched, and what its points say of the fit; None where nothing was."""
-        return None if self.matched is None else matching_record(self.matched.to_json(), self.fit)
+        return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+        """Return the document of ``ortho fit --json`` (docs/engineering/formats.md)."""
         document = self.fit.to_json() | to_document(self.warnings)
         pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
         scale = None if refuted(document["notices"]) else map_scale(self.fit, max(pixels) if pixels else None)
@@ -94,10 +96,10 @@ class FitResult:
             "model": document.pop("model"),
             "model_source": self.scene.model_source,
             **document,
-            "removed": [dict(one) for one in self.removed],
+            "removed": json_value(self.removed),
             **({} if self.matching is None else {"matching": self.matching.to_json()}),
             "map_scale": None if scale is None else scale.to_json(),
-            "covariance": {role: one and one.to_json() for role, one in analyse_fit(self.fit, near=self.near).items()},
+            "covariance": analyse_fit(self.fit, near=self.near).to_json(),
         }
 
 
@@ -130,20 +132,15 @@ class CompareResult:
     """A comparison of models, and the report that was written, if any."""
 
     scene: Scene
-    comparison: comparing.Comparison
+    comparison: ComparisonRecord
     matched: Matched | None = None
     files: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho compare --json`` (docs/formats.md)."""
-        return {
-            "schema_version": SCHEMA_VERSION,
-            "image": str(self.scene.path),
-            "sensor": self.scene.sensor,
-            **self.comparison.to_json(),
-            **({} if self.matched is None else {"matching": self.matched.to_json()}),
-            "files": {name: str(path) for name, path in self.files.items()},
-        }
+        """Return the document of ``ortho compare --json`` (docs/engineering/formats.md)."""
+        document = self.comparison.model_dump(mode="json", exclude_unset=True, exclude={"files"})
+        matching = {} if self.matched is None else {"matching": self.matched.to_json()}
+        return {**document, **matching, "files": {name: str(path) for name, path in self.files.items()}}
 
 
 def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline import plugins
-from ortho_pipeline.commands.heights.surfaces import open_dem
+from ortho_pipeline import host
+from ortho_pipeline.commands.heights.surfaces import dem_as_stated
 from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.commands.stac.given import heights_given, with_items
@@ -22,18 +22,18 @@ from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.files.storage import kept
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.host.unread import unread
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
+from ortho_pipeline.stores import kept
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.cells.copernicus import extent_of
@@ -41,18 +41,27 @@ from ortho_pipeline.surface.cells.copernicus import extent_of
 
 def sensors() -> dict[str, Any]:
     """List the installed sensors, where each comes from, and the plugins that are broken."""
-    host = plugins.Host.discover()
+    plugins = host.Host.discover()
     listed = [
         {
             "name": sensor.name,
             "description": sensor.description,
             "options": dict(sensor.options),
-            "distribution": host.provenance(name).distribution,
-            "version": host.provenance(name).version,
+            "distribution": plugins.provenance(name).distribution,
+            "version": plugins.provenance(name).version,
         }
-        for name, sensor in host.sensors.items()
+        for name, sensor in plugins.sensors.items()
     ]
-    return {"schema_version": SCHEMA_VERSION, "sensors": listed, "broken": [entry.to_json() for entry in host.broken]}
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "sensors": listed,
+        "broken": json_value(plugins.broken),
+    }
+
+
+def formats() -> dict[str, str]:
+    """Return the formats that models are written in, by name, each with its title; broken plugins are left out."""
+    return {name: one.title for name, one in host.Host(installed=True, lenient=True).formats.items()}
 
 
 @with_items
@@ -203,7 +212,7 @@ def dem_check(
     """
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
     extent = extent_of(ground_transform(plane, "EPSG:4979")(ground)[:, :2])
-    heights = open_dem(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
+    heights = dem_as_stated(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(
@@ -223,7 +232,7 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
     those that are missing are fetched from PROJ's store before.
     """
     fetched = fetch_missing() if fetch_grids else []
-    host = plugins.Host(installed=True, lenient=True)
+    plugins = host.Host(installed=True, lenient=True)
     packages = ("ortho-pipeline", "numpy", "scipy", "numba", "pyproj", "click", "pluggy")
     allowed = [name for name in raster.DRIVERS if raster.gdal.GetDriverByName(name) is not None]
     return {
@@ -238,9 +247,10 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
         "proj": proj_info(),
         "grids": grids(),
         "fetched": fetched,
-        "plugins": [entry.to_json() for entry in host.plugins()],
-        "sensors": list(host.sensors),
-        "broken": [entry.to_json() for entry in host.broken],
+        "plugins": json_value(plugins.plugins()),
+        "sensors": list(plugins.sensors),
+        "formats": list(plugins.formats),
+        "broken": json_value(plugins.broken),
         "cpus": os.cpu_count(),
     }
 

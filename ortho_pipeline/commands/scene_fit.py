@@ -17,7 +17,7 @@ from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import CoverageError, InputError
-from ortho_pipeline.estimation import comparison as comparing
+from ortho_pipeline.estimation.choice import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
 from ortho_pipeline.estimation.fit import Fit, fit
@@ -29,6 +29,7 @@ from ortho_pipeline.options import MatchOptions, PointOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
+from ortho_pipeline.report.matching import MatchingRecord
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
 from ortho_pipeline.surface.base import Surface
 
@@ -77,13 +78,9 @@ class Adjusted:
         return self.fit.to_json() if self.scene.adjusted is None else dict(self.scene.adjusted)
 
     @property
-    def matching(self) -> dict[str, Any] | None:
-        """The section ``matching`` of documents, None where nothing was matched."""
-        return None if self.matched is None else self.matched.to_json()
-
-    def removed_json(self) -> list[dict[str, Any]]:
-        """Return the removed parameters as JSON values."""
-        return [{"name": one.name, "t": one.t, "p": one.p} for one in self.removed]
+    def matching(self) -> MatchingRecord | None:
+        """What was matched, and what its points say of the fit; None where nothing was."""
+        return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def warnings(self, surface: Surface | None) -> tuple[Notice, ...]:
         """Return what people ought to know before they trust the numbers."""
@@ -138,7 +135,7 @@ class Adjusted:
         bias = self.fit.raw_bias
         if bias is None or self.fit.model_name in {family.name for family in families()}:
             return []
-        sizes = max(abs(bias["col"]) / self.scene.width, abs(bias["row"]) / self.scene.height)
+        sizes = max(abs(bias.col) / self.scene.width, abs(bias.row) / self.scene.height)
         if not sizes > _ELSEWHERE:
             return []
         text = (
@@ -292,7 +289,7 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     text = Text(
         "the correction was chosen by the matches (",
         Setting("points.correction"),
-        f" chooses another): {compared.reason}",
+        f" chooses another): {compared.recommendation.reason}",
     )
     return chosen, Notice("correction-by-matches", text, correction=chosen)
 

@@ -14,13 +14,15 @@ from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share,
 from ortho_pipeline.options.texts import counted
 
 
-def render(template: str, **values: Any) -> str:
+def render(template: str, package: str = "ortho_pipeline", **values: Any) -> str:
     """Return a template filled with values, which are escaped.
 
     Parameters
     ----------
     template : str
         Room and name, such as ``report/block.html.j2``.
+    package : str
+        The package that has the room.
 
     Raises
     ------
@@ -28,7 +30,7 @@ def render(template: str, **values: Any) -> str:
         If the template uses a value that is not given.
     """
     room, _, name = template.partition("/")
-    return str(_environment().get_template(f"{room}/templates/{name}").render(**values))
+    return str(_environment(package).get_template(f"{room}/templates/{name}").render(**values))
 
 
 def _coded(text: str) -> Any:
@@ -42,7 +44,7 @@ def _coded(text: str) -> Any:
 
 
 @functools.cache
-def _environment() -> Any:
+def _environment(package: str) -> Any:
     """Return the environment, with the filters that write numbers as people read them."""
     import jinja2
 
@@ -68,7 +70,7 @@ def _environment() -> Any:
                 temporary.replace(place)
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ortho_pipeline", ""), autoescape=True, undefined=jinja2.StrictUndefined,
+        loader=jinja2.PackageLoader(package, ""), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, bytecode_cache=Kept(),
     )  # fmt: skip
     environment.filters |= {

@@ -41,8 +41,8 @@ _APART = 2.0
 _ONE_APART = 3.0
 #: An RMSE so many times that of the check points which agree is no figure to judge accuracy by.
 FAR_ABOVE = 2.0
-#: Contradicting check points that a notice names.
-_NAMED = 10
+#: Contradicting points that a notice or an error names.
+NAMED = 10
 #: From so many check points on their own scatter counts, where it is larger than that of the control points.
 _OWN_SCATTER = 5
 #: Measured check points that show where they lie together beside matches.
@@ -52,7 +52,7 @@ _MEDIAN_OF_TWO = 2 * math.log(2)
 #: More than this share of rejected control points is an error, not a clean-up.
 REJECTED_LIMIT = 0.3
 #: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
-_SCALE_FLOOR = 1e-3
+SCALE_FLOOR = 1e-3
 #: A point with a smaller determinant of its redundancy is not tested.
 _TESTABLE = 1e-6
 #: A point without an image is so far off (px): its square is still a number.
@@ -100,7 +100,7 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
 def refuse_many(names: Sequence[str], count: int, what: str, source: str, remedy: str) -> None:
     """Refuse to clean up where so many of `count` contradict that which of them are wrong is a guess."""
     if len(names) > REJECTED_LIMIT * count:
-        some = ", ".join(names[:_NAMED]) + (" ..." if len(names) > _NAMED else "")
+        some = ", ".join(names[:NAMED]) + (" ..." if len(names) > NAMED else "")
         raise DegeneratePoints(
             f"{len(names)} of {counted(count, what)} contradict the others ({some}): which of them are wrong cannot be "
             "decided",
@@ -239,7 +239,7 @@ def _against_others(solution: Solution) -> _Tested | None:
     squares, freedom = np.where(np.linalg.det(redundancy) > _TESTABLE, apart.squares, 0.0), solution.freedom - 2
     if solution.sigma0 is None or freedom < 1:
         return None
-    others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, _SCALE_FLOOR**2)
+    others = np.maximum((solution.sigma0**2 * solution.freedom - squares) / freedom, SCALE_FLOOR**2)
     return _Tested(redundancy, squares / others, chance_of(squares / others, 2, freedom), others)
 
 
@@ -250,7 +250,7 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     except (DegeneratePoints, TooFewPoints):
         return np.ones(len(keep)), np.zeros(len(keep))
     apart = _Apart.of(solution, problem)
-    scale = max(solution.sigma0 or 0.0, _SCALE_FLOOR)
+    scale = max(solution.sigma0 or 0.0, SCALE_FLOOR)
     return chance_of(apart.squares / scale**2, 2, max(solution.freedom, 1.0)), np.hypot(*apart.miss.T)
 
 
@@ -375,7 +375,7 @@ def _outlying_checks(
     if checks is None:
         return []
     squares = checks.squares
-    scale, freedom = max(sigma0, _SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
+    scale, freedom = max(sigma0, SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
     if len(squares) >= _OWN_SCATTER and own > scale:
         # The median of n is about as certain as a mean square of half as many.
@@ -412,7 +412,7 @@ def checks_apart(
     checks = _checks(solution, points.with_roles(np.where(points.check & ~measured, "tie", points.roles)), used, None)
     if checks is None:
         return []
-    scale = max(float(solution.sigma0), _SCALE_FLOOR) ** 2
+    scale = max(float(solution.sigma0), SCALE_FLOOR) ** 2
     ids = np.array([points.ids[i] for i in checks.problem.rows])
     off, usual = np.isin(ids, [one.id for one in said]), checks.expected(scale)
     apart = not shared and measured[used].all() and _together_apart(checks.squares[~off], scale, solution.freedom)
@@ -424,7 +424,7 @@ def checks_apart(
     if apart:
         off |= sizes > (_ONE_APART * usual if len(ids) > 1 else 0.0)
         rest = None if off.all() or not off.any() else rms(sizes[~off])
-    far = np.lexsort((-sizes, ~off))[: min(_NAMED, int(off.sum()) or 3)]
+    far = np.lexsort((-sizes, ~off))[: min(NAMED, int(off.sum()) or 3)]
     beyond = outside_of_hull(points.image[used], checks.problem.image[off])
     without = "" if rest is None else f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
     agree = "check points are wrong, or the model is poor between the control points"

@@ -156,7 +156,7 @@ def ridge_of(text: str) -> float | str | None:
 def _leave_one_out(found: Fit) -> float:
     """Return the leave-one-out RMSE; without redundancy the RMSE of the control points is zero and decides nothing."""
     loo = found.rmse("loo")
-    return float(loo["total"]) if loo is not None else 0.0
+    return loo.total if loo is not None else 0.0
 
 
 def _simpler(

@@ -6,7 +6,6 @@ functions, `statistics` the tests of parameters.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -26,17 +25,29 @@ from ortho_pipeline.estimation.determinacy import (
 )
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.problem import Problem, Solution
+from ortho_pipeline.estimation.records import (
+    Adjustment,
+    Bias,
+    GroupedStatistics,
+    LeftOut,
+    Parameter,
+    Point,
+    Rmse,
+    Rmses,
+    Statistics,
+)
+from ortho_pipeline.estimation.records import CommonError as CommonErrorRecord
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.common_error import CommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
-__all__ = ["Fit", "Prior", "fit", "root_mean_square"]
+__all__ = ["Fit", "Prior", "fit"]
 
 #: Chance of calling a parameter justified that is zero.
 SIGNIFICANCE = 0.05
@@ -143,7 +154,7 @@ class Fit:
         _, p = self.student
         return tuple(name for name, chance in zip(self.param_names, p, strict=True) if not chance <= self.significance)
 
-    def rmse(self, which: str) -> dict[str, float | int] | None:
+    def rmse(self, which: str) -> Rmse | None:
         """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point.
 
         'matched' is of matches that check beside measured points, whose 'check' then is. 'agreeing' is the check points
@@ -163,92 +174,87 @@ class Fit:
             residuals = self.residuals[checks]
             # A point that does not project has no residual; a warning names it.
             residuals = residuals[np.isfinite(residuals).all(axis=1)]
-        return root_mean_square(residuals)
+        return Rmse.of(residuals)
 
     @property
-    def rmses(self) -> dict[str, dict[str, float | int] | None]:
+    def rmses(self) -> Rmses:
         """All of `rmse`, 'matched' only where there is one."""
         both = ("matched",) if (self.points.check & ~self.points.tests).any() else ()
-        return {which: self.rmse(which) for which in ("control", "check", "loo", *both)}
+        return Rmses(**{which: self.rmse(which) for which in ("control", "check", "loo", *both)})
 
     @property
-    def raw_bias(self) -> dict[str, float | int] | None:
+    def raw_bias(self) -> Bias | None:
         """Mean and scatter (px) of measured minus predicted of the model as delivered, over the used points."""
         raw = self.raw_residuals[self.used]
         if not np.isfinite(raw).any():
             return None
         mean, spread = raw.mean(axis=0), raw.std(axis=0)
-        return {"col": mean[0], "row": mean[1], "std_col": spread[0], "std_row": spread[1], "n": len(raw)}
+        return Bias(col=mean[0], row=mean[1], std_col=spread[0], std_row=spread[1], n=len(raw))
 
     def image_sigma(self, ground: Array) -> Array:
         """Return the standard deviation ``(N, 2)`` of predicted image points that comes from the parameters."""
         partials = self.model.param_partials(ground)
-        return np.sqrt(((partials @ self.covariance) * partials).sum(axis=2))
+        return np.asarray(np.sqrt(((partials @ self.covariance) * partials).sum(axis=2)))
 
-    def statistics(self) -> dict[str, Any]:
-        """Return the section ``statistics`` of the document: what is not finite is null."""
+    def _statistics(self) -> Statistics:
+        """Return the tests of the parameters: what is not finite is None."""
         t, p = self.student
         named = {"total_correlation": self.total_correlation, "t": t, "p": p}
-        return {
-            "correlation": [json_value(row) for row in self.correlation],
+        found: dict[str, Any] = {
+            "correlation": json_value(self.correlation),
             **{key: dict(zip(self.param_names, json_value(values), strict=True)) for key, values in named.items()},
             "significance": self.significance,
-            "not_justified": list(self.not_justified),
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "effective_parameters": self.effective_parameters,
+            "not_justified": self.not_justified,
+            "degrees_of_freedom": json_value(self.degrees_of_freedom),
+            "effective_parameters": json_value(self.effective_parameters),
             "ridge": self.ridge,
             "condition": json_value(self.condition),
             "corner_ratio": json_value(self.corner_ratio),
-            **({} if self.shared_errors is None else {"shared_errors": self.shared_errors.to_json()}),
-            **({} if self.common_error is None else {"common_error": self.common_error.to_json()}),
         }
+        if self.common_error is not None:
+            found["common_error"] = CommonErrorRecord.of(self.common_error)
+        return Statistics(**found) if self.shared_errors is None else GroupedStatistics(
+            **found, shared_errors=self.shared_errors
+        )  # fmt: skip
 
     def __repr__(self) -> str:
-        total = {role: found["total"] for role in ("control", "check", "loo") if (found := self.rmse(role))}
+        total = {role: found.total for role in ("control", "check", "loo") if (found := self.rmse(role))}
         said = ", ".join(f"{role} {value:.3f} px" for role, value in total.items())
         return (
             f"<fit of {self.model_name} to {counted(int(self.used.sum()), 'control point')}: RMSE {said or 'unknown'}>"
         )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho fit --json`` (docs/formats.md)."""
+    @property
+    def record(self) -> Adjustment:
+        """What is published of it (docs/engineering/formats.md)."""
         points = self.points
-        return {
-            "model": self.model_name,
-            "parameters": {
-                name: {"value": float(value), "sigma": float(sigma)}
+        names = ("image", "predicted", "residual", "loo_residual")
+        pairs = (points.image, self.predicted, self.residuals, self.loo_residuals)
+        rows = zip(points.ids, points.roles.tolist(), self.used.tolist(), *map(json_value, pairs), strict=True)
+        return Adjustment(
+            model=self.model_name,
+            parameters={
+                name: Parameter(value=value, sigma=json_value(sigma))
                 for name, value, sigma in zip(self.param_names, self.values, self.sigmas, strict=True)
             },
-            "points": [
-                {
-                    "id": points.ids[i],
-                    "role": str(points.roles[i]),
-                    "used": bool(self.used[i]),
-                    "image": json_value(points.image[i]),
-                    "predicted": json_value(self.predicted[i]),
-                    "residual": json_value(self.residuals[i]),
-                    "loo_residual": json_value(self.loo_residuals[i]),
-                }
-                for i in range(len(points))
-            ],
-            "rmse": self.rmses,
-            "raw_bias": self.raw_bias,
-            "redundancy": self.redundancy,
-            "sigma0": self.sigma0,
-            "rejected": [{"id": name, "reason": reason} for name, reason in self.rejected],
-            "outlying": [one.to_json() for one in self.outlying],
-            "rmse_of_agreeing_checks": self.rmse("agreeing"),
+            points=tuple(
+                Point.model_validate({"id": name, "role": role, "used": used, **dict(zip(names, row, strict=True))})
+                for name, role, used, *row in rows
+            ),
+            rmse=self.rmses,
+            raw_bias=self.raw_bias,
+            redundancy=self.redundancy,
+            sigma0=self.sigma0,
+            rejected=tuple(LeftOut(id=name, reason=reason) for name, reason in self.rejected),
+            outlying=self.outlying,
+            rmse_of_agreeing_checks=self.rmse("agreeing"),
             **to_document(self.warnings),
-            "statistics": self.statistics(),
-        }
+            statistics=self._statistics(),
+        )
 
-
-def root_mean_square(residuals: Array) -> dict[str, float | int] | None:
-    """Return the root mean square per axis and in total of residuals ``(N, 2)``; None for no residuals."""
-    if not len(residuals):
-        return None
-    col, row = (residuals**2).mean(axis=0)
-    return {"col": math.sqrt(col), "row": math.sqrt(row), "total": math.sqrt(col + row), "n": len(residuals)}
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of ``ortho fit --json`` (docs/engineering/formats.md)."""
+        return self.record.given()
 
 
 @one_blas_thread()

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.estimation.fit import Fit, root_mean_square
+from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.records import RmseOnGround, RmsesOnGround
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
@@ -92,7 +93,7 @@ def in_metres(fit: Fit, residuals: Array) -> Array:
     return solve_2x2(plan, residuals)
 
 
-def rmse_metres(fit: Fit) -> dict[str, Any]:
+def rmse_metres(fit: Fit) -> RmsesOnGround:
     """Return root mean squares (m; x is east, y north) of control (used), check and left-out residuals, or None."""
     shifts = in_metres(fit, fit.residuals)
     values = {
@@ -103,11 +104,9 @@ def rmse_metres(fit: Fit) -> dict[str, Any]:
     held_out = fit.points.check & ~fit.points.tests
     if held_out.any():
         values["matched"] = shifts[held_out]
-    found = {}
-    for name, rows in values.items():
-        rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
-        found[name] = rmse and {"x": rmse["col"], "y": rmse["row"], "total": rmse["total"], "n": rmse["n"]}
-    return found
+    return RmsesOnGround(
+        **{name: RmseOnGround.of(rows[np.isfinite(rows).all(axis=1)]) for name, rows in values.items()}
+    )
 
 
 def along_view(fit: Fit) -> Array:

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.geodesy.ellipsoid import Array
 
 
-class LeftOut(NamedTuple):
+class PartsLeftOut(NamedTuple):
     """Parts of k observations each, left out one by one.
 
     `misfits` ``(n, k)`` are zero along directions in which nothing is known, and NaN where that is so in all; `known`
@@ -47,7 +47,7 @@ class LeftOut(NamedTuple):
         return np.where(self.known.all(axis=1, keepdims=True), self.misfits, np.nan)
 
 
-def left_out(redundancy: Array, misfits: Array, *, known: float, testable: float | None = None) -> LeftOut:
+def left_out(redundancy: Array, misfits: Array, *, known: float, testable: float | None = None) -> PartsLeftOut:
     """Return parts with blocks ``(n, k, k)`` of the redundancy matrix, and misfits ``(n, k)``, as if left out.
 
     Parameters
@@ -61,7 +61,7 @@ def left_out(redundancy: Array, misfits: Array, *, known: float, testable: float
     alone = turned / np.where(there, shares, np.inf)
     left = np.einsum("nij,nj->ni", axes, alone)
     left[~there.any(axis=1)] = np.nan
-    return LeftOut(left, there, np.where(tested, turned * alone, 0.0).sum(axis=1), tested.sum(axis=1))
+    return PartsLeftOut(left, there, np.where(tested, turned * alone, 0.0).sum(axis=1), tested.sum(axis=1))
 
 
 def squared_distances(residuals: Array, covariance: Array) -> Array:
@@ -103,6 +103,12 @@ def unit_weight(square: float, freedom: float, least: float) -> float | None:
     These are a fraction where some observations are fictitious.
     """
     return math.sqrt(square / freedom) if freedom > least else None
+
+
+def basis_of(columns: Array) -> Array:
+    """Return an orthonormal basis of columns ``(n, K)``."""
+    span, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(span[:, singular > 1e-9 * singular[0]])
 
 
 def correlation_of(covariance: Array) -> Array:

@@ -1,9 +1,10 @@
-"""The formats that a model is exported in: a table of them, and one call for each."""
+"""The formats that a model is exported in: those of the host, and what each is given to write."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,7 @@ from osgeo import gdal
 
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.csm import write_csm
-from ortho_pipeline.exchange.gcp import Gcps, gcps_of_model, gcps_of_points, write_gcps, write_geolocation
+from ortho_pipeline.exchange.gcp import gcps_of_model, gcps_of_points, write_gcps, write_geolocation
 from ortho_pipeline.exchange.rpc import (
     RpcExport,
     export_rpc,
@@ -21,50 +21,42 @@ from ortho_pipeline.exchange.rpc import (
     write_tagged_copy,
     write_vrt,
 )
+from ortho_pipeline.hookspecs import Format
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.surface.base import Surface
-
-#: What ``ortho export --format`` takes, and what the file's name ends with.
-ENDINGS = {
-    "rpc-txt": "_RPC.TXT",
-    "rpb": ".RPB",
-    "vrt": ".vrt",
-    "tag": "_rpc.tif",
-    "gcp": "_gcp.vrt",
-    "gcp-tag": "_gcp.tif",
-    "geolocation": "_geolocation.vrt",
-    "csm": "_csm.json",
-}
-FORMATS = tuple(ENDINGS)
+from ortho_pipeline.surface.flat import FlatSurface
 
 
-def check_formats(formats: Sequence[str]) -> tuple[str, ...]:
-    """Return the formats, each once.
+def check_formats(names: Sequence[str], known: Mapping[str, Format]) -> tuple[Format, ...]:
+    """Return the formats of these names, each once.
 
     Raises
     ------
     InputError
         If one is unknown.
     """
-    unknown = [name for name in formats if name not in ENDINGS]
-    if unknown or not formats:
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
         raise InputError(
             f"no format is called {', '.join(unknown) or 'nothing'}", field="formats",
-            remedy=f"one or more of {', '.join(FORMATS)}",
+            remedy=f"one or more of {', '.join(known)}",
         )  # fmt: skip
-    return tuple(dict.fromkeys(formats))
+    return tuple(known[name] for name in dict.fromkeys(names))
 
 
+@dataclass(frozen=True)
 class Export:
-    """Writes one model in any of the formats and notes how well each stands for it.
+    """A model that is exported, with its image: what the function `write` of a `Format` receives.
 
     Parameters
     ----------
     dataset : gdal.Dataset
         The image.
+    model : SensorModel
+        Its model, adjusted if there were points.
     size : (int, int)
-        Its columns and rows.
+        Columns and rows of the image.
     surface : Surface, optional
         Where grids of points get their heights from.
     control : Points
@@ -73,68 +65,37 @@ class Export:
     left_out : sequence of (str, str)
         Measured control points that are not, with the reason.
     force : bool
-        Accept an RPC that is off by more than 0.1 px.
+        The user accepts a file that is more than 0.1 px off the model.
+    document : dict
+        What is said of the files, as JSON values; the host writes it.
     """
 
-    def __init__(
-        self,
-        dataset: gdal.Dataset,
-        model: SensorModel,
-        size: tuple[int, int],
-        surface: Surface | None,
-        control: Points,
-        left_out: Sequence[tuple[str, str]] = (),
-        *,
-        force: bool = False,
-    ) -> None:
-        self.dataset, self.model, self.size = dataset, model, size
-        self.surface, self.control, self.left_out, self.force = surface, control, tuple(left_out), force
-        self.document: dict[str, Any] = {"exact": None, "max_error_px": None, **to_document(())}
+    dataset: gdal.Dataset
+    model: SensorModel
+    size: tuple[int, int]
+    surface: Surface | None
+    control: Points
+    left_out: Sequence[tuple[str, str]] = ()
+    force: bool = False
+    document: dict[str, Any] = field(
+        default_factory=lambda: {"exact": None, "max_error_px": None, **to_document(())}, repr=False
+    )
 
     @functools.cached_property
     def rpc(self) -> RpcExport:
         """The model as RPC."""
         exported = export_rpc(self.model, force=self.force)
-        self.document |= {"exact": exported.exact, "max_error_px": exported.max_error_px}
-        self.document |= to_document(exported.warnings)
+        worst = {"exact": exported.exact, "max_error_px": exported.max_error_px}
+        self.document.update(worst, **to_document(exported.warnings))
         return exported
 
-    def write(self, name: str, path: Path) -> None:
+    def write(self, kind: Format, path: Path) -> None:
         """Write one format."""
-        writers: dict[str, Callable[[], object]] = {
-            "rpc-txt": lambda: write_rpc_txt(self.rpc.rpc, path),
-            "rpb": lambda: write_rpb(self.rpc.rpc, path),
-            "vrt": lambda: write_vrt(self.dataset, self.rpc.rpc, path),
-            "tag": lambda: write_tagged_copy(self.dataset, self.rpc.rpc, path),
-            "gcp": lambda: write_gcps(self.dataset, self._gcps(), path),
-            "gcp-tag": lambda: write_gcps(self.dataset, self._gcps(), path),
-            "geolocation": lambda: self._geolocation(path),
-            "csm": lambda: self._csm(path),
-        }
-        writers[name]()
+        worst = kind.write(self, path)
+        if worst is not None:
+            self.document[kind.name] = {"max_error_px": worst}
 
-    def _gcps(self) -> Gcps:
-        left_out: list[dict[str, str]] = []
-        if len(self.control):
-            gcps, source = gcps_of_points(self.control), "the measured control points"
-            left_out = [{"id": name, "reason": reason} for name, reason in self.left_out]
-        else:
-            gcps, source = gcps_of_model(self.model, self.size, self.surface), f"a grid{self._where()}"
-        self.document["gcps"] = {"n": len(gcps), "source": source, "left_out": left_out}
-        return gcps
-
-    def _geolocation(self, path: Path) -> None:
-        worst = write_geolocation(self.dataset, self.model, self.size, self.surface, path)
-        self.document["geolocation"] = {"max_error_px": worst, "heights": f"the model{self._where()}"}
-
-    def _csm(self, path: Path) -> None:
-        self.document["csm"] = {"max_error_px": write_csm(self.model, path, force=self.force)}
-
-    def _where(self) -> str:
-        surface = self.surface or Surface.constant(self.model.reference_height)
-        return f" {surface.describe()}"
-
-    def summary(self, model: str, source: str) -> str:
+    def summary(self, model: str, source: str, written: Sequence[Format]) -> str:
         """Say in a line each what was written and how well it stands for the model."""
         lines = [f"Model {model} of {source}"]
         if self.document["exact"] is not None:
@@ -143,9 +104,54 @@ class Export:
         if "gcps" in self.document:
             lines.append("Control points: {n}, {source}".format(**self.document["gcps"]))
             lines += ["Left out: {id} ({reason})".format(**one) for one in self.document["gcps"]["left_out"]]
-        if "csm" in self.document:
-            lines.append("CSM state: at most {max_error_px:.2g} px off".format(**self.document["csm"]))
+        lines += [
+            f"{one.title}: at most {self.document[one.name]['max_error_px']:.2g} px off"
+            for one in written
+            if one.name not in FORMATS
+        ]
         if "geolocation" in self.document:
             found = self.document["geolocation"]
             lines.append(f"Geolocation: {found['heights']}, {found['max_error_px']:.2g} px off between its samples")
         return "\n".join([*lines, *(f"Warning: {text}" for text in self.document["warnings"])])
+
+
+def _write_gcps(export: Export, path: Path) -> None:
+    """Write the measured control points, or a grid."""
+    left_out: list[dict[str, str]] = []
+    if len(export.control):
+        gcps, source = gcps_of_points(export.control), "the measured control points"
+        left_out = [{"id": name, "reason": reason} for name, reason in export.left_out]
+    else:
+        gcps, source = gcps_of_model(export.model, export.size, export.surface), f"a grid{_where(export)}"
+    export.document["gcps"] = {"n": len(gcps), "source": source, "left_out": left_out}
+    write_gcps(export.dataset, gcps, path)
+
+
+def _write_geolocation(export: Export, path: Path) -> None:
+    worst = write_geolocation(export.dataset, export.model, export.size, export.surface, path)
+    export.document["geolocation"] = {"max_error_px": worst, "heights": f"the model{_where(export)}"}
+
+
+def _where(export: Export) -> str:
+    surface = export.surface or FlatSurface(export.model.reference_height)
+    return f" {surface.describe()}"
+
+
+#: The formats of the host; the first four are written where nobody chooses. They say in the document how good they are.
+FORMATS: Mapping[str, Format] = {
+    name: Format(name, title, ending, write)
+    for name, title, ending, write in (
+        ("rpc-txt", "RPC as text", "_RPC.TXT", lambda export, path: write_rpc_txt(export.rpc.rpc, path)),
+        ("rpb", "RPC as DigitalGlobe writes it", ".RPB", lambda export, path: write_rpb(export.rpc.rpc, path)),
+        ("vrt", "RPC over the image", ".vrt", lambda export, path: write_vrt(export.dataset, export.rpc.rpc, path)),
+        (
+            "tag", "RPC in the TIFF tag of a copy", "_rpc.tif",
+            lambda export, path: write_tagged_copy(export.dataset, export.rpc.rpc, path),
+        ),
+        ("gcp", "ground control points", "_gcp.vrt", _write_gcps),
+        ("gcp-tag", "ground control points in a copy", "_gcp.tif", _write_gcps),
+        ("geolocation", "geolocation arrays", "_geolocation.vrt", _write_geolocation),
+    )
+}  # fmt: skip
+#: Names that no plugin's format has: those of the formats above, and other keys of the document.
+RESERVED = {*FORMATS, "exact", "files", "gcps", "model", "notices", "warnings"}

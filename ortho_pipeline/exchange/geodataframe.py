@@ -92,7 +92,7 @@ def from_geodataframe(
         Names the row and the column, and what to do.
     """
     table, sigmas = _table_of(frame)
-    found = points_of(str(frame.attrs.get("source", _FRAME)), table, crs, vertical, "corner")
+    found = points_of(table, crs, vertical, "corner")
     return replace(found, sigma_ground=sigmas)
 
 
@@ -112,7 +112,8 @@ def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
     if not frame.columns.is_unique:
         raise InputError("two columns of one name", file=source, field="columns", remedy="rename one of them")
     table = Table(
-        _FRAME, crs=None if frame.crs is None else frame.crs.to_wkt(), vertical=frame.attrs.get("vertical")
+        _FRAME, crs=None if frame.crs is None else frame.crs.to_wkt(), vertical=frame.attrs.get("vertical"),
+        source=source,
     )  # fmt: skip
     # As objects, for the missing values of pandas are neither numbers nor None.
     cells = {name: frame[name].astype(object).where(frame[name].notna(), None) for name in _COLUMNS if name in frame}

@@ -21,6 +21,7 @@ import re
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError, completed, reads
@@ -266,7 +267,7 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
         root = ElementTree.fromstring(re.sub(r"^\s*<\?xml[^>]{0,300}\?>", "", text, count=1), forbid_dtd=True)
     except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
         raise InputError(f"this is not well-formed XML ({error})", file=path) from error
-    parts: dict[str, list] = {}
+    parts: dict[str, list[Any]] = {}
     for element in root.iter():
         tag = element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
         parts.setdefault(tag, []).append(element)
@@ -287,7 +288,7 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
     return {key: _first_text(parts, tag) for tag, key in _FROM_RPB.items() if tag in parts}, 0.0
 
 
-def _first_text(parts: Mapping[str, list], tag: str) -> str:
+def _first_text(parts: Mapping[str, list[Any]], tag: str) -> str:
     found = parts.get(tag)
     return (found[0].text or "").strip() if found else ""
 

@@ -1,6 +1,6 @@
 """Files: on disk, in archives and behind URLs; read within limits, written whole or not at all.
 
-Also where compiled kernels are kept. Imports nothing above `errors`.
+Imports nothing above `errors`.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 from urllib.parse import unquote
 
 from ortho_pipeline.errors import InputError
@@ -33,6 +33,9 @@ _ARCHIVES = ("/vsizip", "/vsitar", "/vsigzip", "/vsi7z", "/vsirar")
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 #: An address of a folder or an object.
 _ADDRESS = re.compile(rf"({'|'.join(SCHEMES)})://[^/]")
+#: An item and a collection of a STAC API.
+_ITEM_OF_API = re.compile(r"https?://[^?]*/collections/[^/?]+/items/[^/?#]+$")
+_COLLECTION_OF_API = re.compile(r"https?://[^?#]*/collections/[^/?#]+/?$")
 #: What opens a door and stands in an address itself: a name with a password, or what a query calls so.
 _NAMED = re.compile(r"(?<=://)[^/?#@]*@")
 _SIGNED = re.compile(
@@ -279,6 +282,106 @@ def _open_network() -> None:
 AnyPath = str | os.PathLike[str]
 
 
+class Location(str):
+    """What a user or a document calls a file or a folder: the same text, which knows what kind of place it is.
+
+    A path on this machine, an address of `SCHEMES`, or a name of GDAL's. Nothing is opened; only `archive` looks at
+    the disk.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, name: AnyPath) -> Self:
+        """Return the location that has a name."""
+        return name if isinstance(name, cls) else super().__new__(cls, os.fspath(name))
+
+    @property
+    def is_address(self) -> bool:
+        """Whether it is an address of one of `SCHEMES`."""
+        return bool(_ADDRESS.match(self))
+
+    @property
+    def is_on_web(self) -> bool:
+        """Whether it is an address of a web server."""
+        return self.startswith(tuple(f"{scheme}://" for scheme in WEB))
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it is on another machine, where each request takes its time."""
+        url = _URL.match(self)
+        if url is not None:
+            return url[1].lower() in SCHEMES
+        return self.startswith("/vsi") and not self.in_archive and not self.startswith("/vsimem")
+
+    @property
+    def url(self) -> Location:
+        """The address of a file on another machine, also where GDAL's name for it is given; any other name as it is."""
+        for scheme, prefix in SCHEMES.items():
+            if self.startswith(prefix):
+                return Location(f"{scheme}://{self.removeprefix(prefix)}")
+        return self
+
+    # -- archives ----------------------------------------------------------------------------------------------------
+
+    @property
+    def in_archive(self) -> bool:
+        """Whether it is a name of GDAL's that leads into archives on disk and nowhere else."""
+        chain = [prefix for prefix in _ARCHIVES if self.startswith((prefix + "/", prefix + "{"))]
+        if not chain:
+            return False
+        # GDAL takes /vsizip//vsicurl/… and /vsizip/vsicurl/… for the same.
+        rest = self[len(chain[0]) :]
+        if not rest.startswith("/vsi"):
+            rest = rest.removeprefix("/")
+        rest = rest.removeprefix("{")
+        return Location(rest).in_archive if rest.startswith("/vsi") else "://" not in rest
+
+    @property
+    def archive(self) -> Path | None:
+        """The archive on disk that it leads into; None where there is none."""
+        if not self.in_archive:
+            return None
+        rest = re.sub(r"^(/vsi[a-z0-9]+(/(?=/)|(?=/vsi))|/vsi[a-z0-9]+/)+", "", self).replace("{", "").replace("}", "")
+        parts = rest.split("/")
+        for count in range(1, len(parts) + 1):
+            path = Path("/".join(parts[:count]) or "/")
+            if path.is_file():
+                return path
+        return None
+
+    # -- documents of STAC -------------------------------------------------------------------------------------------
+
+    @property
+    def document(self) -> Location:
+        """The address of a STAC document, without the key of an asset after its ``#``."""
+        return self._parts()[0]
+
+    @property
+    def asset(self) -> str:
+        """The key of an asset after the ``#`` of a STAC document; empty where there is none."""
+        return self._parts()[1]
+
+    def _parts(self) -> tuple[Location, str]:
+        text = self.url
+        if not (text.is_address or ".json#" in text.lower()):
+            return text, ""
+        address, _, key = text.partition("#")
+        return Location(address), key
+
+    @property
+    def is_item(self) -> bool:
+        """Whether, by its name, it may be a STAC item: a JSON file, or an address of an API's items."""
+        return self.document._is_json() or bool(_ITEM_OF_API.match(self.document))
+
+    @property
+    def is_collection(self) -> bool:
+        """Whether, by its name, it may be a STAC collection: a JSON file, or a collection of an API."""
+        return self.document._is_json() or bool(_COLLECTION_OF_API.match(self.document))
+
+    def _is_json(self) -> bool:
+        return self.lower().partition("?")[0].endswith((".json", ".geojson"))
+
+
 def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
     """Return where a file lies that the user named: itself on disk, a `VsiPath` in an archive or behind a URL.
 
@@ -309,7 +412,7 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
                 f"URLs of the kind {scheme!r} are not read", file=name, remedy=f"one of {', '.join(SCHEMES)}, or a file"
             )
         name = SCHEMES[scheme] + name[url.end() :]
-    if not in_local_archive(name):
+    if not Location(name).in_archive:
         require_network(os.fspath(path), allow_network)
     return VsiPath(name)
 
@@ -353,19 +456,6 @@ def _decoded(address: str) -> str:
     return address
 
 
-def in_local_archive(name: str) -> bool:
-    """Tell whether a name of GDAL's leads into archives on disk and nowhere else."""
-    chain = [prefix for prefix in _ARCHIVES if name.startswith((prefix + "/", prefix + "{"))]
-    if not chain:
-        return False
-    # GDAL takes /vsizip//vsicurl/… and /vsizip/vsicurl/… for the same.
-    rest = name[len(chain[0]) :]
-    if not rest.startswith("/vsi"):
-        rest = rest.removeprefix("/")
-    rest = rest.removeprefix("{")
-    return in_local_archive(rest) if rest.startswith("/vsi") else "://" not in rest
-
-
 def place(name: AnyPath) -> Any:
     """Return the path of a dataset that is open (``dataset.GetDescription()``): a `Path`, or a `VsiPath`.
 
@@ -380,47 +470,6 @@ def within(path: Path, roots: Iterable[AnyPath]) -> bool:
     """Tell whether a path lies in one of the folders, wherever links lead."""
     resolved = path.resolve()
     return any(resolved.is_relative_to(Path(root).resolve()) for root in roots)
-
-
-def is_far(name: AnyPath) -> bool:
-    """Tell whether a file lies on another machine, where each request to it takes its time."""
-    text = os.fspath(name)
-    url = _URL.match(text)
-    if url is not None:
-        return url[1].lower() in SCHEMES
-    return text.startswith("/vsi") and not in_local_archive(text) and not text.startswith("/vsimem")
-
-
-def is_address(text: AnyPath) -> bool:
-    """Tell whether a text is an address of one of `SCHEMES`."""
-    return bool(_ADDRESS.match(os.fspath(text)))
-
-
-def is_on_web(address: str) -> bool:
-    """Tell whether an address is of a web server."""
-    return address.startswith(tuple(f"{scheme}://" for scheme in WEB))
-
-
-def url_of(name: AnyPath) -> str:
-    """Return the address of a file on another machine, whatever its name; any other name as it is."""
-    text = os.fspath(name)
-    for scheme, prefix in SCHEMES.items():
-        if text.startswith(prefix):
-            return f"{scheme}://{text.removeprefix(prefix)}"
-    return text
-
-
-def archive_of(name: str) -> Path | None:
-    """Return the archive on disk that a name of GDAL's leads into; None where there is none."""
-    if not in_local_archive(name):
-        return None
-    rest = re.sub(r"^(/vsi[a-z0-9]+(/(?=/)|(?=/vsi))|/vsi[a-z0-9]+/)+", "", name).replace("{", "").replace("}", "")
-    parts = rest.split("/")
-    for count in range(1, len(parts) + 1):
-        path = Path("/".join(parts[:count]) or "/")
-        if path.is_file():
-            return path
-    return None
 
 
 def members(archive: AnyPath, endings: tuple[str, ...] = (".tif", ".ntf", ".jp2", ".xml", ".img")) -> list[str]:

@@ -386,7 +386,7 @@ class GroundTransform:
             stops = [(first, last, False)]
         self._legs = [(_transformer(one, other), spatial) for one, other, spatial in stops]
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Any, ...]:
         return GroundTransform, (self.source, self.target)
 
     @property

@@ -25,7 +25,7 @@ def dem_vertical_remedy(first: str = "") -> str:
 
 
 def dem_vertical(
-    path: str, declared: DeclaredVertical | None, option: Vertical | None, override: bool
+    declared: DeclaredVertical | None, option: Vertical | None, override: bool
 ) -> tuple[Vertical, list[str]]:
     """Return the height datum to use for a DEM, and what the user ought to know about it.
 
@@ -47,7 +47,6 @@ def dem_vertical(
         if option is None:
             raise DatumError(
                 "this DEM does not say what its heights are measured above",
-                file=path,
                 field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
@@ -56,7 +55,6 @@ def dem_vertical(
         if declared.vertical is None:
             raise DatumError(
                 f"the heights of this DEM are in {declared.name!r}, which is not a datum that is known here",
-                file=path,
                 field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
@@ -77,7 +75,6 @@ def dem_vertical(
     if declared.certain and not override and not realises:
         raise DatumError(
             Text(f"{told}, ", asked, f" says {option.label}"),
-            file=path,
             field="surface.vertical",
             remedy=Text(
                 "leave the option out, or override what the file declares with ", Setting("surface.override_vertical")
@@ -86,7 +83,7 @@ def dem_vertical(
     return option, [warning]
 
 
-def dem_unit(path: str, text: str, declared: DeclaredVertical | None) -> float:
+def dem_unit(text: str, declared: DeclaredVertical | None) -> float:
     """Return the length in metres of the unit of a DEM's heights.
 
     Parameters
@@ -101,15 +98,12 @@ def dem_unit(path: str, text: str, declared: DeclaredVertical | None) -> float:
     """
     stated = UNITS.get("".join(c for c in text.lower() if c.isalpha())) if text else None
     if text and stated is None:
-        raise DatumError(
-            f"the unit {text!r} of the heights is not known", file=path, field="unit", remedy="use metres or feet"
-        )
+        raise DatumError(f"the unit {text!r} of the heights is not known", field="unit", remedy="use metres or feet")
     # Two-dimensional systems say nothing; 3D ones made by promotion say metre whatever the band holds.
     axis = declared.metres_per_unit if declared else None
     if stated is not None and axis is not None and abs(stated - axis) > 1e-3:
         raise DatumError(
             f"the band says {text!r}, the CRS a unit of {axis:.6g} m",
-            file=path,
             field="unit",
             remedy="state the unit of the heights once (gdal_edit.py -units m, or another CRS)",
         )

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Semi-major axis (m) and squared eccentricity of WGS84.
+#: Semi-major axis of WGS84 (m).
 SEMI_MAJOR = 6378137.0
+#: Squared eccentricity of WGS84.
 ECCENTRICITY_SQUARED = 6.69437999014e-3
 #: Rotation of the Earth, radians per second.
 EARTH_RATE = 7.292115e-5
@@ -161,7 +162,7 @@ def orbital_from_ecef(position: Array, velocity: Array) -> Array:
 def rotation_between(from_vectors: Array, to_vectors: Array) -> Array:
     """Return the rotation ``(3, 3)`` that best turns vectors ``(N, 3)`` into others, by least squares (Kabsch)."""
     u, _, vt = np.linalg.svd(to_vectors.T @ from_vectors)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 def _sin_cos(angle: float) -> tuple[float, float]:

@@ -11,9 +11,9 @@ import pyproj
 
 from ortho_pipeline.errors import DatumError, InputError, StorageError
 from ortho_pipeline.files import parse_json, together, whole_or_nothing
-from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.geodesy.crs import VERTICAL_NAMES, add_system_grids, vertical_transformer
 from ortho_pipeline.geodesy.geoid_grid import header_fault
+from ortho_pipeline.stores.objects import Objects
 
 #: What PROJ's store has: a list with names, sizes and checksums.
 _LIST, _LIST_BYTES = "files.geojson", 50_000_000

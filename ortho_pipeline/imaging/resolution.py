@@ -221,7 +221,7 @@ def _moved(edge: Edge, left: int, top: int) -> Edge:
 
 
 def document(edges: Sequence[Edge], image: str | os.PathLike[str], band: int) -> dict[str, Any]:
-    """Return what ``ortho edge --json`` prints (docs/formats.md): each edge, and medians, also by direction."""
+    """Return what ``ortho edge --json`` prints (docs/engineering/formats.md): each edge, and medians by direction."""
     groups = {"all": list(edges)}
     groups |= {name: [one for one in edges if one.profile == name] for name in ("along the row", "along the column")}
     return {

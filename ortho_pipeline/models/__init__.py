@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.base import SensorModel
+from ortho_pipeline.models.base import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.families import Family, families, family_of
 from ortho_pipeline.models.frame.camera import FrameCamera
@@ -17,35 +15,9 @@ from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC, Rational
 from ortho_pipeline.models.rational_start import model_crs, start_model
 
-#: Model classes by the `kind` under which files name them; the hook `ortho_models` adds to it.
-KINDS: dict[str, type[SensorModel]] = {
-    cls.kind: cls for cls in (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapPlane, Pieces, Pushbroom)
-}
-
-
-def model_from_dict(data: dict[str, Any]) -> SensorModel:
-    """Make a model from what its `to_dict` returned.
-
-    Raises
-    ------
-    InputError
-        If its kind is unknown (the plugin that has it is not installed) or its fields do not fit.
-    """
-    kind = data.get("kind")
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise InputError(
-            f"no installed sensor model is of kind {kind!r}",
-            field="kind",
-            remedy=f"known kinds are {', '.join(sorted(KINDS))}; install the plugin that offers it in ortho_models",
-        )
-    try:
-        return KINDS[kind].from_dict(data)
-    except (TypeError, ValueError, AttributeError, ArithmeticError, LookupError, RecursionError) as error:
-        # Constructors check what numbers mean; that a value is a number or a list at all is found out by using it.
-        raise InputError(
-            f"this is not a model of kind {kind!r} ({str(error)[:200]})", field=kind,
-            remedy="leave what was written as it is, or write the model again",
-        ) from error  # fmt: skip
+KINDS.update(
+    {cls.kind: cls for cls in (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapPlane, Pieces, Pushbroom)}
+)
 
 
 def require_view(model: SensorModel) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
 
+#: The type of all arrays of coordinates and parameters.
 Array = NDArray[np.float64]
 
 #: Newton's method ends when the image point is met this closely (pixels) ...
@@ -113,7 +114,7 @@ class SensorModel(ABC):
         Here the corners of `domain`; a model that knows the frame of its image gives the corners of that.
         """
         centre, half = self.domain
-        return centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        return np.asarray(centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3))))
 
     @property
     def detail(self) -> float:
@@ -275,6 +276,35 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(item) for item in value]
     return value
+
+
+#: Model classes by the `kind` under which files name them: those of `models`, and what the hook `ortho_models` adds.
+KINDS: dict[str, type[SensorModel]] = {}
+
+
+def model_from_dict(data: dict[str, Any]) -> SensorModel:
+    """Make a model from what its `to_dict` returned.
+
+    Raises
+    ------
+    InputError
+        If its kind is unknown (the plugin that has it is not installed) or its fields do not fit.
+    """
+    kind = data.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise InputError(
+            f"no installed sensor model is of kind {kind!r}",
+            field="kind",
+            remedy=f"known kinds are {', '.join(sorted(KINDS))}; install the plugin that offers it in ortho_models",
+        )
+    try:
+        return KINDS[kind].from_dict(data)
+    except (TypeError, ValueError, AttributeError, ArithmeticError, LookupError, RecursionError) as error:
+        # Constructors check what numbers mean; that a value is a number or a list at all is found out by using it.
+        raise InputError(
+            f"this is not a model of kind {kind!r} ({str(error)[:200]})", field=kind,
+            remedy="leave what was written as it is, or write the model again",
+        ) from error  # fmt: skip
 
 
 def as_ground(ground: ArrayLike) -> Array:

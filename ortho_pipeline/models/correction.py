@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.base import Array, SensorModel, as_image
+from ortho_pipeline.models.base import Array, SensorModel, as_image, model_from_dict
 
 COEFFICIENTS = ("col_shift", "col_per_col", "col_per_row", "row_shift", "row_per_col", "row_per_row")
 FREE = {
@@ -82,8 +82,6 @@ class OverAnother(SensorModel):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        from ortho_pipeline.models import model_from_dict
-
         inner = data.get("model")
         if not isinstance(inner, dict):
             raise InputError(f"a model of kind {cls.kind!r} needs the model that it moves", field="model")

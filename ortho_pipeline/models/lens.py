@@ -140,7 +140,7 @@ class Interior:
     def partials_of_direction(self, directions: Array) -> Array:
         """Return d(image)/d(direction) as ``(N, 2, 2)``."""
         scale = np.array([self.focal_length / self.pitch_x, self.focal_length / self.pitch_y])
-        return self._slopes(directions) * scale[:, None]
+        return np.asarray(self._slopes(directions) * scale[:, None])
 
     def partials(self, directions: Array) -> Array:
         """Return d(image)/d(parameters) as ``(N, 2, 10)``, in the order of `INTERIOR`."""

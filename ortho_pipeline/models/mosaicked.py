@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.models.base import Array, Constraints, SensorModel, as_ground, as_image
+from ortho_pipeline.models.base import Array, Constraints, SensorModel, as_ground, as_image, model_from_dict
 from ortho_pipeline.models.correction import OverAnother
 
 
@@ -101,8 +101,6 @@ class Pieces(SensorModel):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        from ortho_pipeline.models import model_from_dict
-
         models = tuple(map(model_from_dict, data.get("models", ())))
         pairs = {name: tuple(map(tuple, data.get(name, ()))) for name in ("offsets", "sizes")}
         return super().from_dict({**data, "models": models, **pairs})

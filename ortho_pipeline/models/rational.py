@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.compiled import is_loaded
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models import rpc_kernel
 from ortho_pipeline.models.base import (
@@ -38,6 +37,7 @@ from ortho_pipeline.models.base import (
 from ortho_pipeline.models.families import exponents, family_of, points_needed
 from ortho_pipeline.models.polynomials import term_partials, term_table, terms_of
 from ortho_pipeline.models.rpc_box import check_numbers, sound_heights
+from ortho_pipeline.runtime.compiled import is_loaded
 
 #: From this many points on the compiled kernels are used: loading a compiler takes longer than few points do.
 COMPILED_FROM = 20_000
@@ -363,7 +363,7 @@ class Rational(SensorModel):
         sums = self._table @ terms  # type: ignore[attr-defined]
         with np.errstate(invalid="ignore"):
             sums[:, ~(sums[2:] > _POLE).all(axis=0)] = np.nan
-        return sums
+        return np.asarray(sums)
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)
@@ -380,7 +380,7 @@ class Rational(SensorModel):
         partials = np.moveaxis((by_axis[:, :2] - ratios * by_axis[:, 2:]) / sums[2:], (0, 1, 2), (2, 1, 0))
         partials = partials * self.image_scale[:, None] / self.ground_scale
         partials[~np.isfinite(normalised).all(axis=1)] = np.nan
-        return partials if slopes is None else partials @ slopes
+        return np.asarray(partials if slopes is None else partials @ slopes)
 
     def param_partials(self, ground: ArrayLike) -> Array:
         normalised, _ = self.normalise(ground)

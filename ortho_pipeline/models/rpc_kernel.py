@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 #: Points of a block: what is kept of them fits into the first cache.
 BLOCK = 256

@@ -77,7 +77,7 @@ class BlockOptions:
         str,
         Option(
             "--dem-heights", Text(
-                "Whether heights of ", Setting("surface.dem"), " are observations of the ties, or serve matching alone."
+                "Use the heights of ", Setting("surface.dem"), " as observations of the ties, or only to match."
             ),
             choices=("on", "off"),
         ),
@@ -85,28 +85,28 @@ class BlockOptions:
     dem_bias: Annotated[
         float | None,
         Option(
-            "--dem-bias", "Standard deviation of an error that all heights of the DEM have in common.", "M",
+            "--dem-bias", "Standard deviation of an error that all heights of the DEM share.", "M",
             kind="number", unset="that of a single height",
         ),
     ] = None  # fmt: skip
     dem_correlation: Annotated[
         float | None,
         Option(
-            "--dem-correlation", "Distance over which errors of the DEM are alike; their correlation falls with "
-            "exp(-d / M).", "M", kind="number", above=0, unset="that of its samples, beside the bias",
+            "--dem-correlation", "Distance over which DEM errors are correlated, by exp(-d / M).", "M", kind="number",
+            above=0, unset="each sample of the DEM has its own error",
         ),
     ] = None  # fmt: skip
     dem_shift_sigma: Annotated[
         float | None,
         Option(
-            "--dem-shift-sigma", "Standard deviation of where the DEM lies, in each axis.", "M", kind="number",
-            unset="half of its samples' side",
+            "--dem-shift-sigma", "Standard deviation of the horizontal position of the DEM, in each axis.", "M",
+            kind="number", unset="half a sample",
         ),
     ] = None  # fmt: skip
     join_limit: Annotated[
         float,
         Option(
-            "--join-limit", "Warn of neighbouring images that may be shifted against each other by more (sigma).", "PX",
+            "--join-limit", "Warn if the relative position of two images with common points has a larger sigma.", "PX",
             kind="number", above=0,
         ),
     ] = 0.5  # fmt: skip

@@ -6,12 +6,9 @@ string "give `surface.dem=FILE` too", and still knows its parts; a formatted str
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
-
-_NOTATION = re.compile(r"`([a-z_]+(?:\.[a-z_]+)?)(?:\.(\w+))?(?:=([^`]*))?`")
 
 
 @dataclass(frozen=True)
@@ -35,6 +32,13 @@ class Setting:
     def __str__(self) -> str:
         name = self.name if self.key is None else f"{self.name}.{self.key}"
         return f"`{name}`" if self.value is None else f"`{name}={self.value}`"
+
+    @classmethod
+    def read(cls, text: str) -> Setting:
+        """Return what stands between two backticks of a text; anything but an option is one that no command has."""
+        name, equals, value = text.partition("=")
+        words = name.split(".", 2)
+        return cls(".".join(words[:2]), value if equals else None, words[2] if len(words) == 3 else None)
 
 
 class Text(str):
@@ -66,13 +70,10 @@ class Text(str):
     @classmethod
     def read(cls, text: str) -> Text:
         """Return a text that another process has written into a JSON document, where it is a string alone."""
-        parts: list[str | Setting] = []
-        end = 0
-        for found in _NOTATION.finditer(text):
-            name, key, value = found.groups()
-            parts += [text[end : found.start()], Setting(name, value, key)]
-            end = found.end()
-        return Text(*parts, text[end:])
+        parts = text.split("`")
+        if len(parts) % 2 == 0:  # one of them quotes nothing
+            return Text(text)
+        return Text(*(Setting.read(part) if number % 2 else part for number, part in enumerate(parts)))
 
 
 def counted(number: int, what: str, plural: str | None = None) -> str:

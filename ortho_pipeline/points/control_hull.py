@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.points.table import Array
 
 #: Below this share of the image, with the margin, the rest is not covered: models that fit the points alike differ
@@ -20,22 +22,24 @@ _PART = 0.2
 _ASIDE = 0.15
 
 
-def control_hull(image: Array, size: tuple[int, int]) -> dict[str, Any] | None:
-    """Return the convex hull of points ``(N, 2)`` px and its share of the image; None below three points.
+class ControlHull(Record):
+    """Convex hull of the used control points, and its share of the image; no outline of points in a line."""
 
-    Returns
-    -------
-    dict
-        `share` (0 to 1), the number `n` of points, and the `outline` as corners (px), empty for a line of points.
-    """
+    share: Annotated[float, pydantic.Field(ge=0)]
+    n: Count
+    outline: tuple[Pair, ...]
+
+
+def control_hull(image: Array, size: tuple[int, int]) -> ControlHull | None:
+    """Return the convex hull of points ``(N, 2)`` px; None below three points."""
     if len(image) < 3:
         return None
     import shapely
 
     hull = shapely.MultiPoint(image).convex_hull
     inside = hull.intersection(shapely.box(0, 0, *size))
-    outline = [[float(x), float(y)] for x, y in hull.exterior.coords[:-1]] if hull.geom_type == "Polygon" else []
-    return {"share": float(inside.area) / (size[0] * size[1]), "n": len(image), "outline": outline}
+    outline = tuple(hull.exterior.coords[:-1]) if hull.geom_type == "Polygon" else ()
+    return ControlHull(share=inside.area / (size[0] * size[1]), n=len(image), outline=outline)
 
 
 def outside_of_hull(control: Array, image: Array) -> NDArray[np.bool_]:

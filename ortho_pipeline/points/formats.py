@@ -136,7 +136,9 @@ def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK)
 def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: Columns) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
     with completed(path, remedy=kind.wanted):
-        return kind.reader(path, text, *expected)
+        table = kind.reader(path, text, *expected)
+    table.source = os.fspath(path)
+    return table
 
 
 def _format_of(path: str | os.PathLike[str], text: str) -> _Format:

@@ -112,11 +112,12 @@ class Table:
 
     `vertical` is stated by the file; `assumed_vertical` is what the format means where nothing is stated. `of_ground`
     is ``geographic`` or ``projected`` where the columns are called so. With `origin_allowed` the file does not say what
-    (0, 0) is, and the user may.
+    (0, 0) is, and the user may. `source` is the file.
     """
 
     format: str
     rows: list[Row] = field(default_factory=list)
+    source: str = ""
     crs: str | None = None
     vertical: str | None = None
     assumed_vertical: str | None = None

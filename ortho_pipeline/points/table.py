@@ -13,13 +13,13 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors import InputError, completed, reads
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
@@ -55,13 +55,11 @@ from ortho_pipeline.points.rows import (
     short,
 )
 
-if TYPE_CHECKING:
-    pass
-
 Array = NDArray[np.float64]
 
 #: Standard deviation (px) of an image measurement whose file gives none.
 DEFAULT_SIGMA_IMAGE = 0.5
+_FORMATS = "see docs/formats.md for what stands in a file of points"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -195,12 +193,12 @@ class Points:
     @property
     def control(self) -> NDArray[np.bool_]:
         """Which points are control ``(N,)``."""
-        return self.roles == "control"
+        return np.asarray(self.roles == "control")
 
     @property
     def check(self) -> NDArray[np.bool_]:
         """Which points are check points ``(N,)``."""
-        return self.roles == "check"
+        return np.asarray(self.roles == "check")
 
     @property
     def tests(self) -> NDArray[np.bool_]:
@@ -266,7 +264,7 @@ class Points:
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
-@reads("see docs/formats.md for what stands in a file of points")
+@reads(_FORMATS)
 def read_points(
     path: str | os.PathLike[str],
     *,
@@ -296,35 +294,33 @@ def read_points(
     InputError, CrsError, DatumError
         Names file, line and column, and what to do.
     """
-    return points_of(path, read_table(path, image_name, pieces), crs, vertical, pixel_origin)
+    return points_of(read_table(path, image_name, pieces), crs, vertical, pixel_origin)
 
 
-@reads("see docs/formats.md for what stands in a file of points")
-def points_of(
-    path: str | os.PathLike[str], table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None,
-    pixel_origin: str,
-) -> Points:  # fmt: skip
+def points_of(table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None, pixel_origin: str) -> Points:
     """Return the points of a table that was read; parameters and errors are those of `read_points`."""
-    shift, rows = origin_shift(path, table, pixel_origin), table.rows
-    ids = numbered_ids(path, rows)
-    pieces = np.array([row.piece for row in rows]).reshape(-1, 3)
-    image = (np.array([row.image for row in rows]).reshape(-1, 2) + shift) * pieces[:, 2:] + pieces[:, :2]
-    ground, plane = ground_of(path, table, crs, vertical)
-    refuse_duplicates(path, [row.where for row in rows], image, ground, [row.role for row in rows])
-    sigma_image = sigmas_of(rows, DEFAULT_SIGMA_IMAGE)
-    return Points(
-        ids=ids,
-        image=image,
-        ground=ground,
-        roles=np.array([row.role for row in rows], dtype="<U7"),
-        sigma_image=sigma_image,
-        sigma_ground=np.array([[row.sigma_xy or 0.0] * 2 + [row.sigma_h or 0.0] for row in rows]).reshape(-1, 3),
-        crs=plane,
-        source=os.fspath(path),
-        covariance_image=covariance_of(rows, sigma_image),
-        groups=groups_of(rows),
-        **common_of(rows),
-    )
+    path = table.source
+    with completed(path, remedy=_FORMATS):
+        shift, rows = origin_shift(path, table, pixel_origin), table.rows
+        ids = numbered_ids(path, rows)
+        pieces = np.array([row.piece for row in rows]).reshape(-1, 3)
+        image = (np.array([row.image for row in rows]).reshape(-1, 2) + shift) * pieces[:, 2:] + pieces[:, :2]
+        ground, plane = ground_of(path, table, crs, vertical)
+        refuse_duplicates(path, [row.where for row in rows], image, ground, [row.role for row in rows])
+        sigma_image = sigmas_of(rows, DEFAULT_SIGMA_IMAGE)
+        return Points(
+            ids=ids,
+            image=image,
+            ground=ground,
+            roles=np.array([row.role for row in rows], dtype="<U7"),
+            sigma_image=sigma_image,
+            sigma_ground=np.array([[row.sigma_xy or 0.0] * 2 + [row.sigma_h or 0.0] for row in rows]).reshape(-1, 3),
+            crs=plane,
+            source=path,
+            covariance_image=covariance_of(rows, sigma_image),
+            groups=groups_of(rows),
+            **common_of(rows),
+        )
 
 
 def gcps_of_dataset(

@@ -23,12 +23,12 @@ from typing import Any
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, completed
-from ortho_pipeline.files.beside import ask_beside
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import AnyPath, VsiPath, in_local_archive, network_is_closed, place, within
+from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, network_is_closed, place, within
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
+from ortho_pipeline.stores.beside import ask_beside
 
 gdal.UseExceptions()
 
@@ -329,7 +329,7 @@ class _Gate:
     def _beside(path: Any) -> list[str]:
         """Return the names beside a file that begin as its own; behind a URL, those of the side-cars that are there."""
         folder = path.parent
-        if isinstance(folder, VsiPath) and not (in_local_archive(str(folder)) and folder.is_dir()):
+        if isinstance(folder, VsiPath) and not (Location(str(folder)).in_archive and folder.is_dir()):
             names = (path.name + ending for ending in (".ovr", ".msk", ".aux", ".aux.xml"))
             return [name for name in names if (folder / name).exists()]
         return listing(folder).beginning(path.stem)

@@ -17,10 +17,10 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.files.process_limits import Progress, claim_gdal_threads
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
+from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
 
 #: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.
 _SMALL = 16_000_000

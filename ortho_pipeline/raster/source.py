@@ -25,12 +25,12 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import AnyPath, VsiPath, archive_of, check_path, in_local_archive, located, members
-from ortho_pipeline.files.process_limits import require_memory
+from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
 from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.block_cache import keep_blocks
 from ortho_pipeline.raster.gate import DRIVERS, DecodedUnit, open_seen
+from ortho_pipeline.runtime.process_limits import require_memory
 
 gdal.UseExceptions()
 log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def _opened(
     name, drivers = os.fspath(place), list(DRIVERS)
     if isinstance(place, VsiPath):
         drivers.remove("VRT")
-        if in_local_archive(name) and not place.exists():
+        if Location(name).in_archive and not place.exists():
             raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
         what = "this is a pipe or a device" if Path(name).exists() else "there is no such file"
@@ -171,7 +171,7 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
 
 
 def _in_archive(name: str) -> str:
-    archive = archive_of(name) if name.startswith("/vsi") else Path(name)
+    archive = Location(name).archive if name.startswith("/vsi") else Path(name)
     found = members(archive) if archive is not None else []
     return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
 
@@ -468,7 +468,7 @@ class RasterSource:
 def _numpy_type(gdal_type: int) -> np.dtype[Any]:
     from osgeo import gdal_array
 
-    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
+    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))  # type: ignore[no-any-return]
 
 
 def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:

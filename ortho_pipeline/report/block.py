@@ -8,34 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.relative.joins import Join
+from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
+from ortho_pipeline.block.heights.settling import HeightsRecord
+from ortho_pipeline.block.network import NetworkRecord
+from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.estimation.blunders import contradicting
+from ortho_pipeline.estimation.records import Rmse, is_known
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.points.rows import ROLES
-from ortho_pipeline.report.adjustment_records import Rmse, is_known
-from ortho_pipeline.report.block_records import (
-    BlockAdjustment,
-    BlockHeadline,
-    BlockImage,
-    BlockPoint,
-    BlockProvenance,
-    BlockReport,
-    HeightsRecord,
-    NetworkRecord,
-    Ray,
-    VariancesRecord,
-    merged,
-)
+from ortho_pipeline.report.block_records import BlockHeadline, BlockImage, BlockProvenance, BlockReport
 from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
-from ortho_pipeline.report.network.facts import found_network, network_record, placed, suffices_for, thinly_covered
+from ortho_pipeline.report.network.facts import found_network, placed, suffices_for, thinly_covered
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
@@ -77,12 +67,11 @@ def build_report(
     exported: Mapping[str, RpcExport],
     provenance: Mapping[str, Any],
     warnings: Sequence[Notice],
-    joins: Sequence[Join] = (),
     join_limit: float = math.inf,
 ) -> BlockReport:
-    """Collect everything that the report says (docs/formats/block-points.md)."""
+    """Collect everything that the report says (docs/engineering/formats.md)."""
     places = placed(fit, starts)
-    network, parted = found_network(fit)
+    network, of_network = found_network(fit, join_limit)
     suffices = suffices_for(fit)
     images = {}
     for label, start in starts.items():
@@ -97,10 +86,7 @@ def build_report(
             rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
             **places[label],
         )
-    adjustment, noted = (
-        BlockAdjustment.model_validate(json_value(fit.to_json())),
-        to_document([*warnings, *parted, *thinly_covered(places)]),
-    )
+    adjustment, noted = fit.record, to_document([*warnings, *of_network, *thinly_covered(places)])
     return BlockReport(
         images=images,
         adjustment=adjustment,
@@ -110,7 +96,7 @@ def build_report(
         headline=_corrected(
             headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
         ),
-        network=network_record(network, joins, join_limit),
+        network=network,
         map_scale=None if refuted(noted["notices"]) else suffices,
     )
 
@@ -222,24 +208,24 @@ def summary_text(report: BlockReport) -> str:
 
 
 def height_lines(heights: HeightsRecord | None) -> list[str]:
-    """Say what a DEM said of the heights of ties."""
+    """Say how many heights a DEM gave to points, how accurate they are, and its bias."""
     if heights is None:
         return []
-    left = f", {heights.left_out} left out" if heights.left_out else ""
+    left = f", {len(heights.left_out)} left out" if heights.left_out else ""
     return [
         f"{counted(heights.used, 'height')} of the DEM{left}: sigma {heights.sigma_m:.2g} m ({heights.sigma_is}), "
-        f"common error {heights.bias_m:+.2f} m (sigma {heights.bias_sigma_m:.2g} m)"
+        f"bias {heights.bias_m:+.2f} m (sigma {heights.bias_sigma_m:.2g} m)"
     ]
 
 
 def join_lines(network: NetworkRecord) -> list[str]:
-    """Say how well images that share points lie to each other, apart from where all of them lie."""
+    """Say how accurate the relative positions of images with points in common are."""
     known = sorted(one.sigma_px for one in network.pairs if one.sigma_px is not None)
     if not known:
         return []
     return [
-        f"Relative accuracy: {counted(len(known), 'pair')} of images within {known[len(known) // 2]:.2g} px of each "
-        f"other (median sigma), the worst within {known[-1]:.2g} px"
+        f"Relative accuracy of {counted(len(known), 'pair')} of images: sigma {known[len(known) // 2]:.2g} px "
+        f"(median), {known[-1]:.2g} px (worst)"
     ]
 
 
@@ -319,7 +305,8 @@ def _marks(report: BlockReport) -> list[str]:
     kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
     said = [what for role, what in kinds.items() if role in there]
     said += ["crosses are what was left out"] if report.adjustment.rejected else []
-    said += ["red lines are joins that are hardly determined"] if any(one.weak for one in report.network.pairs) else []
+    weak = any(pair.weak for pair in report.network.pairs)
+    said += ["red lines join images whose relative position is uncertain"] if weak else []
     return [*said, "in red rings what contradicts"] if doubted(report.notices) else said
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import px
+from ortho_pipeline.estimation.records import Adjustment
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.report.adjustment_records import Adjustment
 from ortho_pipeline.report.records import NOT_TESTED, Headline
 from ortho_pipeline.report.wording import headline
 
@@ -47,7 +47,7 @@ def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
 
 
 def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
-    from ortho_pipeline.report.block_records import AdjustedImage  # few scenes come from a block
+    from ortho_pipeline.block.fit import AdjustedImage  # few scenes come from a block
 
     image = AdjustedImage.read({name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +21,10 @@ from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.estimation.fit import Fit, root_mean_square
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
+from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
+from ortho_pipeline.estimation.records import Adjustment, Point, Rmse, RmseOfView, RmsesOfView, is_known
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.json.records import DocumentError
@@ -33,19 +34,15 @@ from ortho_pipeline.geodesy.distortion import map_from_enu, metres_of_steps
 from ortho_pipeline.geodesy.naming import crs_definition, crs_name
 from ortho_pipeline.points.control_hull import control_hull
 from ortho_pipeline.raster.quicklook import preview_png
-from ortho_pipeline.report.adjustment_records import Adjustment, RmseOfView, RmsesOfView, RmsesOnGround, is_known
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.layers.styles import raster_style
 from ortho_pipeline.report.map_scale import map_scale
-from ortho_pipeline.report.matching import matching_record
+from ortho_pipeline.report.matching import MatchingRecord
 from ortho_pipeline.report.page.scene import write_report_html
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import (
-    ComparisonRecord,
-    ControlHull,
-    Covariances,
     Dem,
     FlatGround,
     MapScaleRecord,
@@ -55,7 +52,6 @@ from ortho_pipeline.report.records import (
     RpcRecord,
     SceneRecord,
     SceneReport,
-    WarpRecord,
 )
 from ortho_pipeline.report.wording import UNKNOWN, corrected, headline, refuted, summary_text
 from ortho_pipeline.surface.flat import FlatSurface
@@ -67,7 +63,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Scene
     from ortho_pipeline.raster.source import Grid
     from ortho_pipeline.surface.base import Surface
-    from ortho_pipeline.warp.job import WarpResult
+    from ortho_pipeline.warp.job import WarpRecord
 
 Array = NDArray[np.float64]
 
@@ -105,9 +101,9 @@ def build_report(
     surface: Surface | None = None,
     coverage: float | None = None,
     grid: Grid | None = None,
-    warp: WarpResult | None = None,
-    comparison: Mapping[str, Any] | None = None,
-    matching: Mapping[str, Any] | None = None,
+    warp: WarpRecord | None = None,
+    comparison: ComparisonRecord | None = None,
+    matching: MatchingRecord | None = None,
     near: float | None = None,
     provenance: Mapping[str, Any] | None = None,
     warnings: Iterable[Notice] = (),
@@ -120,10 +116,8 @@ def build_report(
         The adjusted model as RPC.
     coverage : float, optional
         Share (0 to 1) of the scene for which the DEM has a height.
-    comparison : mapping, optional
-        The document of ``ortho compare``.
-    matching : mapping, optional
-        From `commands.control.matching.Matched.to_json`.
+    comparison : ComparisonRecord, optional
+    matching : MatchingRecord, optional
     provenance : mapping, optional
         From `commands.inputs.provenance`.
     near : float, optional
@@ -134,29 +128,29 @@ def build_report(
     seen = viewing(fit.model, scene.width, scene.height)
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
     noted = to_document([*warnings, *doubts])
-    adjustment, rmse_m = _adjustment(fit, noted), RmsesOnGround.model_validate(rmse_metres(fit))
-    matched = None if matching is None else matching_record(matching, fit)
-    hull = control_hull(fit.points.image[fit.used], (scene.width, scene.height))
+    adjustment, rmse_m = _adjustment(fit, noted), rmse_metres(fit)
     return SceneReport(
         scene=_scene(scene, seen),
         adjustment=adjustment,
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
-        covariance=_covariances(fit, near),
+        covariance=analyse_fit(fit, near=near),
         map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
-        control_hull=None if hull is None else ControlHull.model_validate(hull),
-        comparison=None if comparison is None else ComparisonRecord.model_validate(json_value(comparison)),
-        matching=matched,
+        control_hull=control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
+        comparison=comparison,
+        matching=matching,
         heights=heights,
         surface=None if surface is None else _surface(surface, coverage),
         rpc=None if exported is None else RpcRecord(exact=exported.exact, max_error_px=exported.max_error_px),
         ortho=None if grid is None else _ortho(grid, warp),
-        warp=None if warp is None else _warped(warp),
+        warp=warp,
         provenance=Provenance.model_validate(json_value(provenance or {})),
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=corrected(
-            headline(adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matched),
+            headline(
+                adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matching
+            ),
             noted["notices"],
         ),
     )
@@ -175,16 +169,17 @@ def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:
 
 def _adjustment(fit: Fit, noted: Mapping[str, Any]) -> Adjustment:
     """Return the adjustment with all that there is to warn of, and its points as they are on the ground."""
-    document = json_value(fit.to_json()) | noted
-    shifts, views = in_metres(fit, fit.residuals), along_view(fit)
+    record, shifts = fit.record, in_metres(fit, fit.residuals)
     places, shown = _in_degrees(fit, shifts)
-    for i, point in enumerate(document["points"]):
-        point["raw_residual"] = json_position(fit.raw_residuals[i])
-        point["residual_m"] = json_position(shifts[i])
-        point["view_residual"] = json_position(views[i])
-        point["height_m"] = json_value(fit.points.ground[i, 2])
-        point["lon_lat"], point["shown_lon_lat"] = json_position(places[i]), json_position(shown[i])
-    return Adjustment.model_validate(document)
+    names = ("raw_residual", "residual_m", "view_residual", "lon_lat", "shown_lon_lat")
+    vectors = zip(fit.raw_residuals, shifts, along_view(fit), places, shown, strict=True)
+    points = [
+        Point.model_validate(
+            {**point.given(), "height_m": json_value(height), **dict(zip(names, map(json_position, row), strict=True))}
+        )
+        for point, height, row in zip(record.points, fit.points.ground[:, 2], vectors, strict=True)
+    ]
+    return record.replaced(points=tuple(points), **{name: tuple(one) for name, one in noted.items()})
 
 
 def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
@@ -195,10 +190,6 @@ def _in_degrees(fit: Fit, shifts: Array) -> tuple[Array, Array]:
     to_degrees, moved = ground_transform(points.crs, "EPSG:4979"), points.ground.copy()
     moved[:, :2] += np.einsum("nij,nj->ni", map_from_enu(points.crs, points.ground)[:, :2, :2], shifts)
     return to_degrees(points.ground)[:, :2], to_degrees(moved)[:, :2]
-
-
-def _covariances(fit: Fit, near: float | None) -> Covariances:
-    return Covariances(**analyse_fit(fit, near=near))
 
 
 def _map_scale(fit: Fit, seen: Mapping[str, Any], grid: Grid | None) -> MapScaleRecord | None:
@@ -219,9 +210,8 @@ def _view_rmse(fit: Fit) -> RmsesOfView:
     views = along_view(fit)
 
     def over(mask: NDArray[np.bool_]) -> RmseOfView | None:
-        rows = views[mask]
-        rmse = root_mean_square(rows[np.isfinite(rows).all(axis=1)])
-        return None if rmse is None else RmseOfView(along=rmse["col"], across=rmse["row"], n=int(rmse["n"]))
+        rmse = Rmse.of(views[mask & np.isfinite(views).all(axis=1)])
+        return None if rmse is None else RmseOfView(along=rmse.col, across=rmse.row, n=rmse.n)
 
     return RmsesOfView(control=over(fit.used), check=over(fit.points.tests))
 
@@ -265,7 +255,7 @@ def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
     return f" (the geoid is {undulation:+.1f} m from the ellipsoid there)"
 
 
-def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
+def _ortho(grid: Grid, warp: WarpRecord | None) -> OrthoRecord:
     unit = grid.crs.axis_info[0].unit_name
     left, bottom, right, top = (float(value) for value in grid.extent)
     return OrthoRecord(
@@ -277,11 +267,6 @@ def _ortho(grid: Grid, warp: WarpResult | None) -> OrthoRecord:
         size=(grid.width, grid.height),
         valid_share=None if warp is None else warp.valid_pixels / max(warp.pixels, 1),
     )
-
-
-def _warped(warp: WarpResult) -> WarpRecord:
-    """Return what the warp did without how long it took: the same inputs make the same report, byte by byte."""
-    return WarpRecord.model_validate({name: value for name, value in asdict(warp).items() if name != "seconds"})
 
 
 def with_layers(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +10,9 @@ from numpy.typing import NDArray
 from ortho_pipeline.display.numbers import metres, px, share
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
+from ortho_pipeline.estimation.records import Adjustment, Count, Pair
 from ortho_pipeline.files.json.records import Record
-from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.report.adjustment_records import Adjustment, Count, Pair
 
 #: Code of the notice of an adjustment to matches: its figures are no absolute ones.
 RELATIVE = "relative-to-reference"
@@ -40,7 +38,7 @@ class Candidate(Record):
 
 
 class MatchComponents(Record):
-    """What the covariances of the matches are made of (docs/matching.md)."""
+    """What the covariances of the matches are made of (docs/engineering/matching.md)."""
 
     matching: float
     height_m: float
@@ -71,6 +69,17 @@ class Tested(Record):
     n: Count
     px: float
     m: float | None
+
+    @classmethod
+    def of(cls, fit: Fit, mask: NDArray[np.bool_]) -> Self | None:
+        """Return that of the points of a fit that have a residual; None without any."""
+        rows = mask & np.isfinite(fit.residuals).all(axis=1)
+        if not rows.any():
+            return None
+        shifts = in_metres(fit, fit.residuals)[rows]
+        ground = float(np.sqrt((shifts**2).sum(axis=1).mean())) if np.isfinite(shifts).all() else None
+        image = float(np.sqrt((fit.residuals[rows] ** 2).sum(axis=1).mean()))
+        return cls(n=int(rows.sum()), px=image, m=ground)
 
 
 class MatchingRecord(Record):
@@ -125,25 +134,6 @@ class MatchingRecord(Record):
         return f"{self.kept} of {self.tried} matches with {names}, {fields}"
 
 
-def matching_record(matching: Mapping[str, Any], fit: Fit) -> MatchingRecord:
-    """Return the record of a matching (`Matched.to_json`) with what its points and those measured say of a fit."""
-    matched = fit.points.groups >= 0
-    tested = {
-        "relative": _tested(fit, fit.points.check & matched), "absolute": _tested(fit, fit.points.check & ~matched)
-    }  # fmt: skip
-    return MatchingRecord.model_validate({**json_value(matching), **tested})
-
-
 def is_relative(adjustment: Adjustment) -> bool:
     """Tell whether an adjustment was to matches, now or when its model file was written."""
     return any(one["code"] == RELATIVE for one in adjustment.notices)
-
-
-def _tested(fit: Fit, mask: NDArray[np.bool_]) -> Tested | None:
-    rows = mask & np.isfinite(fit.residuals).all(axis=1)
-    if not rows.any():
-        return None
-    shifts = in_metres(fit, fit.residuals)[rows]
-    ground = float(np.sqrt((shifts**2).sum(axis=1).mean())) if np.isfinite(shifts).all() else None
-    image = float(np.sqrt((fit.residuals[rows] ** 2).sum(axis=1).mean()))
-    return Tested(n=int(rows.sum()), px=image, m=ground)

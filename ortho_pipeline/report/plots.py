@@ -12,11 +12,13 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.display.notices import doubted
+from ortho_pipeline.estimation.choice.comparison import ComparedModel
+from ortho_pipeline.estimation.records import Pair, Point, is_known
+from ortho_pipeline.estimation.spatial.correlation import Covariance
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
 from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
 from ortho_pipeline.report.layers.accuracy import plot_accuracy
-from ortho_pipeline.report.records import ComparedModel, Covariance, SceneReport
+from ortho_pipeline.report.records import SceneReport
 
 #: Drawing area of the plot of vectors in CSS pixels, and the space around it.
 _PLOT_WIDTH, _PLOT_HEIGHT, _PAD = 452.0, 460.0, 19.0
@@ -46,23 +48,19 @@ def plots(report: SceneReport) -> dict[str, Drawing]:
     return {name: drawing for name, drawing in made.items() if drawing is not None}
 
 
-class Shown(NamedTuple):
-    """A point that is drawn: where it was measured in the image, its residual, pixels, and its number in the report."""
+class Drawn(NamedTuple):
+    """A point that is drawn: its place in the image and its residual, px; its number in the report; and its mark."""
 
     point: Point
     image: Pair
     residual: Pair
     number: int
-
-    @property
-    def kind(self) -> str:
-        """The mark that it is drawn with: control, check or out."""
-        return self.point.kind
+    kind: str
 
 
-def _shown(report: SceneReport) -> list[Shown]:
+def _drawn(report: SceneReport) -> list[Drawn]:
     return [
-        Shown(point, point.image, point.residual, k)
+        Drawn(point, point.image, point.residual, k, point.kind)
         for k, point in enumerate(report.adjustment.points)
         if is_known(point.image) and is_known(point.residual) and point.role != "tie"
     ]
@@ -78,8 +76,7 @@ def plot_residuals(report: SceneReport) -> Drawing | None:
     outside of the image are drawn where they are, tie points not at all, matches on a map of their own.
     """
     # The map of matches has their residuals.
-    matched = set() if report.matching is None else {one.image for one in report.matching.candidates}
-    points = [point for point in _shown(report) if point.image not in matched]
+    points = [point for point in _drawn(report) if point.image not in report.matched_places]
     if not points:
         return None
     width, height = report.scene.size
@@ -116,7 +113,7 @@ def plot_residuals(report: SceneReport) -> Drawing | None:
     return drawing
 
 
-def _draw_point(drawing: Drawing, point: Shown, at: Any, arrow: float, label: bool) -> None:
+def _draw_point(drawing: Drawing, point: Drawn, at: Any, arrow: float, label: bool) -> None:
     x, y = (float(value) for value in at)
     dx, dy = (value * arrow for value in point.residual)
     kind = point.kind
@@ -133,7 +130,7 @@ def _draw_point(drawing: Drawing, point: Shown, at: Any, arrow: float, label: bo
             drawing.text(x + side, y + down, point.point.id, anchor=anchor, quiet=kind == "out")
 
 
-def _title(shown: Shown) -> str:
+def _title(shown: Drawn) -> str:
     point, (column, row) = shown.point, shown.residual
     lines = [f"{point.id} ({point.role}{', left out' if point.kind == 'out' else ''})"]
     lines.append(f"residual {column:+.3f}, {row:+.3f} px")
@@ -144,7 +141,7 @@ def _title(shown: Shown) -> str:
     return "\n".join(lines)
 
 
-def _legend(drawing: Drawing, points: Sequence[Shown], y: float) -> None:
+def _legend(drawing: Drawing, points: Sequence[Drawn], y: float) -> None:
     names = {"control": "control", "check": "check", "out": "left out"}
     present = {point.kind for point in points}
     x = _PAD + 4.0
@@ -160,7 +157,7 @@ def _legend(drawing: Drawing, points: Sequence[Shown], y: float) -> None:
 
 def plot_directions(report: SceneReport) -> Drawing | None:
     """Draw residuals along the direction of view against those across it, on equal axes."""
-    points = [(one, one.point.view_residual) for one in _shown(report)]
+    points = [(one, one.point.view_residual) for one in _drawn(report)]
     seen = [(one, vector) for one, vector in points if is_known(vector)]
     kept = [max(abs(along), abs(across)) for one, (along, across) in seen if one.kind != "out"]
     if not kept:
@@ -179,7 +176,7 @@ def plot_directions(report: SceneReport) -> Drawing | None:
 
 def plot_heights(report: SceneReport) -> Drawing | None:
     """Draw residuals along the direction of view (in rows, for a view straight down) against height."""
-    points = [one for one in _shown(report) if one.point.height_m is not None]
+    points = [one for one in _drawn(report) if one.point.height_m is not None]
     viewed = all(is_known(one.point.view_residual) for one in points if one.kind != "out")
     found = [(one, one.point.height_m or 0.0, _upward(one, viewed)) for one in points]
     kept = [(height, value) for one, height, value in found if one.kind != "out" and value is not None]
@@ -205,7 +202,7 @@ def plot_heights(report: SceneReport) -> Drawing | None:
     return drawing
 
 
-def _upward(one: Shown, viewed: bool) -> float | None:
+def _upward(one: Drawn, viewed: bool) -> float | None:
     """Return the residual in which an error of height shows: along the direction of view, or in rows without one."""
     if not viewed:
         return one.residual[1]
@@ -255,10 +252,9 @@ def plot_correlation(report: SceneReport) -> Drawing | None:
 
 def plot_neighbours(report: SceneReport) -> Drawing | None:
     """Draw the correlation of residuals against the distance of points, with what chance does to each class."""
-    role = report.covariance.drawn_role
-    found = None if role is None else report.covariance.of(role)
-    if role is None or found is None:
+    if report.covariance.drawn is None:
         return None
+    role, found = report.covariance.drawn
     classes = found.classes
     reach = max(abs(value) for one in classes for value in (*one.correlation, 2 / math.sqrt(one.pairs)))
     reach = max(1.08 * reach, 0.3)
@@ -276,10 +272,9 @@ def plot_neighbours(report: SceneReport) -> Drawing | None:
 
 def plot_relative(report: SceneReport) -> Drawing | None:
     """Draw the relative standard deviation against the distance of points, and the fitted covariance function."""
-    role = report.covariance.drawn_role
-    found = None if role is None else report.covariance.of(role)
-    if role is None or found is None:
+    if report.covariance.drawn is None:
         return None
+    role, found = report.covariance.drawn
     high = 1.12 * max(max(one.relative) for one in found.classes) or 1.0
     drawing, axes = _distance_axes(found, (0.0, high), f"relative standard deviation, {found.unit}", "relative")
     fitted = found.verdict == "systematic"

@@ -9,22 +9,23 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from ortho_pipeline.estimation.spatial.correlation import Covariance
-from ortho_pipeline.files.json.records import Record, Words
-from ortho_pipeline.report.adjustment_records import (
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
+from ortho_pipeline.estimation.records import (
     Adjustment,
     Count,
-    LeftOut,
     NoticeDocument,
     Pair,
-    Rmses,
     RmsesOfView,
     RmsesOnGround,
 )
+from ortho_pipeline.estimation.spatial.correlation import Covariances
+from ortho_pipeline.files.json.records import Record, Words
+from ortho_pipeline.points.control_hull import ControlHull
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
 from ortho_pipeline.report.map_scale import MapScaleRecord
 from ortho_pipeline.report.matching import MatchingRecord
+from ortho_pipeline.warp.job import WarpRecord
 
 Size = tuple[Annotated[int, pydantic.Field(ge=1)], Annotated[int, pydantic.Field(ge=1)]]
 
@@ -95,35 +96,6 @@ class SceneRecord(Record):
 # -- accuracy --------------------------------------------------------------------------------------------------------
 
 
-class Covariances(Record):
-    """Of control and of check points, never of both together."""
-
-    control: Covariance | None = None
-    check: Covariance | None = None
-
-    @property
-    def drawn_role(self) -> Literal["control", "check"] | None:
-        """The points whose analysis is drawn: check points where they could be tested, else control."""
-        roles: tuple[Literal["check", "control"], ...] = ("check", "control")
-        for role in roles:
-            found = self.of(role)
-            if found is not None and found.p_joint is not None and len(found.classes) > 1:
-                return role
-        return None
-
-    def of(self, role: Literal["control", "check"]) -> Covariance | None:
-        """Return the analysis of the points of a role."""
-        return self.check if role == "check" else self.control
-
-
-class ControlHull(Record):
-    """Convex hull of the used control points, and its share of the image; no outline of points in a line."""
-
-    share: Annotated[float, pydantic.Field(ge=0)]
-    n: Count
-    outline: tuple[Pair, ...]
-
-
 #: The figure of what nothing tests.
 NOT_TESTED = "Not tested"
 
@@ -135,60 +107,6 @@ class Headline(Record):
     metres: str | None
     what: str
     notes: tuple[str, ...]
-
-
-# -- compared models -------------------------------------------------------------------------------------------------
-
-
-class ComparedModel(Record):
-    """A model that was fitted, or why it could not be."""
-
-    model: str
-    parameters: Count
-    minimum_points: Count
-    dimensions: Literal[2, 3]
-    error: str | None
-    rmse: Rmses
-    rmse_m: RmsesOnGround
-    condition: float | None
-    redundancy: int | None
-    sigma0: float | None
-    fitted_as: str | None
-    ridge: float | None
-    effective_parameters: float | None
-    warnings: tuple[Words, ...]
-    notices: tuple[NoticeDocument, ...] = ()
-
-
-class PointCounts(Record):
-    """Numbers of points."""
-
-    control: Count
-    check: Count
-
-
-class Recommendation(Record):
-    """The model to take, null where nothing can be said, and what speaks for it."""
-
-    model: str | None
-    criterion: Literal["check", "leave-one-out", "none"]
-    reason: str
-
-
-class ComparisonRecord(Record):
-    """Models that ortho compare fitted to the same points, and its recommendation."""
-
-    schema_version: Count
-    image: str
-    sensor: str
-    model_crs: str | None
-    points: PointCounts
-    rows: tuple[ComparedModel, ...]
-    left_out: tuple[LeftOut, ...]
-    recommendation: Recommendation
-    warnings: tuple[Words, ...]
-    notices: tuple[NoticeDocument, ...] = ()
-    files: dict[str, str]
 
 
 # -- heights and the ortho -------------------------------------------------------------------------------------------
@@ -208,11 +126,6 @@ class FlatGround(Record):
 
     coverage: float | None
     constant_height: float
-
-    @property
-    def is_flat(self) -> bool:
-        """True."""
-        return True
 
 
 class Dem(Record):
@@ -237,11 +150,6 @@ class Dem(Record):
     items: tuple[str, ...] = ()
     documents: tuple[str, ...] = ()
     declared_in: Literal["files", "items"] | None = None
-
-    @property
-    def is_flat(self) -> bool:
-        """False."""
-        return False
 
 
 class RpcRecord(Record):
@@ -271,25 +179,6 @@ class OrthoRecord(Record):
         return self.crs_name if "[" in self.crs else self.crs
 
 
-class WarpRecord(Record):
-    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
-
-    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked;
-    `filled_share` that of those which another ortho filled (`output.fill_from`), null where none was given.
-    """
-
-    max_error_px: float
-    tolerance_px: float
-    finest_spacing: int | None = None
-    refined_blocks: int | None = None
-    blocks: int | None = None
-    pixels: Count
-    valid_pixels: Count
-    transformer: str | None = None
-    hidden_share: float | None = None
-    filled_share: float | None = None
-
-
 class SceneReport(Record):
     """The content of <stem>_report.json. Numbers that do not exist are null."""
 
@@ -315,3 +204,8 @@ class SceneReport(Record):
     warnings: tuple[Words, ...]
     notices: tuple[NoticeDocument, ...] = ()
     headline: Headline
+
+    @property
+    def matched_places(self) -> frozenset[Pair]:
+        """Places in the image that were looked for in a reference."""
+        return frozenset() if self.matching is None else frozenset(one.image for one in self.matching.candidates)

@@ -115,7 +115,7 @@ class DemAccuracy:
         return [name for name, out in zip(self.ids, far, strict=True) if out]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the document of ``ortho dem-check --json`` (docs/formats.md)."""
+        """Return the document of ``ortho dem-check --json`` (docs/engineering/formats.md)."""
         points = [
             {"id": name, "difference_m": json_value(difference), "slope_deg": json_value(slope)}
             for name, difference, slope in zip(self.ids, self.differences, self.slopes, strict=True)

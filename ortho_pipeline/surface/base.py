@@ -5,21 +5,15 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-import os
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.options import number_of
-
-if TYPE_CHECKING:
-    from ortho_pipeline.surface.dem import DemSurface
-    from ortho_pipeline.surface.flat import FlatSurface
 
 Array = NDArray[np.float64]
 #: Samples left, top, right, bottom; the last two are the first beyond.
@@ -38,7 +32,7 @@ class Excerpt(NamedTuple):
 
 
 class Surface(abc.ABC):
-    """The ground as ellipsoidal heights: `open` a DEM, or take it to be `constant`.
+    """The ground as ellipsoidal heights: `open_dem` opens a DEM, `FlatSurface` is one height.
 
     A surface never changes: `with_fill` and `around` return another one. Safe to use from several threads; copies and
     pickles know what the surface is and nothing of what was read.
@@ -56,52 +50,6 @@ class Surface(abc.ABC):
 
     fill: str | float
     sigma: float | Surface | None
-
-    @staticmethod
-    def constant(height: float) -> FlatSurface:
-        """Return flat ground at an ellipsoidal height (m)."""
-        from ortho_pipeline.surface.flat import FlatSurface
-
-        return FlatSurface(height)
-
-    @staticmethod
-    def open(
-        path: str | os.PathLike[str],
-        vertical: Vertical | str | None = None,
-        override: bool = False,
-        fill: str | float = "error",
-        allow_network: bool = False,
-        roots: Sequence[str | os.PathLike[str]] = (),
-        memory: int = 512_000_000,
-    ) -> DemSurface:
-        """Open a DEM.
-
-        Parameters
-        ----------
-        path : path
-            A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.mosaic`).
-        vertical : Vertical or str, optional
-            What the heights are measured above; needed where the DEM does not say it.
-        override : bool
-            Let `vertical` stand against a datum that the DEM declares by an authority code.
-        fill : 'error', 'mask', 'nearest' or float
-            See the class; a number is an ellipsoidal height in metres.
-        memory : int
-            Bytes of a whole job; an eighth of them may hold heights that were read.
-
-        Raises
-        ------
-        DatumError
-            If the height datum is unknown, contradicted, or its geoid grid is not installed or does not reach here.
-        CrsError
-            If the DEM has no usable georeference.
-        InputError
-            If it cannot be opened.
-        """
-        from ortho_pipeline.surface.dem import open_dem
-
-        access = {"allow_network": allow_network, "roots": tuple(roots)}
-        return open_dem(os.fspath(path), vertical, override, parse_fill(fill), access, memory)
 
     # -- what it is --------------------------------------------------------------------------------------------------
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import CoverageError, DatumError
+from ortho_pipeline.errors import CoverageError, DatumError, completed
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
@@ -43,29 +44,54 @@ _LOOK = 1024
 
 
 def open_dem(
-    path: str,
-    vertical: Vertical | str | None,
-    override: bool,
-    fill: str | float,
-    access: Mapping[str, Any],
-    memory: int,
+    path: str | os.PathLike[str],
+    vertical: Vertical | str | None = None,
+    override: bool = False,
+    fill: str | float = "error",
+    allow_network: bool = False,
+    roots: Sequence[str | os.PathLike[str]] = (),
+    memory: int = 512_000_000,
 ) -> DemSurface:
-    """Open a DEM: see `Surface.open`."""
+    """Open a DEM.
+
+    Parameters
+    ----------
+    path : path
+        A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.mosaic`).
+    vertical : Vertical or str, optional
+        What the heights are measured above. Needed where the DEM does not say it.
+    override : bool
+        Let `vertical` stand against a datum that the DEM declares by an authority code.
+    fill : 'error', 'mask', 'nearest' or float
+        What stands for a void (see `Surface`); a number is an ellipsoidal height in metres.
+    memory : int
+        Bytes of a whole job. An eighth of them may hold heights that were read.
+
+    Raises
+    ------
+    InputError, DatumError, CrsError
+        If it cannot be opened, its height datum is unknown or contradicted, a geoid grid is missing, or it has no
+        usable georeference.
+    """
+    access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)
-    file: Samples = DemFile(path, access) if files is None else open_mosaic(path, files, access)
-    return dem_of(file, vertical, override, fill, memory)
+    name = os.fspath(path)
+    file: Samples = DemFile(name, access) if files is None else open_mosaic(name, files, access)
+    return dem_of(file, vertical, override, parse_fill(fill), memory)
 
 
 def dem_of(
     file: Samples, vertical: Vertical | str | None, override: bool, fill: str | float, memory: int
 ) -> DemSurface:
-    """Return samples, of a file or of many, as a surface: see `Surface.open`."""
+    """Return samples, of a file or of many, as a surface: see `open_dem`."""
     path = file.path
     crs, grid = file.place()
     declared = declared_vertical(crs)
     option = None if vertical is None else Vertical.parse(vertical)
-    used, warnings = dem_vertical(path, declared, option, override)
-    unit = dem_unit(path, file.unit, declared)
+    with completed(path):
+        used, warnings = dem_vertical(declared, option, override)
+        unit = dem_unit(file.unit, declared)
+        _check_geoid(grid, used)
     record = {
         "path": path,
         "crs": grid.crs.name,
@@ -79,24 +105,22 @@ def dem_of(
         "fill": fill,
         "warnings": warnings,
     }
-    _check_geoid(path, grid, used)
     return DemSurface(file, grid, used, unit, fill, record, memory // _TILES_SHARE)
 
 
-def _check_geoid(path: str, grid: SampleGrid, vertical: Vertical) -> None:
-    """Fail now, with the DEM's name, if the geoid grid is missing or does not reach any part of the DEM."""
+def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
+    """Fail now if the geoid grid is missing or does not reach any part of the DEM."""
     rows, columns = grid.shape
     v, u = (axis.ravel() for axis in np.meshgrid(np.linspace(0, rows - 1, 5), np.linspace(0, columns - 1, 5)))
     try:
         undulation = vertical.undulation(*grid.lonlat(u, v))
     except DatumError as error:
         raise DatumError(
-            error.message, file=path, field="surface.vertical", remedy=dem_vertical_remedy(error.remedy or "")
+            error.message, field="surface.vertical", remedy=dem_vertical_remedy(error.remedy or "")
         ) from error
     if not np.isfinite(undulation).any():
         raise DatumError(
             f"the geoid grid of {vertical.label} does not reach this DEM",
-            file=path,
             field="surface.vertical",
             remedy=dem_vertical_remedy(),
         )
@@ -128,7 +152,7 @@ class Tiles:
 
 @dataclass(frozen=True, eq=False)
 class DemSurface(Surface):
-    """The heights of a DEM, as `Surface.open` makes it.
+    """The heights of a DEM, as `open_dem` makes it.
 
     Parameters
     ----------

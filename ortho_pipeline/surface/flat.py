@@ -17,7 +17,7 @@ from ortho_pipeline.surface.base import Array, Excerpt, Surface, Window, parse_f
 
 @dataclass(frozen=True)
 class FlatSurface(Surface):
-    """Ground of one ellipsoidal height, as `Surface.constant` makes it.
+    """Ground of one ellipsoidal height, as `FlatSurface` makes it.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.files.stac.item import split
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.surface.base import Array
@@ -80,8 +80,8 @@ def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
     InputError
         If there are none, or too many.
     """
-    text = os.fspath(pattern)
-    if split(text)[1]:
+    text = Location(pattern)
+    if text.asset:
         return None  # a pattern of assets in a STAC document
     if not glob.has_magic(text) or os.path.exists(text) or "://" in text or text.startswith("/vsi"):
         return None

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 Array = NDArray[np.float64]
 
@@ -32,8 +32,6 @@ _STEPS = 8
 _LAST = 0.01
 #: A ray is followed from so much above the highest sample (m): more than rounding.
 _MARGIN = 1e-4
-#: Squares that are looked at for whether a ray is above their steep cells.
-_SQUARES = 9
 
 
 class Terrain(NamedTuple):

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.process_limits import thread_pool
 from ortho_pipeline.raster.block_cache import limit_cache
 from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
@@ -34,9 +33,10 @@ from ortho_pipeline.raster.ortho import (
     value_range,
 )
 from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.runtime.process_limits import thread_pool
 from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
-from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpResult
+from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpRecord
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
 from ortho_pipeline.warp.layers.hiding import Hiding, Looked
 
@@ -45,7 +45,7 @@ from ortho_pipeline.warp.layers.hiding import Hiding, Looked
 TILE = 4 * BLOCK
 
 
-def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
     """Write the orthoimage of a source on a grid.
 
     Parameters
@@ -85,7 +85,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
             if progress:
                 progress(WARPING, done / len(tiles))
         refuse_empty(work.valid_pixels, path)
-    return WarpResult(
+    return WarpRecord(
         max_error_px=work.lattices.worst,
         tolerance_px=job.tolerance,
         finest_spacing=work.lattices.finest,

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import Protocol
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.warp import engine, gdal_engine
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 
 class Engine(Protocol):
-    """What makes orthos; each engine is a module with this function."""
+    """What makes orthos; each engine is a module with these names.
 
-    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+    Attributes
+    ----------
+    tile_maker : callable (job), optional
+        Makes single tiles of an ortho. None where the engine only makes files.
+    """
+
+    @property
+    def tile_maker(self) -> Callable[[WarpJob], engine.TileMaker] | None: ...
+
+    def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         """Write an ortho; what the engine cannot do is an `InputError`."""
 
 

@@ -41,7 +41,7 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.surface.base import Excerpt, Surface
-from ortho_pipeline.warp.job import WARPING, WarpJob, WarpResult
+from ortho_pipeline.warp.job import WARPING, WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
@@ -55,6 +55,8 @@ _FAR = 1000.0
 _NO_PLACE = -1e9
 #: Output pixels whose image points are computed at once.
 _PIECE = 1_000_000
+#: GDAL's warper only makes files.
+tile_maker = None
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ class Exact:
         return float(worst) if np.isfinite(worst) else np.inf
 
 
-def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
+def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
     """Write the orthoimage by GDAL's own warper, without approximating its transformer: a cross-check of our engine.
 
     Raises
@@ -187,7 +189,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
             _warp_exactly(view, ortho, job, profile, transformer, threads)
         valid = writer.copy(target)
         refuse_empty(valid, path)
-    return WarpResult(
+    return WarpRecord(
         max_error_px=transformer.max_error_px,
         tolerance_px=transformer.limit,
         finest_spacing=1,

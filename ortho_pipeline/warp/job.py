@@ -5,15 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import pydantic
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_fit import RpcExport
-from ortho_pipeline.files.process_limits import Resources, require_memory, startable_threads
+from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import kernels
 
@@ -109,29 +113,27 @@ class WarpJob:
             )
 
 
-@dataclass(frozen=True)
-class WarpResult:
-    """The outcome of a job.
+class WarpRecord(Record):
+    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
 
-    `max_error_px` is a bound on the difference (source pixels) between the geometry used and the exact model at every
-    output pixel; `finest_spacing` the smallest lattice spacing that a block needed, 1 where every pixel was projected;
-    `valid_pixels` how many output pixels have a value. `transformer` names the one of GDAL's that stood for the model,
-    where GDAL's warper made the pixels: then the error is what was measured through it. `hidden_share` is that of the
-    pixels that the image reaches which terrain hides, where that was looked for, `filled_share` that of those which
-    another ortho filled, where one was given.
+    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked;
+    `filled_share` that of those which another ortho filled (`output.fill_from`), null where none was given.
     """
 
+    # max_error_px bounds the difference between the geometry used and the exact model at every output pixel, or is what
+    # was measured through GDAL's transformer; finest_spacing is the smallest spacing of the lattice that a block
+    # needed, 1 where every pixel was projected. seconds are no part of documents: the same inputs make the same report.
     max_error_px: float
     tolerance_px: float
-    finest_spacing: int
-    refined_blocks: int
-    blocks: int
-    pixels: int
-    valid_pixels: int
-    seconds: float
+    finest_spacing: int | None = None
+    refined_blocks: int | None = None
+    blocks: int | None = None
+    pixels: Count
+    valid_pixels: Count
     transformer: str | None = None
     hidden_share: float | None = None
     filled_share: float | None = None
+    seconds: Annotated[float, pydantic.Field(exclude=True)] = 0.0
 
     def notes(self, memory: int) -> list[Notice]:
         """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 #: Bilinear is None: numba leaves out of a function what `kernel is None` excludes, so that a plain job, as most first
 #: runs are, compiles no more than it needs. The others share what is compiled for a number.

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 #: A cell counts as visible if it comes as close to the image as this (px), or as half of its own size.
 _NEAR = 4.0

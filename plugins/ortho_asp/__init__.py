@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from ortho_csm.files import has_csm, read_csm
 from osgeo import gdal
 
 from ortho_asp.cameras import adjusted, read_adjust, read_aster, read_tsai
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.csm import has_csm, read_csm
-from ortho_pipeline.exchange.rpc_files import read_rpc_text
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models import SensorModel
-from ortho_pipeline.models.frame.camera import FrameCamera
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
+from ortho_pipeline.plugin import (
+    FrameCamera,
+    InputError,
+    Notice,
+    Pushbroom,
+    Scene,
+    Sensor,
+    SensorModel,
+    hookimpl,
+    listing,
+    place,
+    read_bounded,
+    read_rpc_text,
+)
 
 #: What a camera's name ends with after the stem of its image; the first that is there, so adjusted states come first.
 ENDINGS = (".adjusted_state.json", "_csm.json", ".json", ".isd", ".tsai", ".xml")

@@ -18,18 +18,25 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import decoded, read_bounded
-from ortho_pipeline.files.xml_fields import XmlFields
-from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
-from ortho_pipeline.models import SensorModel, require_view
-from ortho_pipeline.models.frame.camera import FrameCamera
-from ortho_pipeline.models.frame.orientation import heights_below
-from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.rotations import are_rotations
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_quaternions
+from ortho_pipeline.plugin import (
+    FrameCamera,
+    InputError,
+    Interior,
+    LineCamera,
+    Pushbroom,
+    SensorModel,
+    XmlFields,
+    are_rotations,
+    decoded,
+    enu_from_ecef,
+    geocentric,
+    heights_below,
+    pushbroom_of_tables,
+    read_bounded,
+    reads,
+    require_view,
+    rotations_of_quaternions,
+)
 
 Array = NDArray[np.float64]
 

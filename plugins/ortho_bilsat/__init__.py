@@ -10,15 +10,22 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_bilsat.survey import MARK, Survey, read_survey
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.prior import priors_at
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.ellipsoid import geodetic, orbital_from_ecef
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera
-from ortho_pipeline.models.frame.orientation import camera_from_platform, exterior_sigmas
+from ortho_pipeline.plugin import (
+    LOOKS_PAST,
+    FrameCamera,
+    InputError,
+    Notice,
+    Scene,
+    Sensor,
+    camera_from_platform,
+    exterior_sigmas,
+    geodetic,
+    hookimpl,
+    orbital_from_ecef,
+    place,
+    priors_at,
+    read_bounded,
+)
 
 
 @hookimpl
@@ -35,15 +42,6 @@ def ortho_sensors() -> Iterable[Sensor]:
         },
         metadata_beside=survey_of,
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``bilsat``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_bilsat.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

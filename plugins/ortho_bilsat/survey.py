@@ -8,10 +8,7 @@ import re
 from dataclasses import dataclass
 from os import PathLike
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import read_bounded, write_text
-from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.plugin import InputError, Interior, counted, read_bounded, reads, write_text
 
 MARK = "BILSAT-1 IMAGING SURVEY 1"
 CAMERAS = ("PAN", "XS-BLUE", "XS-GREEN", "XS-RED", "XS-NIR")

@@ -11,13 +11,17 @@ from osgeo import gdal
 from ortho_cartosat.layout import metadata_of, partner_of, rpc_of, view_of
 from ortho_cartosat.metadata import Metadata, read_metadata
 from ortho_cartosat.start import DEFAULT, SOFT, pushbroom, soft_facts, soft_sigmas
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc import rpc_of_dataset
-from ortho_pipeline.exchange.rpc_files import rpc_of_fields
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    Notice,
+    Scene,
+    Sensor,
+    SensorModel,
+    hookimpl,
+    rpc_of_dataset,
+    rpc_of_fields,
+)
 
 #: Ground for which the pushbroom is meant where no RPC tells it.
 HEIGHTS = (-500.0, 9000.0)
@@ -53,15 +57,6 @@ def ortho_sensors() -> Iterable[Sensor]:
             },
         },
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``cartosat``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_cartosat.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

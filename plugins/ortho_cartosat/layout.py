@@ -19,11 +19,7 @@ from os import PathLike
 from pathlib import Path
 
 from ortho_cartosat.metadata import Metadata, read_metadata
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc_files import read_rpc_text
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.plugin import RPC, InputError, Notice, place, read_rpc_text
 
 #: Where the name of an image says which of the two it is.
 _SIDE = re.compile(r"(.*(?:band|_|-))([af])", re.IGNORECASE)

@@ -16,10 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import decoded, read_bounded
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.models.base import Array
+from ortho_pipeline.plugin import Array, InputError, decoded, place, read_bounded, reads
 
 MAX_BYTES = 1_000_000
 _REMEDY = "copy the _MET.TXT again from the delivery"

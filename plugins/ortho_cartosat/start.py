@@ -9,10 +9,7 @@ from dataclasses import asdict
 import numpy as np
 
 from ortho_cartosat.metadata import TILTS_DEG, Metadata
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.pushbroom.metadata import SoftSigmas, pushbroom_of_metadata
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.options import is_usable, number_of
+from ortho_pipeline.plugin import InputError, Pushbroom, SoftSigmas, is_usable, number_of, pushbroom_of_metadata
 
 #: Focal length and pixel size of both cameras in metres: Willneff et al., table 1; and columns of a whole image.
 FOCAL_LENGTH, PIXEL_SIZE, COLUMNS = 1.945, 7e-6, 12000

@@ -16,15 +16,20 @@ from typing import Any
 import numpy as np
 from osgeo import gdal
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.exchange.rpc_files import rpc_of_fields
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.files.xml_fields import XmlFields
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    Notice,
+    Scene,
+    Sensor,
+    XmlFields,
+    hookimpl,
+    listing,
+    place,
+    read_bounded,
+    reads,
+    rpc_of_fields,
+)
 
 MAX_SIZE = 20_000_000
 MOST_BANDS = 300

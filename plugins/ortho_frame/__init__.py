@@ -12,17 +12,25 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_frame.tables import Pose, Shot, is_reconstruction, read_camera, read_exterior
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.prior import Prior, priors_at
-from ortho_pipeline.geodesy.crs import Vertical, ground_transform
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.frame.camera import LOOKS_PAST, FrameCamera
-from ortho_pipeline.models.frame.orientation import exterior_sigmas
-from ortho_pipeline.models.frame.working_frame import TOPOCENTRIC
-from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.options import numbers_of
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.plugin import (
+    LOOKS_PAST,
+    TOPOCENTRIC,
+    Array,
+    FrameCamera,
+    InputError,
+    Interior,
+    Prior,
+    Scene,
+    Sensor,
+    Setting,
+    Text,
+    Vertical,
+    exterior_sigmas,
+    ground_transform,
+    hookimpl,
+    numbers_of,
+    priors_at,
+)
 
 OPTIONS = {
     "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",

@@ -11,12 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import read_bounded, read_json
-from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation
-from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.plugin import (
+    Array,
+    InputError,
+    Interior,
+    angles_of_rotation,
+    counted,
+    read_bounded,
+    read_json,
+    reads,
+)
 
 MAX_BYTES = 5_000_000
 #: A reconstruction holds the points of the whole block too.

@@ -15,19 +15,29 @@ from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadata
 from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.prior import Prior, priors_at
-from ortho_pipeline.exchange.rpc import has_rpc, read_rpc, rpc_of_dataset
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.hookspecs import Piece, Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models import MapPlane, SensorModel
-from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options import numbers_of
-from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    MapPlane,
+    Notice,
+    Piece,
+    Prior,
+    Scene,
+    Sensor,
+    SensorModel,
+    Setting,
+    Text,
+    ground_transform,
+    has_rpc,
+    hookimpl,
+    numbers_of,
+    open_dataset,
+    place,
+    priors_at,
+    read_bounded,
+    read_rpc,
+    rpc_of_dataset,
+)
 
 OPTIONS = {
     "metadata": "the metadata file, where it is not po_<order>_metadata.txt beside the image",
@@ -41,7 +51,7 @@ PRODUCT_LINE, LEVEL = "Geo", "Standard Geometrically Corrected"
 #: Half the range of heights that `geo` is meant for where nothing else is known (m).
 HALF_RANGE = 500.0
 #: What the vendor states of the first years is 50 m at 90 %: 23 m for each coordinate. Direction of relief: by how much
-#: it differs from the nominal one within a real scene (docs/formats/ikonos.md).
+#: it differs from the nominal one within a real scene (docs/engineering/block-adjustment.md).
 SIGMAS = {"shift_x": 25.0, "shift_y": 25.0, "relief_x": 0.01, "relief_y": 0.01}
 #: RPC and metadata that differ by more than this on the plane (px) belong to different images.
 DISAGREEMENT = 1.0
@@ -52,15 +62,6 @@ def ortho_sensors() -> Iterable[Sensor]:
     """Offer the sensor ``ikonos``."""
     yield Sensor("ikonos", "IKONOS Geo products (po_* with metadata.txt, with or without RPC)", recognises, open_scene,
                  options=OPTIONS)  # fmt: skip
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``ikonos``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_ikonos.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

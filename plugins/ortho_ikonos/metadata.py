@@ -14,9 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import decoded, read_bounded
+from ortho_pipeline.plugin import InputError, Notice, decoded, read_bounded, reads
 
 MAX_BYTES = 2_000_000
 MAX_LINE = 10_000

@@ -12,11 +12,7 @@ import pyproj
 from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import CrsError, InputError
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import parse_crs, same_crs
+from ortho_pipeline.plugin import CrsError, InputError, Notice, listing, parse_crs, place, same_crs
 
 _NAME = re.compile(
     r"(?P<order>po_[^/\\]+)_(?P<band>[a-z]{2,4})_(?P<component>\d{7})\.(?:tiff?|ntf|nitf)", re.IGNORECASE | re.ASCII

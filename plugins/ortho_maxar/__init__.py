@@ -9,14 +9,19 @@ from osgeo import gdal
 
 from ortho_maxar.isd import Isd, Tile, read_isd_pushbroom
 from ortho_maxar.layout import colours_beside, cut, metadata_of, parts_beside, tile_of, tiles_beside
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models import SensorModel
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    Notice,
+    Pushbroom,
+    Scene,
+    Sensor,
+    SensorModel,
+    has_rpc,
+    hookimpl,
+    place,
+    rpc_of_dataset,
+)
 
 #: From here on (px) the rigorous model and the RPC are worth a word, and from here on they are of two images.
 APART, DISAGREEMENT = 5.0, 100.0

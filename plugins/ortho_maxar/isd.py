@@ -28,15 +28,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.exchange.rpc_files import read_rpc_text
-from ortho_pipeline.files.xml_fields import XmlFields
-from ortho_pipeline.models import require_view
-from ortho_pipeline.models.light import LightPath
-from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_quaternions
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    LightPath,
+    LineCamera,
+    Pushbroom,
+    XmlFields,
+    pushbroom_of_tables,
+    read_rpc_text,
+    reads,
+    require_view,
+    rotations_of_quaternions,
+)
 
 Array = NDArray[np.float64]
 

@@ -7,14 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ortho_maxar.isd import Isd, Tile, read_isd_pushbroom
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Piece
-from ortho_pipeline.models import RPC, SensorModel
-from ortho_pipeline.models.mosaicked import relative_scale
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    Notice,
+    Piece,
+    SensorModel,
+    listing,
+    place,
+    read_bounded,
+    relative_scale,
+)
 
 _ISD = re.compile(rb"<(\w{1,20}:)?isd[\s>].*?<(\w{1,20}:)?IMD>", re.DOTALL)
 #: ``21FEB01005130-P1BS_R1C1-016263048010_01_P001``: time, kind of product, tile, order, part of a strip or of an order.

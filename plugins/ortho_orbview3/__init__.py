@@ -11,13 +11,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, rpc_text_of
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, Study, hookimpl
-from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.plugin import RPC, InputError, Notice, Scene, Sensor, Setting, Text, hookimpl, place, read_bounded
 
 #: Names of the USGS: 3v, year, month, day, and p for panchromatic or m for multispectral.
 _NAME = re.compile(r"3v(\d{6})([pm])\d", re.IGNORECASE)
@@ -51,15 +45,6 @@ def ortho_sensors() -> Iterable[Sensor]:
             "label": "the label, where it is not <image>.pvl",
         },
     )
-
-
-@hookimpl
-def ortho_studies() -> Iterable[Study]:
-    """Offer the study ``orbview3``."""
-    # An experiment takes a while to load, and few commands need it.
-    from ortho_orbview3.study import STUDY
-
-    yield STUDY
 
 
 def recognises(dataset: gdal.Dataset) -> bool:

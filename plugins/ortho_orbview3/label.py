@@ -17,9 +17,7 @@ from dataclasses import dataclass, field
 from os import PathLike
 from typing import NamedTuple
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import decoded, read_bounded
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.plugin import InputError, counted, decoded, read_bounded, reads
 
 #: Real labels have 6 kB and three levels of groups.
 MAX_BYTES, MAX_DEPTH = 200_000, 12

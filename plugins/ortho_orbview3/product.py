@@ -11,15 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from ortho_orbview3.label import Group, read_label
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.exchange.rpc import read_rpc
-from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_of_fields
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.plugin import (
+    RPC,
+    Array,
+    InputError,
+    Notice,
+    Setting,
+    Text,
+    listing,
+    place,
+    read_rpc,
+    read_rpc_text,
+    reads,
+    rpc_of_fields,
+)
 
 #: Keys of the label by the names that RPC text has for them.
 SCALAR_KEYS = {

@@ -13,13 +13,20 @@ from typing import Any
 
 from osgeo import gdal
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
-from ortho_pipeline.files import read_bounded, read_json
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.plugin import (
+    InputError,
+    Notice,
+    Scene,
+    Sensor,
+    has_rpc,
+    hookimpl,
+    listing,
+    place,
+    read_bounded,
+    read_json,
+    reads,
+    rpc_of_dataset,
+)
 
 MAX_SIZE = 5_000_000
 _METADATA = re.compile(r".*_metadata\.json$", re.IGNORECASE | re.DOTALL)

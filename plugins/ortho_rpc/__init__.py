@@ -12,12 +12,7 @@ from typing import Any
 
 from osgeo import gdal
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.exchange.rpc import has_rpc, rpc_of_dataset
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models import SensorModel
-from ortho_pipeline.models.rational import RPC
+from ortho_pipeline.plugin import RPC, Notice, Scene, Sensor, SensorModel, has_rpc, hookimpl, place, rpc_of_dataset
 from ortho_rpc import geolocation
 from ortho_rpc.bundle import pieces_beside, rpc_of_dimap
 from ortho_rpc.rigorous import Rigorous, rigorous_beside

@@ -7,13 +7,7 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.rpc_files import read_rpc_text
-from ortho_pipeline.files.folders import Listing, listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Piece
-from ortho_pipeline.models import SensorModel
-from ortho_pipeline.models.mosaicked import relative_scale
+from ortho_pipeline.plugin import InputError, Listing, Piece, SensorModel, listing, place, read_rpc_text, relative_scale
 from ortho_rpc.dimap import images_of, tile_of
 from ortho_rpc.dimap_file import DimapFile
 

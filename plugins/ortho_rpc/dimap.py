@@ -32,14 +32,17 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.models import require_view
-from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.splines import SplineForm
-from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
+from ortho_pipeline.plugin import (
+    InputError,
+    LineCamera,
+    Pushbroom,
+    SplineForm,
+    place,
+    pushbroom_of_tables,
+    read_bounded,
+    reads,
+    require_view,
+)
 from ortho_rpc.dimap_file import MAX_SIZE, DimapFile
 from ortho_rpc.scan import FIRST, SECOND, first_version, second_version
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from os import PathLike
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ortho_pipeline.files.xml_fields import MAX_SIZE, XmlFields
+from ortho_pipeline.plugin import Array, XmlFields
 
-Array = NDArray[np.float64]
-
+#: Bytes of a file.
+MAX_SIZE = 5_000_000
 #: Coefficients that a polynomial may have.
 MOST_TERMS = 10
 __all__ = ["MAX_SIZE", "MOST_TERMS", "DimapFile"]
@@ -20,7 +19,7 @@ class DimapFile(XmlFields):
     """DIMAP metadata whose rigorous model may be left for their RPC."""
 
     def __init__(self, path: PathLike[str]) -> None:
-        super().__init__(path, remedy="use the RPC")
+        super().__init__(path, remedy="use the RPC", limit=MAX_SIZE)
 
     def polynomial(self, field: str) -> Array:
         """Return the coefficients, lowest power first, of a polynomial with its degree."""

@@ -15,16 +15,22 @@ import pyproj
 from numpy.typing import NDArray
 from osgeo import gdal
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import CrsError, InputError, OrthoError
-from ortho_pipeline.estimation.family_fit import fit_family
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
-from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.models import SensorModel
-from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.points import Points
-from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.plugin import (
+    CrsError,
+    InputError,
+    Notice,
+    OrthoError,
+    Points,
+    Scene,
+    SensorModel,
+    Setting,
+    Text,
+    fit_family,
+    ground_transform,
+    open_dataset,
+    parse_crs,
+    place,
+)
 
 Array = NDArray[np.float64]
 

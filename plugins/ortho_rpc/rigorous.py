@@ -7,13 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.models.base import Array
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options.texts import Text
+from ortho_pipeline.plugin import RPC, Array, InputError, Notice, Pushbroom, Text, listing
 from ortho_rpc.bundle import DIMAP
 from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom
 from ortho_rpc.dimap_file import DimapFile

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from ortho_pipeline.models.light import LightPath
-from ortho_pipeline.models.pushbroom.tables import rotations_of_quaternions
+from ortho_pipeline.plugin import LightPath, rotations_of_quaternions
 from ortho_rpc.dimap_file import MOST_TERMS, DimapFile
 
 Array = NDArray[np.float64]

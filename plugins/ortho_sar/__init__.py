@@ -19,15 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 from osgeo import gdal
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.exchange.rpc import has_rpc
-from ortho_pipeline.files import read_bounded, read_json
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.geodesy.crs import parse_crs
-from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geodetic
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
-from ortho_pipeline.models.map_plane import MapPlane
+from ortho_pipeline.plugin import (
+    InputError,
+    MapPlane,
+    Notice,
+    Scene,
+    Sensor,
+    enu_from_ecef,
+    geodetic,
+    has_rpc,
+    hookimpl,
+    parse_crs,
+    place,
+    read_bounded,
+    read_json,
+    reads,
+)
 
 MAX_SIZE = 20_000_000
 _REMEDY = "download the metadata again, or give incidence=DEG and azimuth=DEG"

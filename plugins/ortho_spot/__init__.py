@@ -10,13 +10,7 @@ from pathlib import Path
 
 from osgeo import gdal
 
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.prior import Prior
-from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import place
-from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
+from ortho_pipeline.plugin import InputError, Notice, Prior, Scene, Sensor, hookimpl, listing, place, read_bounded
 from ortho_spot.dimap import read_spot
 
 #: How well the vendor locates without control (m on the ground, one sigma per axis) and from which height (m): SPOT 1

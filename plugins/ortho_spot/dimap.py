@@ -35,12 +35,16 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError, reads
-from ortho_pipeline.files.xml_fields import XmlFields
-from ortho_pipeline.models import require_view
-from ortho_pipeline.models.pushbroom.line_camera import LineCamera
-from ortho_pipeline.models.pushbroom.scanner import Pushbroom
-from ortho_pipeline.models.pushbroom.tables import lagrange, pushbroom_of_tables
+from ortho_pipeline.plugin import (
+    InputError,
+    LineCamera,
+    Pushbroom,
+    XmlFields,
+    lagrange,
+    pushbroom_of_tables,
+    reads,
+    require_view,
+)
 
 Array = NDArray[np.float64]
 

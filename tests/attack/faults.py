@@ -615,6 +615,7 @@ def may_mount() -> bool:
 
 def load() -> None:
     """Load what commands use, so that each forked process has it."""
+
     import ortho_pipeline.batch.runner
     import ortho_pipeline.commands.bands
     import ortho_pipeline.commands.block
@@ -622,11 +623,10 @@ def load() -> None:
     import ortho_pipeline.commands.control.ties
     import ortho_pipeline.commands.mosaic.assembly
     import ortho_pipeline.commands.rectification
-    import ortho_pipeline.commands.studies
     import ortho_pipeline.warp.engine  # noqa: F401
-    from ortho_pipeline import plugins
+    from ortho_pipeline import host
 
-    plugins.Host.discover()
+    host.Host.discover()
 
 
 def main() -> int:

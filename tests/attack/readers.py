@@ -20,6 +20,7 @@ import state
 from ortho_asp.cameras import read_adjust, read_aster, read_tsai
 from ortho_bilsat.survey import read_survey
 from ortho_cartosat.metadata import read_metadata as read_cartosat
+from ortho_csm.files import csm_text, read_csm
 from ortho_enmap import read_enmap
 from ortho_ikonos.metadata import read_header, read_metadata
 from ortho_maxar.isd import Isd, read_isd_pushbroom
@@ -32,17 +33,14 @@ from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
-from ortho_pipeline.batch.records import FileState, Record
+from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError
-from ortho_pipeline.exchange.csm import csm_text, read_csm
 from ortho_pipeline.exchange.model_file import read_model_file, save_model
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpb, write_rpc_txt
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.stac.collection import Collection
-from ortho_pipeline.files.stac.item import read_item as read_stac_item
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.imaging.matching import open_references
 from ortho_pipeline.models import ImageCorrection, SensorModel
@@ -51,7 +49,9 @@ from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.stac import acquisition_time
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.stores.stac.collection import Collection
+from ortho_pipeline.stores.stac.item import read_item as read_stac_item
+from ortho_pipeline.surface.dem import open_dem
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ def _survey(path: Path) -> Any:
 
 
 def _dem(path: Path) -> Any:
-    surface = Surface.open(path, "ellipsoid")
+    surface = open_dem(path, "ellipsoid")
     rows, columns = surface.shape
     part = surface.window(0, 0, min(columns, 40), min(rows, 40))
     return [part[np.isfinite(part)], np.isinf(part).any() * math.inf if np.isinf(part).any() else 0.0]
@@ -282,13 +282,16 @@ def _yaml(path: Path) -> Any:
 def _record_seed(folder: Path) -> bytes:
     state = FileState.of("ortho", seeds.SAMPLE / "gcps.csv", name="gcps.csv")
     facts = {"rmse_px": {"control": 0.5}, "lean_m_per_m": 0.1}
-    record = Record("one", "0" * 64, "done", (state,), (state,), "0" * 64, 1.5, facts, None, "run")
+    record = RunRecord(
+        name="one", key="0" * 64, status="done", inputs=(state,), outputs=(state,), siblings="0" * 64, seconds=1.5,
+        facts=facts, run="run",
+    )  # fmt: skip
     record.write(folder / "record.json")
     return (folder / "record.json").read_bytes()
 
 
 def _record(path: Path) -> Any:
-    record = Record.read(path)
+    record = RunRecord.at(path)
     if record is None:
         return []
     # What `ortho run` does with it.

@@ -18,18 +18,18 @@ from unittest import mock
 import numpy as np
 import seeds
 from obstore.store import MemoryStore
+from ortho_measure.block.session import open_block_session
+from ortho_measure.journal import Journal
+from ortho_measure.project import JOURNAL, Project
+from ortho_measure.session import open_session
 
 from ortho_pipeline import commands
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.shared.leases import Lease, Leases, lease_document
 from ortho_pipeline.files import together
-from ortho_pipeline.files.storage import kept, objects
 from ortho_pipeline.files.whole import Outputs
-from ortho_pipeline.measure.block.session import open_block_session
-from ortho_pipeline.measure.journal import Journal
-from ortho_pipeline.measure.project import JOURNAL, Project
-from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
+from ortho_pipeline.stores import kept, objects
 
 _COUNT = itertools.count()
 
@@ -138,7 +138,7 @@ def read_result(path: Path) -> list[Any]:
     store.put("one.result.json", path.read_bytes())
     found = leases.result("one")
     assert leases.finished() == {"one"}
-    return [] if found is None else [found.seconds, found.facts, Record.parse(found.text().encode()) == found]
+    return [] if found is None else [found.seconds, found.facts, RunRecord.parse(found.text().encode()) == found]
 
 
 # -- projects of `ortho measure` -------------------------------------------------------------------------------------

@@ -26,14 +26,14 @@ from pyproj.enums import PJType
 from ortho_pipeline.batch.runner import run
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError, OrthoError
-from ortho_pipeline.files.stac.item import read_item
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.output import checked_options
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.stores.stac.item import read_item
+from ortho_pipeline.surface.dem import open_dem
 
 _GEOGCS = (
     'GEOGCS["u",DATUM["u",SPHEROID["b",6377397.155,299.1528128]{}],PRIMEM["Greenwich",0],'
@@ -151,7 +151,7 @@ def _vrt_text(text: str) -> str:
 
 def _vrt(folder: Path, text: str) -> None:
     (folder / "dem.vrt").write_text(_vrt_text(text))
-    Surface.open(folder / "dem.vrt", "ellipsoid").heights(np.array([[10.0, 50.0]]), "EPSG:4326")
+    open_dem(folder / "dem.vrt", "ellipsoid").heights(np.array([[10.0, 50.0]]), "EPSG:4326")
 
 
 def _entities(folder: Path, text: str) -> None:
@@ -175,13 +175,13 @@ def _grid(folder: Path) -> Path:
 def _aux(folder: Path, text: str) -> None:
     path = _grid(folder)
     path.with_name("a.asc.aux.xml").write_text(f"<PAMDataset><SRS>{html.escape(text)}</SRS></PAMDataset>")
-    Surface.open(path, "ellipsoid")
+    open_dem(path, "ellipsoid")
 
 
 def _prj(folder: Path, text: str) -> None:
     path = _grid(folder)
     path.with_suffix(".prj").write_text(text)
-    Surface.open(path, "ellipsoid")
+    open_dem(path, "ellipsoid")
 
 
 def _envi(folder: Path, text: str) -> None:
@@ -190,7 +190,7 @@ def _envi(folder: Path, text: str) -> None:
         "ENVI\nsamples = 9\nlines = 9\nbands = 1\nheader offset = 0\ndata type = 1\ninterleave = bsq\nbyte order = 0\n"
         "map info = {Arbitrary, 1, 1, 10, 50, 1e-4, 1e-4, 0}\ncoordinate system string = {" + text + "}\n"
     )
-    Surface.open(folder / "a.dat", "ellipsoid")
+    open_dem(folder / "a.dat", "ellipsoid")
 
 
 def _geolocation(folder: Path, text: str) -> None:
@@ -261,7 +261,7 @@ def test_a_bare_name_is_not_looked_for_in_the_working_folder(tmp_path: Path, pip
     for text in (f"+proj=longlat +datum=WGS84 +geoidgrids={name} +vunits=m +type=crs", _BOUND.replace("PIPE", name)):
         (tmp_path / "dem.vrt").write_text(_vrt_text(text))
         with pytest.raises(InputError):
-            Surface.open(tmp_path / "dem.vrt").heights(np.array([[10.0, 50.0]]), "EPSG:4326")
+            open_dem(tmp_path / "dem.vrt").heights(np.array([[10.0, 50.0]]), "EPSG:4326")
     with pytest.raises(DatumError):
         Vertical.stated(name)
     assert not pipe.readers

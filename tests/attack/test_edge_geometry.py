@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -22,7 +23,6 @@ from ortho_pipeline.geodesy.crs import utm_crs
 from ortho_pipeline.models import FrameCamera, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.surface.writing import write_dem
 
 SIZE, GSD, TOLERANCE = 200, 5.0, 0.01

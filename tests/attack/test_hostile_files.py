@@ -20,7 +20,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 from ortho_pipeline.raster.valid_area import valid_outline
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.mosaic import Ortho, lay_out
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -78,7 +78,7 @@ def test_every_way_in_leads_through_the_gate(trap, tiny, tmp_path, name):
     ways = (
         lambda: RasterSource(path),
         lambda: RasterSource(tiny.image, path),
-        lambda: Surface.open(path, "ellipsoid"),
+        lambda: open_dem(path, "ellipsoid"),
         lambda: lay_out([Ortho("a", Path(path))]),
         lambda: valid_outline(Path(path)),
     )

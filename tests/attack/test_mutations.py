@@ -1,4 +1,4 @@
-"""Damaged files of every format are read soundly or refused with file, field and remedy (docs/reliability.md)."""
+"""Damaged files are read soundly or refused with file, field and remedy (docs/engineering/reliability.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from readers import BY_NAME, READERS
 from real_seeds import FILES, real_seeds
 
 from ortho_pipeline.batch import plan as batch_plan
-from ortho_pipeline.batch.records import FileState, Record
+from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.errors import InputError, completed, reads
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import parse_json
@@ -167,16 +167,19 @@ def test_a_damaged_record_is_none_and_stops_nothing(tmp_path: Path, place: tuple
     node[place[-1]] = value
     path = tmp_path / "one.json"
     path.write_text(json.dumps(document))
-    record = Record.read(path)
+    record = RunRecord.at(path)
     assert record is None or not record.intact(tmp_path, checksums=True)
 
 
 def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("1")
     state = FileState.of("ortho", tmp_path / "a", name="a")
-    record = Record("one", "k", "done", (state,), (state,), "s", 1.5, {}, None, "run")
+    record = RunRecord(
+        name="one", key="k", status="done", inputs=(state,), outputs=(state,), siblings="s", seconds=1.5, facts={},
+        run="run",
+    )  # fmt: skip
     record.write(tmp_path / "one.json")
-    assert Record.read(tmp_path / "one.json") == record
+    assert RunRecord.at(tmp_path / "one.json") == record
 
 
 @pytest.mark.parametrize(

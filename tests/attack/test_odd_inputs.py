@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
@@ -19,11 +20,10 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import read_json
-from ortho_pipeline.files.stac.item import read_item
 from ortho_pipeline.imaging.matching import open_references
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.stores.stac.item import read_item
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 SMALL = OutputOptions(extent=(530600.0, 4122000.0, 530800.0, 4122200.0))

@@ -25,7 +25,7 @@ from ortho_pipeline.batch import config as batch_config
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch import runner as batch
 from ortho_pipeline.batch.executors import Processes, WorkerDied, completed
-from ortho_pipeline.batch.records import Record, locked
+from ortho_pipeline.batch.records import RunRecord, locked
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
@@ -188,7 +188,7 @@ def test_a_file_that_is_not_there_or_not_utf8(tmp_path):
 
 
 def test_the_examples_of_the_guide_are_right(tmp_path):
-    guide = (ROOT / "docs" / "run.md").read_text(encoding="utf-8")
+    guide = "".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in ("run.md", "mosaic.md"))
     examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     assert len(examples) >= 3
     for example in examples:
@@ -550,7 +550,7 @@ def test_a_record_does_not_reach_outside_of_its_folder(block):
     document = json.loads(path.read_text())
     document["outputs"][0]["path"] = "../../raw/s0.tif"
     path.write_text(json.dumps(document))
-    assert Record.read(path) is None
+    assert RunRecord.at(path) is None
     assert block.run()["s0"] == "done"
     assert (block.folder / "raw" / "s0.tif").exists()
 

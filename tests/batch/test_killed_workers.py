@@ -21,7 +21,7 @@ from osgeo import gdal
 from servers import moto_server
 
 from ortho_pipeline.batch.plan import STATE
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.stores.objects import Objects
 
 PATIENCE = 2.0
 FILE = """

@@ -24,7 +24,7 @@ from servers import moto_server, on_a_faulty_way, serving
 from ortho_pipeline.batch import runner
 from ortho_pipeline.batch.executors import Sequential
 from ortho_pipeline.batch.plan import STATE, Job, Plan, plan
-from ortho_pipeline.batch.records import FileState, Record, key_of
+from ortho_pipeline.batch.records import FileState, RunRecord, key_of
 from ortho_pipeline.batch.results import Outcome
 from ortho_pipeline.batch.shared.arrays import part_of_array
 from ortho_pipeline.batch.shared.leases import Leases
@@ -32,8 +32,8 @@ from ortho_pipeline.batch.shared.run import SharedFolder, run_shared, summary_of
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, error_document
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import Objects
 
 gdal.UseExceptions()
 
@@ -107,7 +107,7 @@ def test_parts_of_all_workers_are_all_scenes_once() -> None:
 
 
 #: What a worker says of a scene that failed.
-RESULT = Record("s", "", "failed", error=error_document(InputError("no heights")))
+RESULT = RunRecord(name="s", key="", status="failed", error=error_document(InputError("no heights")))
 
 
 # -- leases ------------------------------------------------------------------------------------------------------------
@@ -131,7 +131,7 @@ def make(made: list[str], seconds: float, dying: random.Random | None, job: Job)
     return Outcome(job.name, "done", seconds, {"ortho": str(job.folder / f"{job.name}_ortho.tif")})
 
 
-def done_record(job: Job) -> Record:
+def done_record(job: Job) -> RunRecord:
     """Return what a run writes of a scene without inputs."""
     job.record.parent.mkdir(exist_ok=True)
     for role in ("report", "html"):
@@ -140,7 +140,9 @@ def done_record(job: Job) -> Record:
     outputs = tuple(FileState.of(role, job.folder / name, name=name) for role, name in names.items())
     facts = {"sensor": "rpc", "model": "rpc", "headline": {}, "lean_m_per_m": 0.1, "rmse_px": {}, "rmse_m": {},
              "rmse_points": {}, "ortho": {}, "warnings": [], "notices": []}  # fmt: skip
-    return Record(job.name, key_of((), job.configuration, job.versions), "done", outputs=outputs, facts=facts)
+    return RunRecord(
+        name=job.name, key=key_of((), job.configuration, job.versions), status="done", outputs=outputs, facts=facts
+    )
 
 
 def work_together(address: str, count: int, scenes: int, patience: float, dying: int | None = None) -> Counter[str]:
@@ -340,9 +342,9 @@ HOSTILE = [
 
 @pytest.mark.parametrize("data", HOSTILE, ids=range(len(HOSTILE)))
 def test_a_record_that_cannot_be_read_is_none(data: bytes, tmp_path: Path, caplog: Any) -> None:
-    assert Record.parse(data) is None
+    assert RunRecord.parse(data) is None
     (tmp_path / "record.json").write_bytes(data)
-    assert Record.read(tmp_path / "record.json") is None
+    assert RunRecord.at(tmp_path / "record.json") is None
     assert caplog.text.count("cannot be read") == 1
 
 

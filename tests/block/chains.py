@@ -14,7 +14,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface, open_dem
 from ortho_pipeline.surface.writing import write_dem
 
 CRS = "EPSG:32636"
@@ -174,7 +174,7 @@ def dem(
     trees: float = 0.0,
     void: float = 0.0,
     shift: tuple[float, float] = (0.0, 0.0),
-) -> Surface:
+) -> DemSurface:
     """Return a DEM of the ground under a chain: with white errors, a common one, and one that is alike over a length.
 
     `trees` is the part of the cells that stand 15 m higher; `void` metres in the west have no height; `shift`
@@ -193,7 +193,7 @@ def dem(
     if void:
         heights[x < low[0] + _MARGIN + void] = -32768.0
     write_dem(path, heights, (float(low[0]), float(high[1])), cell, CRS)
-    return Surface.open(path, "ellipsoid", override=True)
+    return open_dem(path, "ellipsoid", override=True)
 
 
 def field(shape: tuple[int, int], length: float, random: np.random.Generator) -> Array:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
-from ortho_cartosat.truth import StereoPair
+from ortho_studies.cartosat.truth import StereoPair
+from ortho_studies.simulation.scanner import LineScanner
 from scipy.stats import chi2
 
 from ortho_pipeline.block.adjustment import _prepared, adjust
@@ -35,7 +36,6 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.report.notebook.tables import html
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT = 33.35, 37.25
 SIZE = 4000
@@ -186,8 +186,8 @@ def test_a_pushbroom_and_an_rpc_in_one_block(rpcs: dict[str, RPC]) -> None:
     rms = found.object_rms("check")
     assert rms is not None
     # Noise of 0.3 px (0.75 m) in each image, rays that meet at 32 degrees.
-    assert rms["plan"] < 1.5
-    assert rms["h"] < 2.5
+    assert rms.plan < 1.5
+    assert rms.h < 2.5
     # Soft constraints on the shape of the orbit decide parameters, and are no observations.
     rays_and_ground = 2 * points.rays + 3 * 12
     assert found.degrees_of_freedom > rays_and_ground - len(found.parameters) - 3 * 60
@@ -325,15 +325,15 @@ def test_a_stereo_block_recovers_biases_within_their_sigmas(rpcs: dict[str, RPC]
     assert (np.abs(found.values - wanted) < 4 * found.sigmas).all()
     rms = found.object_rms("check")
     assert rms is not None
-    assert rms["n"] == 60
+    assert rms.n == 60
     # The bias is of 30 px (75 m); what is left is noise of half a pixel and the geometry of 32 degrees.
-    assert rms["plan"] < 2.5
-    assert rms["h"] < 4.0
+    assert rms.plan < 2.5
+    assert rms.h < 4.0
     before = found.image_rms("left", "check", "raw_residuals")
     after = found.image_rms("left", "check")
     assert before is not None
     assert after is not None
-    assert after["total"] < 1.0 < before["total"]
+    assert after.total < 1.0 < before.total
 
 
 # -- check points and ties -------------------------------------------------------------------------------------------
@@ -666,7 +666,7 @@ def test_a_wrong_check_point_is_named_and_kept(rpcs: dict[str, RPC], axis: int, 
     found = adjust(starts(truth), replace(points, ground=frame.geodetic(local)))
     assert [(one.point, one.role, one.what) for one in found.outlying] == [("p20", "check", what)]
     assert any("check point p20" in text and "sigma" in text for text in found.warnings)
-    assert found.object_rms()["n"] == 31  # type: ignore[index]
+    assert found.object_rms().n == 31  # type: ignore[union-attr]
     assert found.rejected == ()
     assert found.to_json()["outlying"][0]["point"] == "p20"
 
@@ -942,7 +942,7 @@ def test_models_without_parameters_are_only_intersected(rpcs: dict[str, RPC]) ->
     crossed = intersect(delivered, points)
     np.testing.assert_allclose(found.ground, crossed.ground, rtol=0, atol=1e-9)
     assert found.sigma0 == pytest.approx(crossed.sigma0)
-    assert found.object_rms("check")["plan"] > 10  # type: ignore[index]
+    assert found.object_rms("check").plan > 10  # type: ignore[union-attr]
     assert found.parameters == ()
     assert found.covariance.shape == (0, 0)
 

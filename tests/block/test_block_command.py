@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal
 from servers import moto_server
 
@@ -22,14 +23,13 @@ from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, rpc_metadata
-from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.models import RPC
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.report.block import summary_text
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.wording import NO_SCALE
-from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.stores.objects import Objects
 from ortho_pipeline.surface.writing import write_dem
 
 LON, LAT, SIZE = 24.4, -33.65, 400

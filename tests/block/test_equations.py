@@ -29,6 +29,7 @@ from ortho_pipeline.block.intersection import frame_of, meet
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability import blunders
 from ortho_pipeline.block.variances import control_equations
+from ortho_pipeline.estimation.observations.on_points import OnPoints
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import as_ground
 
@@ -410,3 +411,44 @@ def test_the_order_in_which_rays_are_stated_changes_no_bit() -> None:
         np.testing.assert_array_equal(getattr(straight, name), getattr(other, name))
     for name in ("residuals", "back_projected", "raw_residuals", "used_rays"):
         np.testing.assert_array_equal(getattr(straight, name)[shuffled], getattr(other, name))
+
+
+class OnASlope(BlockProblem):
+    """A block whose ties have an observed height: they lie on a surface with a slope, 5 cm along its normal."""
+
+    normal = np.array([0.3, -0.2, 1.0]) / np.sqrt(1.13)
+    distances: np.ndarray
+
+    def _grounded(self, selection: Selection) -> np.ndarray:
+        return np.asarray(super()._grounded(selection) | self.points.tie)
+
+    def on_points(self, local: np.ndarray, rows: np.ndarray) -> OnPoints:
+        found, tie = super().on_points(local, rows), self.points.tie[rows]
+        turn = np.linalg.qr(np.column_stack([self.normal, np.eye(3)[:, :2]]))[0].T[[1, 2, 0]]
+        turn[2] = self.normal
+        along = np.where(tie, self.distances[rows] - local[rows] @ self.normal, found.apart[:, 2])
+        sigmas = np.where(tie[:, None], (np.inf, np.inf, 0.05), found.sigmas)
+        axes = np.where(tie[:, None, None], turn, found.axes)
+        return OnPoints(np.column_stack([found.apart[:, :2], along]), axes, sigmas)
+
+
+def test_a_further_type_of_observation_of_points_needs_no_change_of_the_solver() -> None:
+    models, points = strip(6, 120)
+    ordered = tuple(models.values())
+    frame = frame_of(ordered, points)
+    known = np.where(points.control[:, None], points.ground, np.nan)
+    problem, everything = OnASlope(points, ordered, frame, known), np.ones(points.rays, dtype=bool)
+    local = meet(frame, ordered, points, everything)
+    object.__setattr__(problem, "distances", local @ problem.normal)
+    rays = np.isfinite(local).all(axis=1)[points.point]
+    solved = solve(problem, State(ordered, local), Selection.of(rays, points.control))
+    design, misfits = dense(solved.linear)
+    assert np.abs(design.T @ misfits).max() < 1e-6 * np.abs(design.T).dot(np.abs(misfits)).max()
+    whole = np.linalg.inv(design.T @ design)
+    numbers, found = solved.linear.ordering.numbers, solved.points.ground(solved.cofactors, 1.0)
+    own = np.arange(problem.size, len(whole)).reshape(-1, 3)
+    of_points = whole[own[:, :, None], own[:, None, :]]
+    np.testing.assert_allclose(found[numbers], of_points, rtol=1e-6, atol=1e-9 * of_points.max())
+    ties = points.tie & np.isfinite(found).all(axis=(1, 2))
+    assert (np.sqrt(problem.normal @ found[ties] @ problem.normal) < 0.05).all()
+    assert solved.unit_weight()[1] == pytest.approx(np.abs(design).any(axis=1).sum() - design.shape[1])

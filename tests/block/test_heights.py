@@ -13,7 +13,7 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.errors import DegeneratePoints, InputError
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.flat import FlatSurface
 
 
 @pytest.mark.parametrize("convergence_deg", [1.0, 3.0])
@@ -50,7 +50,7 @@ def test_a_bias_of_the_dem_does_not_average_out(tmp_path: Path) -> None:
     heights = dem(block, tmp_path / "dem.tif", 2, white=2.0, bias=5.0).with_sigma(2.0)
     fit = adjust(block.start, block.points, heights=DemHeights(heights, bias=5.0), hold=5.0)
     assert fit.heights is not None
-    assert fit.heights.bias_sigma > 3.0
+    assert fit.heights.bias_sigma_m > 3.0
     assert np.nanmedian(fit.ground_sigmas[:, 2]) > 3.0
     claimed = [np.hypot(*fit_sigma) for fit_sigma in _claims(block, fit)]
     assert (misfits(block, fit) < 3.5 * np.array(claimed)).all()
@@ -66,7 +66,7 @@ def test_trees_cost_their_heights_and_no_tie(tmp_path: Path) -> None:
     heights = dem(block, tmp_path / "dem.tif", 0, white=1.0, trees=0.05).with_sigma(1.0)
     fit = adjust(block.start, block.points, heights=heights)
     assert fit.heights is not None
-    assert fit.heights.left_out >= 5
+    assert len(fit.heights.left_out) >= 5
     assert fit.used_rays.all()
     assert not fit.rejected
     assert any(notice.code == "heights-left-out" for notice in fit.warnings)
@@ -76,13 +76,13 @@ def test_the_sigma_is_found_where_nobody_states_it(tmp_path: Path) -> None:
     block = fly(Chain(convergence_deg=10.0), 3)
     fit = adjust(block.start, block.points, heights=dem(block, tmp_path / "dem.tif", 3, white=2.0))
     assert fit.heights is not None
-    assert fit.heights.source == "estimated"
-    assert 1.4 < fit.heights.sigma < 2.8
+    assert fit.heights.sigma_is == "estimated"
+    assert 1.4 < fit.heights.sigma_m < 2.8
     # Nearly parallel rays do not tell it: then it is taken to be 10 m, and that is said.
     parallel = fly(Chain(convergence_deg=0.1), 3)
     fit = adjust(parallel.start, parallel.points, heights=dem(parallel, tmp_path / "other.tif", 3, white=2.0))
     assert fit.heights is not None
-    assert fit.heights.source == "assumed"
+    assert fit.heights.sigma_is == "assumed"
     assert any(notice.code == "dem-sigma-by-default" for notice in fit.warnings)
 
 
@@ -91,15 +91,16 @@ def test_no_heights_in_voids(tmp_path: Path) -> None:
     heights = dem(block, tmp_path / "dem.tif", 0, white=2.0, void=100.0).with_sigma(2.0)
     fit = adjust(block.start, block.points, heights=heights)
     assert fit.heights is not None
-    assert fit.heights.none > 20
-    assert fit.heights.used + fit.heights.none + fit.heights.left_out + fit.heights.breaks == len(block.points)
+    assert fit.heights.without > 20
+    taken = fit.heights.used + len(fit.heights.left_out) + fit.heights.at_breaks
+    assert taken + fit.heights.without == len(block.points)
     assert fit.used_rays.all()
 
 
 def test_flat_ground_is_no_observation() -> None:
     block = fly(Chain(images=2, ties=20), 0)
     with pytest.raises(InputError, match="flat ground"):
-        adjust(block.start, block.points, heights=Surface.constant(200.0))
+        adjust(block.start, block.points, heights=FlatSurface(200.0))
 
 
 def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:

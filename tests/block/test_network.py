@@ -66,7 +66,7 @@ def test_angles_are_those_between_the_places_of_the_cameras(block):
     for pair, (count, angle) in expected.items():
         assert found[pair][0] == count
         assert found[pair][1] == pytest.approx(angle, abs=1e-3)
-    np.testing.assert_allclose(network.angles_deg, seen, atol=1e-3)
+    np.testing.assert_allclose(np.array(network.largest_deg, dtype=float), seen, atol=1e-3)
     # The same by the rays as they were measured.
     np.testing.assert_allclose(intersect(fit.models, fit.points).angles_deg[:15], seen[:15], atol=1e-3)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.projection import rays
@@ -13,7 +14,6 @@ from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.models.correction import COEFFICIENTS, FREE
-from ortho_pipeline.simulation.scanner import LineScanner
 
 SIZE = 2000
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from scipy.special import polygamma
 
 from ortho_pipeline.block.adjustment import adjust
@@ -22,7 +23,6 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LON, LAT, SIZE = 33.35, 37.25, 4000
 CHECKS, TIES = 5, 4

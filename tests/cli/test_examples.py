@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import click
+import make_commands
 import pytest
 from click.testing import CliRunner
 
@@ -16,8 +17,8 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.cli.survey.examples import EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-#: What takes seconds, and what serves until somebody ends it.
-SLOW, SERVES = ("match", "ties", "--reference", "edge", "register"), ("measure",)
+#: What takes seconds.
+SLOW = ("match", "ties", "--reference", "edge", "register")
 #: What has to be there before.
 BEFORE = {
     "mosaic": [
@@ -56,30 +57,27 @@ def test_every_command_has_an_example_in_its_help():
             command.make_context(words, shlex.split(line)[1 + len(words.split()) :], resilient_parsing=False)
 
 
-def test_the_page_of_options_says_of_each_when_one_needs_it():
-    page = (ROOT / "docs" / "options.md").read_text(encoding="utf-8")
-    told = {
-        flag for row in re.findall(r"^\| (`--[^|]+)\|", page, re.MULTILINE) for flag in re.findall(r"`(--[\w-]+)`", row)
-    }
+def test_the_pages_of_commands_say_of_each_option_when_one_needs_it():
+    told = [name for needs in make_commands.NEEDS.values() for name in needs]
+    assert len(told) == len(set(told))
     found = {
-        max((name for name in option.opts if name.startswith("--")), key=len)
+        make_commands.long_name(option)
         for words, command in commands(cli)
-        if words[0] not in ("simulate", "reproduce", "cache")
+        if words[0] not in make_commands.PLAIN
         for option in command.params
         if isinstance(option, click.Option)
     }
-    assert found - told == set()
-    assert told <= found
+    assert found == set(told)
 
 
 def test_every_yes_of_ours_is_a_command_that_is_run():
-    """Of the table beside other programs: each command, with its options, stands in a tutorial or an example."""
+    """Of the table of docs/comparison.md: each command, with its options, stands in a tutorial or an example."""
     from sessions import steps
 
-    run = [shlex.split(line) for words, line in LINES if words not in SERVES]
+    run = [shlex.split(line) for _, line in LINES]
     for page in (ROOT / "docs" / "tutorials").glob("*.md"):
         run += [shlex.split(step.command) for step in steps(page) if step.command.startswith("ortho ")]
-    table = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8").partition("## Whom")[0]
+    table = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8").partition("## Which")[0]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if line.startswith("| ")]
     assert len(rows) > 20
     assert all(len(row) == 6 for row in rows)
@@ -117,10 +115,10 @@ def play(lines: list[tuple[str, str]]) -> None:
 
 @pytest.mark.usefixtures("folder")
 def test_examples_run():
-    play([(words, line) for words, line in LINES if words not in SERVES and not is_slow(line)])
+    play([(words, line) for words, line in LINES if not is_slow(line)])
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_long_examples_run():
-    play([(words, line) for words, line in LINES if words not in SERVES and is_slow(line)])
+    play([(words, line) for words, line in LINES if is_slow(line)])

@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner
 
 from ortho_pipeline import commands
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
-from ortho_pipeline.cli.program import COMMANDS, cli
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files.json.values import json_value
@@ -86,8 +86,8 @@ def test_names_of_options_are_shown_as_flags() -> None:
 
 def test_errors_that_come_back_from_a_record_name_options_as_they_are_typed(tmp_path) -> None:
     refused = error_document(InputError("far away", remedy=Text("allow it with ", Setting("scene.allow_network"))))
-    Record("scene", "", "failed", error=refused).write(tmp_path / "record.json")
-    found = Record.read(tmp_path / "record.json")
+    RunRecord(name="scene", key="", status="failed", error=refused).write(tmp_path / "record.json")
+    found = RunRecord.at(tmp_path / "record.json")
     assert found is not None
     assert found.error == refused
     assert found.error is not None
@@ -118,7 +118,7 @@ def test_an_error_names_options_as_the_caller_knows_them(tiny, tmp_path) -> None
 
 
 def test_every_flag_of_a_command_has_a_name() -> None:
-    for command in map(command_of, COMMANDS):
+    for command in map(command_of, cli.list_commands(click.Context(cli))):
         names = flags_of(command)
         typed = {one.opts[0] for one in command.params if isinstance(one, click.Option)}
         assert typed == set(names.values())

@@ -12,7 +12,7 @@ import pytest
 from osgeo import gdal
 
 import ortho_pipeline
-from ortho_pipeline import commands, plugins
+from ortho_pipeline import commands, host
 from ortho_pipeline.commands import results
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError, PluginError
@@ -325,7 +325,7 @@ def test_a_folder_that_cannot_be_written_is_said(tiny, tmp_path):
 
 def test_points_without_heights_take_them_from_the_dem(tiny):
     rows = [(name, col, row, lon, lat) for name, col, row, lon, lat, _ in tiny.points(6, noise=0)]
-    heights = ortho_pipeline.Surface.open(tiny.dem, ortho_pipeline.Vertical("ellipsoid")).heights(
+    heights = ortho_pipeline.open_dem(tiny.dem, ortho_pipeline.Vertical("ellipsoid")).heights(
         np.array([row[3:5] for row in rows]), "EPSG:4326"
     )
     ground = np.column_stack([np.array([row[3:5] for row in rows]), heights])
@@ -489,7 +489,7 @@ def test_provenance_has_the_checksum_of_every_input_and_the_command(tiny, tmp_pa
 
 def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypatch):
     called = []
-    monkeypatch.setattr(plugins.Host, "discover", classmethod(called.append))
+    monkeypatch.setattr(host.Host, "discover", classmethod(called.append))
     path = tmp_path / "m_model.json"
     ortho_pipeline.save_model(tiny.model, path)
     open_scene(tiny.image, SceneOptions(model=path))

@@ -237,8 +237,8 @@ def test_what_is_said_of_one_image_names_it(pair, words, said):
 
 
 def test_measuring_takes_them_too(pair, monkeypatch):
-    from ortho_pipeline.measure.block import session
-    from ortho_pipeline.measure.serving import server
+    from ortho_measure.block import session
+    from ortho_measure.serving import server
 
     first, second, points = pair
     given: list[Any] = []
@@ -253,7 +253,7 @@ def test_measuring_takes_them_too(pair, monkeypatch):
 
 @pytest.mark.slow
 def test_a_session_of_images_with_rpcs_and_places_of_their_own(pair, tmp_path):
-    from ortho_pipeline.measure.block.session import open_block_session
+    from ortho_measure.block.session import open_block_session
 
     folder = SAMPLE / "cartosat"
     opened = open_block_session(

@@ -9,8 +9,7 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.errors import CoverageError, CrsError, InputError
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
-from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import NEAREST_METRES
+from ortho_pipeline.surface.dem import NEAREST_METRES, open_dem
 from ortho_pipeline.surface.dem_file import DemFile
 
 
@@ -88,7 +87,7 @@ def test_nearest_takes_no_height_from_far_away(tiny, tmp_path):
     refused(tiny, tmp_path / "out", "15.4 km", CoverageError, surface=dem_of(tiny, dem=far, fill="nearest"))
     done = commands.check(tiny.image, surface=dem_of(tiny, dem=near, fill="nearest"))
     assert 0 < done["coverage"] < 1
-    surface = Surface.open(far, "ellipsoid", fill="nearest")
+    surface = open_dem(far, "ellipsoid", fill="nearest")
     reach = surface.nearest_reach
     window = surface.window(-reach - 5, 10, reach + 5, 1)[0]
     assert np.isnan(window[:5]).all()

@@ -8,9 +8,9 @@ import importlib.metadata
 import pyproj
 
 from ortho_pipeline import commands
+from ortho_pipeline.host import Host
 from ortho_pipeline.models import rational, rpc_kernel
 from ortho_pipeline.options import SurfaceOptions
-from ortho_pipeline.plugins import Host
 
 
 def test_a_second_scene_asks_proj_and_the_package_for_nothing_that_is_known(tiny, tmp_path, monkeypatch) -> None:

@@ -14,7 +14,7 @@ def environment():
 
     def anew():
         pages._environment.cache_clear()
-        return pages._environment()
+        return pages._environment("ortho_pipeline")
 
     yield anew
     pages._environment.cache_clear()

@@ -15,11 +15,11 @@ from typing import ClassVar
 import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
+from ortho_studies.simulation.earth import geocentric
+from ortho_studies.simulation.waves import Waves
 
 from ortho_pipeline.models.base import SensorModel, as_ground
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.earth import geocentric
-from ortho_pipeline.simulation.waves import Waves
 
 Array = NDArray[np.float64]
 

@@ -114,7 +114,7 @@ def test_points_without_it_correct_it_as_generalised_least_squares_does(rpc: RPC
     np.testing.assert_allclose(said["estimate_m"], (2.5, -1.5), atol=3 * max(said["estimate_sigma_m"]))
     assert max(said["estimate_sigma_m"]) < 0.3
     # Residuals are what is left beside it; nothing of 3 m stands in them.
-    assert found.rmse("control")["total"] < 0.6
+    assert found.rmse("control").total < 0.6
 
 
 def test_few_surveyed_points_are_no_gross_errors_beside_many_matches(rpc: RPC) -> None:

@@ -13,28 +13,33 @@ import pyproj
 import pytest
 from click.testing import CliRunner
 from known_scenes import DEVELOPMENT, KnownScene, known_scene
-from ortho_bilsat import truth as bilsat_scene
-from ortho_cartosat import truth as cartosat_scene
-from ortho_ikonos import truth as ikonos_scene
-from ortho_ikonos.experiment import vendor_rpc
-from ortho_orbview3 import truth as orbview3_scene
+from ortho_studies.bilsat import truth as bilsat_scene
+from ortho_studies.cartosat import truth as cartosat_scene
+from ortho_studies.ikonos import truth as ikonos_scene
+from ortho_studies.ikonos.experiment import vendor_rpc
+from ortho_studies.orbview3 import truth as orbview3_scene
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.choice.comparison import (
+    ComparedModel,
+    ComparisonRecord,
+    available_models,
+    choose_models,
+    compare,
+)
 from ortho_pipeline.estimation.choice.expected_error import expectation
 from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
-from ortho_pipeline.estimation.choice.row import Row
-from ortho_pipeline.estimation.comparison import Comparison, available_models, choose_models, compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import RPC, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)
@@ -68,7 +73,7 @@ def test_every_model_is_a_row_and_one_that_cannot_be_fitted_says_why():
     assert [row.model for row in done.rows] == [family.name for family in families()]
     rows = {row.model: row for row in done.rows}
     assert "39" in str(rows["rfm3"].error)
-    assert rows["rfm3"].to_json()["rmse"] == {"control": None, "check": None, "loo": None}
+    assert rows["rfm3"].given()["rmse"] == {"control": None, "check": None, "loo": None}
     assert rows["affine3d"].error is None
     json.dumps(done.to_json(), allow_nan=False)
 
@@ -78,8 +83,8 @@ def test_flat_models_lose_on_hills_and_the_recommended_is_simple_enough():
     rows = {row.model: row.to_json() for row in done.rows}
     assert rows["affine2d"]["rmse"]["check"]["total"] > 10 * rows["affine3d"]["rmse"]["check"]["total"]
     assert done.recommended in ("affine3d", "dlt")
-    assert done.criterion == "check"
-    assert "20 check points" in done.reason
+    assert done.recommendation.criterion == "check"
+    assert "20 check points" in done.recommendation.reason
 
 
 def test_metres_are_the_pixels_of_the_scene():
@@ -95,22 +100,22 @@ def test_a_blunder_is_left_out_of_every_model():
     image[index] += (80.0, -60.0)
     moved = Points(**{**vars(points), "image": image})
     done = compare(moved, ("affine3d", "dlt", "rfm1"), size=(1000, 1000))
-    assert [name for name, _ in done.left_out] == [points.ids[index]]
+    assert [one.id for one in done.left_out] == [points.ids[index]]
     assert {row.fit.used.sum() for row in done.rows if row.fit} == {29}
 
 
 def test_nothing_is_recommended_without_redundancy():
     done = compare(simulated(4, 0), ("affine3d",), size=(1000, 1000))
     assert done.recommended is None
-    assert "redundancy" in done.reason
+    assert "redundancy" in done.recommendation.reason
 
 
 def test_the_simpler_of_two_equal_models_is_recommended():
     done = compare(simulated(40, 0), ("affine3d", "poly3d1", "affine12"), size=(1000, 1000))
     rows = {row.model: row for row in done.rows}
     assert rows["affine3d"].parameters == min(row.parameters for row in done.rows)
-    assert done.criterion == "leave-one-out"
-    assert recommend([rows["affine12"], Row("none", 1, 1, 3, error="no")])[0] == "affine12"
+    assert done.recommendation.criterion == "leave-one-out"
+    assert recommend([rows["affine12"], ComparedModel.of("none", (1, 1, 3), "no")])[0] == "affine12"
 
 
 def test_fourteen_models_are_all_fitted_to_sixty_points():
@@ -139,7 +144,7 @@ def test_a_plain_image_is_rectified_from_points_alone(tiny, tmp_path, crs):
     options = points_of(tiny, fit_model="affine3d", model_crs=crs)
     fitted = commands.fit(image, options)
     assert fitted.scene.sensor == "points only"
-    assert fitted.fit.rmse("loo")["total"] < 0.5
+    assert fitted.fit.rmse("loo").total < 0.5
     if crs not in (None, "utm"):
         return
     surface = SurfaceOptions(dem=tiny.dem, vertical="ellipsoid")
@@ -187,7 +192,7 @@ def test_prune_takes_out_what_the_points_do_not_justify(tiny):
     assert {"col_shift", "row_shift"} <= set(result.fit.param_names)
     assert len(result.removed) >= 2
     assert any("do not justify" in text for text in result.warnings)
-    assert [one["name"] for one in result.to_json()["removed"]] == [one["name"] for one in result.removed]
+    assert [one["name"] for one in result.to_json()["removed"]] == [one.name for one in result.removed]
 
 
 @pytest.mark.parametrize(
@@ -212,7 +217,7 @@ def test_an_unknown_model_is_refused(tiny):
 def test_points_without_heights_serve_flat_models_only(tiny):
     path = tiny.write(tiny.folder / "flat.csv", [row[:5] for row in tiny.points(8)], "id,col,row,x,y")
     options = PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine2d")
-    assert commands.fit(plain(tiny), options).fit.rmse("control")["n"] == 8
+    assert commands.fit(plain(tiny), options).fit.rmse("control").n == 8
     with pytest.raises(InputError, match="without a height"):
         commands.fit(plain(tiny), PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine3d"))
 
@@ -274,13 +279,13 @@ def test_no_unstable_model_is_recommended_on_spot_6(real):
     size = int(2 * rpc.col_scale), int(2 * rpc.row_scale)
     done = compare(points, ("rfm1", "poly3d2", "poly3d3", "rfm2"), size=size)
     rows = {row.model: row.fit for row in done.rows if row.fit}
-    errors = {name: found.rmse("loo")["total"] for name, found in rows.items()}
+    errors = {name: found.rmse("loo").total for name, found in rows.items()}
     smallest = min(errors, key=errors.__getitem__)
     assert rows[smallest].reservations == ("unstable",)
     assert rows[done.recommended].reservations == ()
     assert done.recommended in ("poly3d2", "poly3d3")
-    assert f"; {smallest} has" in done.reason
-    assert done.reason.endswith("and is unstable")
+    assert f"; {smallest} has" in done.recommendation.reason
+    assert done.recommendation.reason.endswith("and is unstable")
     # With the RPC, which is right up to shift and drift.
     done = compare(points, ("rpc", "rpc+shift", "rpc+shift-drift", "rpc+affine", "poly3d2", "rfm2"), own=rpc, size=size)
     assert done.recommended in ("rpc+shift-drift", "rpc+affine")
@@ -307,10 +312,10 @@ def test_what_is_uncertain_over_the_scene_is_part_of_the_expected_error():
     assert done.recommended == "affine3d"
     alone = compare(points, ("affine14",), size=(1000, 1000))
     assert alone.recommended == "affine14"
-    assert alone.reason.endswith("it is uncertain at a corner: measure points there")
+    assert alone.recommendation.reason.endswith("it is uncertain at a corner: measure points there")
 
 
-def as_if(name: str, parameters: int, errors: np.ndarray) -> Row:
+def as_if(name: str, parameters: int, errors: np.ndarray) -> ComparedModel:
     """Return a row whose check points have these errors (px) in columns, of a fit that is above suspicion."""
     base = compare(simulated(12, len(errors)), ("affine3d",), size=(1000, 1000)).rows[0].fit
     assert base is not None
@@ -319,7 +324,7 @@ def as_if(name: str, parameters: int, errors: np.ndarray) -> Row:
     found = dataclasses.replace(
         base, residuals=residuals, loo_residuals=np.full_like(residuals, np.nan), outlying=(), corner_ratio=1.0
     )
-    return Row(name, parameters, 4, 3, fit=found)
+    return ComparedModel.of(name, (parameters, 4, 3), found)
 
 
 def test_a_simpler_model_costs_two_per_cent_at_most():
@@ -339,7 +344,7 @@ def test_an_error_below_the_noise_is_chance():
     fits = {row.model: row.fit for row in rows}
     # As uncertain as measured, and no less: then both errors are smaller than can be.
     exact = {name: dataclasses.replace(found, sigma0=1.0) for name, found in fits.items() if found}
-    rows = [dataclasses.replace(row, fit=exact[row.model]) for row in rows]
+    rows = [row.replaced(fit=exact[row.model]) for row in rows]
     assert recommend(rows)[0] == "simple"
     rows = [as_if("simple", 8, 5 * errors), as_if("many", 20, 3 * errors)]
     assert recommend(rows)[0] == "many"
@@ -369,11 +374,11 @@ def test_a_wrong_check_point_decides_nothing():
     models = ("affine2d", "poly2", "affine3d", "dlt")
     before, after = compare(points, models, size=(1000, 1000)), compare(moved, models, size=(1000, 1000))
     assert after.recommended == before.recommended
-    assert "11 check points" in after.reason
+    assert "11 check points" in after.recommendation.reason
     best = after.best
     assert best is not None
     assert best.fit is not None
-    assert best.fit.rmse("check")["n"] == 12
+    assert best.fit.rmse("check").n == 12
     assert [one.id for one in best.fit.outlying] == ["C03"]
 
 
@@ -384,7 +389,7 @@ def test_models_that_do_not_follow_the_scene_have_no_vote_on_gross_errors():
     image[7] += (9.0, -8.0)
     moved = dataclasses.replace(points, image=image)
     done = compare(moved, ("affine2d", "poly2", "poly3", "affine3d", "dlt"), size=(1000, 1000))
-    assert [name for name, _ in done.left_out] == [points.ids[7]]
+    assert [one.id for one in done.left_out] == [points.ids[7]]
 
 
 @pytest.mark.parametrize("family", ["affine3d", "dlt", "rfm1"])
@@ -399,7 +404,7 @@ def test_a_gross_error_on_the_ground_does_not_move_what_a_model_is_meant_for(fam
     np.testing.assert_allclose(found.values, good.values, rtol=1e-6, atol=1e-9)
 
 
-def true_errors(scene: KnownScene, done: Comparison) -> dict[str, float]:
+def true_errors(scene: KnownScene, done: ComparisonRecord) -> dict[str, float]:
     """Return the error (px) of each model over the scene, by its dense truth without noise."""
     models = {row.model: row.fit.model for row in done.rows if row.fit}
     misses = {
@@ -409,7 +414,7 @@ def true_errors(scene: KnownScene, done: Comparison) -> dict[str, float]:
     return {name: math.sqrt((miss**2).sum(axis=1).mean()) for name, miss in misses.items()}
 
 
-def compared(scene: KnownScene, names: tuple[str, ...] | None = None) -> Comparison:
+def compared(scene: KnownScene, names: tuple[str, ...] | None = None) -> ComparisonRecord:
     names = names or tuple(available_models(scene.own))
     return compare(scene.points, names, own=scene.own, size=scene.size, heights=scene.heights, robust=False)
 
@@ -418,7 +423,7 @@ def test_twenty_parameters_on_fourteen_points_do_not_win_by_chance():
     scene = known_scene(DEVELOPMENT[2], "even", 14, 339)
     done = compared(scene)
     fits = {row.model: row.fit for row in done.rows if row.fit}
-    left_out = {name: found.rmse("loo")["total"] for name, found in fits.items() if found.rmse("loo")}
+    left_out = {name: found.rmse("loo").total for name, found in fits.items() if found.rmse("loo")}
     true = true_errors(scene, done)
     # The smallest error at the points, by chance, and twice the best one over the scene.
     assert min(left_out, key=left_out.__getitem__) == "poly3d2"
@@ -426,7 +431,7 @@ def test_twenty_parameters_on_fourteen_points_do_not_win_by_chance():
     assert true["poly3d2"] > 1.9 * min(true.values())
     assert done.recommended == "dlt"
     assert true["dlt"] < 1.05 * min(true.values())
-    assert f"poly3d2 has {left_out['poly3d2']:.3g} px with 20 parameters, and " in done.reason
+    assert f"poly3d2 has {left_out['poly3d2']:.3g} px with 20 parameters, and " in done.recommendation.reason
 
 
 @pytest.mark.slow

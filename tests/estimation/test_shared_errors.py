@@ -186,8 +186,8 @@ def test_sigmas_cover_where_errors_are_smooth_but_for_samples(rpc: RPC, kind: st
 def test_sigmas_cover_at_all_ranges(rpc: RPC, kind: str, count: int, share: float, part: float) -> None:
     """Over all parameters too small by a third at most where a quarter of the scene errs alike, by 1.75 where half.
 
-    Slopes and shifts take up most of what is so long (docs/accuracy.md). Sigmas of forty draws of one parameter are
-    known to 15 %, and have long tails.
+    Slopes and shifts take up most of what is so long (docs/engineering/accuracy.md). Sigmas of forty draws of one
+    parameter are known to 15 %, and have long tails.
     """
     claimed, usual = spread(rpc, kind, count, share, part, 40)
     whole, before = np.sqrt((claimed**2).mean()), np.sqrt((usual**2).mean())

@@ -10,20 +10,20 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from scipy.stats import binom
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.estimation.spatial.correlation import Covariance, analyse, analyse_fit
+from ortho_pipeline.estimation.spatial.correlation import Covariance, Covariances, analyse, analyse_fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 Array = np.ndarray
 SIDE = 10_000.0
@@ -258,13 +258,13 @@ def section(result: Fit) -> dict[str, Covariance | None]:
 
 
 def test_a_wave_that_no_affine_takes_out_is_found():
-    found = section(adjusted(wave=0.6))["control"]
+    found = section(adjusted(wave=0.6)).control
     assert found is not None
     assert found.verdict == "systematic"
     assert found.p is not None
     # The columns of a southward pass are east: x has it, y has not.
     assert found.p[0] < 0.01 < found.p[1]
-    clean = section(adjusted(wave=0.0))["control"]
+    clean = section(adjusted(wave=0.0)).control
     assert clean is not None
     assert clean.verdict == "none found"
 
@@ -272,19 +272,19 @@ def test_a_wave_that_no_affine_takes_out_is_found():
 def test_control_and_check_are_apart_and_in_metres():
     result = adjusted(wave=0.0)
     found = section(result)
-    assert found["control"] is not None
-    assert found["check"] is not None
-    assert (found["control"].n, found["check"].n) == (int(result.used.sum()), 12)
+    assert found.control is not None
+    assert found.check is not None
+    assert (found.control.n, found.check.n) == (int(result.used.sum()), 12)
     rmse = result.rmse("check")
     assert rmse is not None
-    assert found["check"].unit == "m"
-    assert np.hypot(*found["check"].absolute) == pytest.approx(2.5 * rmse["total"], rel=0.1)
+    assert found.check.unit == "m"
+    assert np.hypot(*found.check.absolute) == pytest.approx(2.5 * rmse.total, rel=0.1)
     # Distances are those of the ground: the scene is 2.5 km wide.
-    last = found["control"].classes[-1]
+    last = found.control.classes[-1]
     assert 2000 < last.to_m < 3600
     none: Points = result.points.select(np.zeros(len(result.points), dtype=bool))
     empty = fit(ImageCorrection(CAMERA, "none", (500.0, 500.0), np.zeros(6)), none)
-    assert section(empty) == {"control": None, "check": None}
+    assert section(empty) == Covariances()
 
 
 def test_report_holds_the_analysis_and_draws_it(tmp_path):

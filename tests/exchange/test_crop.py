@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -17,13 +18,12 @@ from ortho_pipeline.estimation.family_fit import fit_own
 from ortho_pipeline.exchange.crop import moved, noted_offset
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.host import open_scene as open_product
 from ortho_pipeline.models import ImageCorrection, model_from_dict
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.options import PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene as open_product
 from ortho_pipeline.points.table import Points
 from ortho_pipeline.raster.source import open_dataset
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor_model
 
 gdal.UseExceptions()

@@ -278,8 +278,7 @@ def test_every_format_from_the_command_line(tiny, tmp_path):
     done = CliRunner().invoke(cli, ["export", *map(str, arguments), *formats])
     assert done.exit_code == 0, done.stderr
     document = json.loads(done.stdout)
-    # All but the state of a camera with an orientation, which an RPC is not.
-    assert set(document["files"]) == set(FORMATS) - {"csm"}
+    assert set(document["files"]) == set(FORMATS)
     assert all(Path(path).stat().st_size for path in document["files"].values())
     assert document["exact"] is True
 

@@ -19,9 +19,9 @@ from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded, sha256
 from ortho_pipeline.files.locations import MAX_READ, VsiPath
+from ortho_pipeline.host import Host
 from ortho_pipeline.models import model_from_dict
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import Host
 
 ORBVIEW = "3v050620p0000443940a5200000000200m_001443940.tif"
 PRODUCTS = {

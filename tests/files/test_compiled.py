@@ -12,8 +12,8 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
-from ortho_pipeline.files.kernels import places
-from ortho_pipeline.files.storage import kept
+from ortho_pipeline.runtime.kernels import places
+from ortho_pipeline.stores import kept
 
 KERNELS = [
     path
@@ -24,7 +24,7 @@ SCENE = Path(__file__).parents[2] / "sample_data/ikonos/po_39001_pan_0000000.tif
 #: Nothing can be kept below a file.
 NOWHERE = {"NUMBA_CACHE_DIR": os.fspath(Path(__file__))}
 ONE = """
-from ortho_pipeline.files.compiled import compiled
+from ortho_pipeline.runtime.compiled import compiled
 @compiled
 def double(x):
     return 2 * x
@@ -50,7 +50,7 @@ def cached(folder: Path, code: str = TOLD, **surroundings: str) -> str:
 def test_a_command_runs_where_no_cache_can_be_written() -> None:
     done = run(
         f"sys.argv = ['ortho', 'info', {str(SCENE)!r}]\n"
-        "from ortho_pipeline.files import compiled\n"
+        "from ortho_pipeline.runtime import compiled\n"
         "from ortho_pipeline.models import rpc_kernel\n"
         "from ortho_pipeline.models.pushbroom import kernel as pushbroom_kernel\n"
         "compiled.compiled(lambda number: number + 1)(1)\n"
@@ -124,7 +124,7 @@ def test_a_plain_job_compiles_one_kernel_and_no_function_of_the_warp_twice(tmp_p
 
 def test_kept_code_is_made_again_when_a_function_of_another_module_changes(tmp_path: Path) -> None:
     """numba's own cache gave the old value: it looks at the module of the caller alone."""
-    made = "from ortho_pipeline.files.compiled import compiled, inlined\n"
+    made = "from ortho_pipeline.runtime.compiled import compiled, inlined\n"
     below = made + "@inlined\ndef step(x):\n    return x + {}\n"
     between = made + "from below import step\n@compiled\ndef twice(x):\n    return step(step(x))\n"
     above = made + "from between import twice\n@compiled\ndef run(x):\n    return twice(x)\n"

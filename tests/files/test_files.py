@@ -65,7 +65,7 @@ import resource, signal, sys
 from ortho_pipeline.warp import engine as warp
 from ortho_pipeline.warp.job import WarpJob
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
 image, out, driver, limit = sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4])
@@ -75,7 +75,7 @@ if limit:
 model = rpc_of_dataset(raster.open_dataset(image))[0]
 grid = raster.Grid.of_extent(parse_crs("EPSG:4326"), (19.99, -30.0065, 20.01, -29.9935), (2e-6, 2e-6))
 print("start", flush=True)
-warp.rectify(WarpJob(model, raster.RasterSource(image), Surface.constant(500.0), grid, driver=driver), out)
+warp.rectify(WarpJob(model, raster.RasterSource(image), FlatSurface(500.0), grid, driver=driver), out)
 """
 
 

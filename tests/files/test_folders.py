@@ -12,7 +12,7 @@ import pytest
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import folders
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.plugins.host import Host
+from ortho_pipeline.host.discovery import Host
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.locations import VsiPath, archive_of, in_local_archive, located
+from ortho_pipeline.files.locations import Location, VsiPath, located
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.source import open_dataset
 
@@ -115,7 +115,7 @@ def test_other_urls_are_refused_and_files_stay_files():
     ],
 )  # fmt: skip
 def test_archives_on_disk_are_not_the_network(name, local):
-    assert in_local_archive(name) == local
+    assert Location(name).in_archive == local
     if not local:
         with pytest.raises(InputError, match=r"scene\.allow_network"):
             open_dataset(name)
@@ -208,8 +208,8 @@ def test_archive_and_member_are_named_where_they_are_wrong(archive):
         done = run("info", name)
         assert done.exit_code == 2
         assert f"/vsizip/{archive}/product/tiny.tif" in done.stderr
-    assert archive_of(f"/vsizip/{archive}/product/tiny.tif") == archive
-    assert archive_of(f"/vsizip/{{{archive}}}/product/tiny.tif") == archive
+    assert Location(f"/vsizip/{archive}/product/tiny.tif").archive == archive
+    assert Location(f"/vsizip/{{{archive}}}/product/tiny.tif").archive == archive
 
 
 # -- other folders ---------------------------------------------------------------------------------------------------

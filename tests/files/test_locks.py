@@ -9,13 +9,13 @@ import os
 from pathlib import Path
 
 import pytest
+from ortho_measure.journal import Journal
 
 from ortho_pipeline.batch.records import locked
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import Lock, Outputs, append_line, together, write_text
-from ortho_pipeline.files.storage import kept
-from ortho_pipeline.files.storage.objects import Content
-from ortho_pipeline.measure.journal import Journal
+from ortho_pipeline.stores import kept
+from ortho_pipeline.stores.objects import Content
 
 #: What a process asks that wants a file for itself.
 _ALONE = fcntl.LOCK_EX | fcntl.LOCK_NB

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.files.process_limits import (
+from ortho_pipeline.runtime.process_limits import (
     MOST_THREADS,
     parts_of,
     require_memory,
@@ -95,7 +95,7 @@ def test_threads_share_a_heap() -> None:
     """A heap of a thread is a reservation of 64 MB that begins at a multiple of that."""
     code = (
         "import sys, threading, time, pathlib\n"
-        "from ortho_pipeline.files.process_limits import share_freed_memory\n"
+        "from ortho_pipeline.runtime.process_limits import share_freed_memory\n"
         "if len(sys.argv) > 1: assert share_freed_memory()\n"
         "kept, ready = [], threading.Barrier(5)\n"
         "def hold(): kept.append([bytearray(60_000) for _ in range(9)]); ready.wait(); ready.wait()\n"

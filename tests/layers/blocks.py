@@ -10,6 +10,7 @@ import pyproj
 from ortho_pipeline.models.base import SensorModel, as_ground
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
 
 ZONE = 32636
@@ -103,7 +104,7 @@ class City:
         heights = FLOOR + self.heights(*np.meshgrid(x, y))
         corner = (WEST - margin - step / 2, NORTH + margin + step / 2)
         write_dem(path, heights, corner, step, f"EPSG:{ZONE}")
-        return Surface.open(path, "ellipsoid")
+        return open_dem(path, "ellipsoid")
 
     def grid(self, pixel: float = 0.5) -> Grid:
         """Return an output grid over the square."""

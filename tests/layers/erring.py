@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from ortho_bilsat import truth as bilsat
-from ortho_cartosat import truth as cartosat
-from ortho_ikonos import truth as ikonos
-from ortho_ikonos.experiment import vendor_rpc
-from ortho_orbview3 import truth as orbview3
+from ortho_studies.bilsat import truth as bilsat
+from ortho_studies.cartosat import truth as cartosat
+from ortho_studies.ikonos import truth as ikonos
+from ortho_studies.ikonos.experiment import vendor_rpc
+from ortho_studies.orbview3 import truth as orbview3
 
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.exchange.rpc_fit import fit_rpc

@@ -11,7 +11,7 @@ from osgeo import gdal
 
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.layers.accuracy import Budget, layer_grid, parts_at, write_accuracy
 from ortho_pipeline.warp.layers.error_ellipse import circular_error
 from ortho_pipeline.warp.layers.sight import Sight
@@ -64,7 +64,7 @@ def test_the_parts_are_the_spread_of_errors_that_are_drawn(tiny):
 
 def test_the_file_holds_what_the_parts_say_at_its_pixels(tiny, tmp_path):
     model, grid = corrected(tiny.model), grid_of(tiny)
-    dem = Surface.open(tiny.dem, "ellipsoid")
+    dem = open_dem(tiny.dem, "ellipsoid")
     budget = Budget(covariance=COVARIANCE, heights=4.0, datum=0.5, interpolation_px=0.3)
     path = tmp_path / "accuracy.tif"
     made = write_accuracy(budget, Sight(model, grid), dem, SIZE, path, heights=(480.0, 520.0), step=2)
@@ -105,9 +105,9 @@ def test_heights_of_unknown_quality_have_no_accuracy_and_void_ones_neither(tiny,
     copy.GetRasterBand(1).SetNoDataValue(-32767.0)
     copy.WriteArray(values)
     copy = None
-    sigma = Surface.open(quality, "ellipsoid", override=True, fill="mask")
+    sigma = open_dem(quality, "ellipsoid", override=True, fill="mask")
     write = {"heights": (480.0, 520.0), "step": 4}
-    sight, surface = Sight(tiny.model, grid), Surface.open(tiny.dem, "ellipsoid")
+    sight, surface = Sight(tiny.model, grid), open_dem(tiny.dem, "ellipsoid")
     made = write_accuracy(Budget(heights=sigma), sight, surface, SIZE, path, **write)
     ce90 = gdal.Open(str(path)).ReadAsArray()[3]
     one = write_accuracy(Budget(heights=1.0), sight, surface, SIZE, path, **write)
@@ -123,9 +123,9 @@ def test_heights_of_unknown_quality_have_no_accuracy_and_void_ones_neither(tiny,
 
 
 def test_the_layer_does_not_depend_on_the_memory(tiny, tmp_path):
-    from ortho_pipeline.files.process_limits import Resources
+    from ortho_pipeline.runtime.process_limits import Resources
 
-    sight, surface = Sight(corrected(tiny.model), grid_of(tiny)), Surface.open(tiny.dem, "ellipsoid")
+    sight, surface = Sight(corrected(tiny.model), grid_of(tiny)), open_dem(tiny.dem, "ellipsoid")
     found = []
     for memory in (512_000_000, 16_000):
         path = tmp_path / f"{memory}.tif"

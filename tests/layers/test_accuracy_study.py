@@ -11,18 +11,19 @@ from osgeo import gdal
 
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import ImageCorrection
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.layers.accuracy import Budget, parts_at, predictive
 from ortho_pipeline.warp.layers.sight import Sight
 
 
 def test_errors_are_as_large_as_predicted():
-    """Of 30 scenes with independent DEM errors a spread is known to about 10 %; a thousand are in docs/accuracy.md."""
+    """Of 30 scenes with independent DEM errors a spread is known to about 10 % (docs/engineering/accuracy.md: 1000)."""
     seeds = {"ikonos": 12, "orbview3": 8, "bilsat": 8, "cartosat": 2}
     found = pooled([trial(sensor, seed) for sensor, count in seeds.items() for seed in range(count)])
     assert 0.85 <= found["east"] <= 1.15
@@ -64,7 +65,7 @@ def _dem(path, truth: Truth, to_map, corner, errors) -> Surface:
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
     heights = truth.terrain(*to_map.transform(*xy.T, direction="INVERSE")) + errors(xy)
     write_dem(path, heights.reshape(count, count), (west, north), step, f"EPSG:{truth.zone}")
-    return Surface.open(path, "ellipsoid")
+    return open_dem(path, "ellipsoid")
 
 
 def _ramp(path, size):

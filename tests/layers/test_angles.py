@@ -17,7 +17,7 @@ from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.layers.angles import Sun, write_angles, write_shadows
 from ortho_pipeline.warp.layers.hiding import Hiding
 from ortho_pipeline.warp.layers.sight import Sight
@@ -35,7 +35,7 @@ def test_angles_of_view_are_those_of_the_rays_in_space(tiny, tmp_path):
     utm = pyproj.CRS.from_epsg(32634)
     x, y = pyproj.Transformer.from_crs(4326, utm, always_xy=True).transform(tiny.model.lon_off, tiny.model.lat_off)
     grid = Grid(utm, x - 960, y + 720, 4.8, 4.8, 400, 300)
-    dem = Surface.open(tiny.dem, "ellipsoid")
+    dem = open_dem(tiny.dem, "ellipsoid")
     write_angles(Sight(tiny.model, grid), dem, (400, 300), tmp_path / "a.tif", heights=(480.0, 520.0), step=8)
     zenith, azimuth = read(tmp_path / "a.tif")
     columns, rows = (part.ravel() for part in np.meshgrid(np.arange(20, 30) * 8 + 4.0, np.arange(10, 20) * 8 + 4.0))
@@ -56,7 +56,7 @@ def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path):
     x = np.arange(0, 400.0, 4)
     heights = FLOOR + 0.3 * np.broadcast_to(x, (100, 100))  # rises to the east
     write_dem(tmp_path / "dem.tif", heights, (WEST - 70, NORTH + 70), 4.0, "EPSG:32636")
-    surface, grid = Surface.open(tmp_path / "dem.tif", "ellipsoid"), City(()).grid(1.0)
+    surface, grid = open_dem(tmp_path / "dem.tif", "ellipsoid"), City(()).grid(1.0)
     sight = Sight(Parallel(0.0, 0.0, 1.0, 256.0), grid)
     write_angles(sight, surface, (256, 256), tmp_path / "a.tif", heights=(100.0, 220.0), step=8, sun=SUN)
     zenith, _, incidence = read(tmp_path / "a.tif")[:, 10, 10]

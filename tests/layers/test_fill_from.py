@@ -14,12 +14,12 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import write_rpc_txt
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp import engine
 from ortho_pipeline.warp.layers.hiding import Hiding

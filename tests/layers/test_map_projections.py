@@ -16,6 +16,7 @@ from space import Hills, Satellite, angles, axes, between, radius_of, to_space, 
 
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.layers.accuracy import Budget, layer_grid, write_accuracy
 from ortho_pipeline.warp.layers.angles import Sun, write_angles, write_shadows
 from ortho_pipeline.warp.layers.sight import Sight
@@ -158,7 +159,7 @@ def hills_at(tmp_path_factory):
             path = tmp_path_factory.mktemp("hills") / "dem.tif"
             hills = Hills((LON, lat))
             hills.write(path)
-            made[lat] = hills, Surface.open(path, "ellipsoid")
+            made[lat] = hills, open_dem(path, "ellipsoid")
         return made[lat]
 
     return at

@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.layers import visibility
 from ortho_pipeline.warp.layers.sight import Sight
@@ -63,7 +64,7 @@ def rough(path, slope: float, seed: int = 2) -> Surface:
         heights += length * np.sin(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / length + phase)
     steepest = max(np.abs(np.diff(heights, axis=0)).max(), np.abs(np.diff(heights, axis=1)).max()) * np.sqrt(2) / 5
     write_dem(path, FLOOR + heights * slope / steepest, (WEST - 200.37, NORTH + 200.29), 5.0, f"EPSG:{ZONE}")
-    return Surface.open(path, "ellipsoid")
+    return open_dem(path, "ellipsoid")
 
 
 def along(surface: Surface, x: np.ndarray, y: np.ndarray, east: float, north: float, step: float = 0.1) -> np.ndarray:
@@ -85,7 +86,7 @@ def test_where_the_mask_is_not_that_of_the_boxes_their_samples_are_not_the_boxes
     wrong = np.argwhere(found != TOWN.hidden(*TOWN.places(TOWN.grid()), east, north))
     rows, columns = wrong[:: max(1, len(wrong) // 150)].T
     x, y = TOWN.grid().xy(columns + 0.5, rows + 0.5)
-    above = along(Surface.open(tmp_path / "dsm.tif", "ellipsoid"), x, y, east, north, step=0.02)
+    above = along(open_dem(tmp_path / "dsm.tif", "ellipsoid"), x, y, east, north, step=0.02)
     clear = np.abs(above) > 0.03  # the walk steps over what rises by less
     assert clear.sum() > 20
     np.testing.assert_array_equal(found[rows, columns][clear], (above > 0)[clear])
@@ -137,7 +138,7 @@ def test_a_void_is_told_and_hides_nothing(tmp_path):
     heights[60:80, 60:80] = -32768.0
     dataset.WriteArray(heights)
     dataset = None
-    surface, grid = Surface.open(path, "ellipsoid", fill="mask"), City(()).grid(1.0)
+    surface, grid = open_dem(path, "ellipsoid", fill="mask"), City(()).grid(1.0)
     sight = Sight(Parallel(*towards(40, 100), 1.0, 256.0), grid)
     found = Visibility(sight, surface, (40.0, 160.0), 2**30).look(0, 0, 256, 256)
     columns, rows = np.meshgrid(np.arange(256) + 0.5, np.arange(256) + 0.5)
@@ -166,7 +167,7 @@ def test_lines_that_end_early_miss_nothing(azimuth, terrain, step, tmp_path, mon
     """Seen flat and in every direction, what is hidden is what it is if each line is followed to its end."""
     heights = FLOOR + terrain(np.random.default_rng(azimuth)) * step / 2
     write_dem(tmp_path / "dem.tif", heights, (WEST - 72.3, NORTH + 72.1), step, f"EPSG:{ZONE}")
-    surface, grid = Surface.open(tmp_path / "dem.tif", "ellipsoid", fill="mask"), City(()).grid(1.0)
+    surface, grid = open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"), City(()).grid(1.0)
     sight = Sight(Parallel(*towards(62, azimuth), 1.0, 256.0), grid)
     found = Visibility(sight, surface, (60.0, 180.0), 2**30).look(0, 0, 256, 256)
     unbounded = lambda heights, tops, *_: (np.full(tops.shape, np.inf), np.full(tops.shape, -np.inf))  # noqa: E731
@@ -187,7 +188,7 @@ def test_a_ray_from_the_image_ends_where_the_pixel_is_visible(tiny, tmp_path):
     random = np.random.default_rng(5)
     heights = 500 + 60 * gaussian_filter(random.normal(0, 6, (120, 120)), 1.5)
     write_dem(tmp_path / "dem.tif", heights, (x - 1200, y + 1200), 20.0, "EPSG:32634")
-    surface, grid = Surface.open(tmp_path / "dem.tif", "ellipsoid"), Grid(utm, x - 512, y + 512, 4.0, 4.0, 256, 256)
+    surface, grid = open_dem(tmp_path / "dem.tif", "ellipsoid"), Grid(utm, x - 512, y + 512, 4.0, 4.0, 256, 256)
     sight = Sight(lean, grid)
     found = Visibility(sight, surface, (300.0, 700.0), 2**30).look(0, 0, 256, 256)
     rows, columns = random.integers(0, 256, (2, 200))

@@ -12,10 +12,10 @@ from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.warp import engine
 from ortho_pipeline.warp.layers.hiding import Hiding
 

@@ -18,6 +18,7 @@ from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 SETTING = Setting(
     side=260, seed=5, error=6.0, margin=30.0, fine=1.0, scene=View(noise=0.03), reference=View(noise=0.03)
@@ -53,7 +54,7 @@ def matched(
 
 
 def of_case(case: Case, reference: Path, *bands: int) -> matching.Matches:
-    return matched(case.scene_file, case.model, Surface.open(case.dem_file, "ellipsoid"), reference, *bands)
+    return matched(case.scene_file, case.model, open_dem(case.dem_file, "ellipsoid"), reference, *bands)
 
 
 def test_a_band_that_is_displaced_is_named_and_counts_in_the_sigmas(case: Case, tmp_path: Path) -> None:
@@ -101,7 +102,7 @@ def test_the_near_infrared_of_landsat_disagrees_with_the_other_bands(real: Path)
     """Matched with all chips, each band by itself: 2, 3, 4, 6 and 7 within 0.3 px, 5 off by -1.1, 0.25 ± 0.2 px."""
     scene = real / "orthority" / "rpc" / "qb2_basic1b.tif"
     model = rpc_of_dataset(gdal.Open(str(scene)))[0]
-    surface = Surface.open(real / "orthority" / "ngi" / "dem.tif", "egm96", override=True)
+    surface = open_dem(real / "orthority" / "ngi" / "dem.tif", "egm96", override=True)
     reference = real / "homonim" / "landsat8_byte.tif"
     (notice,) = _bands_apart(matched(scene, model, surface, reference, search=60.0, points=500))
     found = {one["band"]: np.array(one["shift_px"]) for one in notice.fields["bands"]}

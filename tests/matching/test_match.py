@@ -17,7 +17,7 @@ from ortho_pipeline.errors import CrsError, OrthoError
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 #: What the default run has: grounds that are there without real images.
 PLAIN = Setting(side=500, seed=3, error=12.0)
@@ -100,7 +100,7 @@ def test_stripes_of_a_detector_do_not_attract_matches(tmp_path):
 
 def test_matches_do_not_depend_on_threads(tmp_path):
     case = Case(PLAIN, tmp_path).write()
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     one, two = (
         matches(case.scene_file, case.model, surface, [case.reference_file], search=30.0, points=40, threads=count)
         for count in (1, 2)
@@ -115,7 +115,7 @@ def test_chips_show_the_same_where_it_was_found(tmp_path):
     # A reference that errs from place to place, or all chips would lie within a hundredth of a pixel of each other.
     case = Case(replace(PLAIN, reference_sigma=0.5, reference_length=80.0), tmp_path).write()
     seen = matching.View(
-        Intensity(RasterSource(case.scene_file)), case.model, Surface.open(case.dem_file, "ellipsoid")
+        Intensity(RasterSource(case.scene_file)), case.model, open_dem(case.dem_file, "ellipsoid")
     )  # fmt: skip
     settings = matching.MatchSettings(search=30.0, points=60, threads=1)
     found = matching.match(seen, matching.open_references([case.reference_file]), settings)
@@ -144,7 +144,7 @@ COARSE = Setting(side=360, seed=3, error=12, dem_sigma=20, dem_length=60, off_na
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
 def test_a_scene_that_looks_sideways_is_matched_over_a_coarse_dem(tmp_path, seed):
     case = Case(replace(COARSE, seed=seed), tmp_path).write()
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     found = matches(
         case.scene_file, case.model, surface, [case.reference_file], search=case.search, dem_sigma=20.0, points=100
     )
@@ -266,7 +266,7 @@ def test_the_scene_itself_is_no_reference(tmp_path):
 
 def test_a_scene_of_one_ground_says_so_in_words(tmp_path):
     case = Case(replace(PLAIN, ground="water"), tmp_path).write()
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     with pytest.raises(OrthoError) as caught:
         matches(case.scene_file, case.model, surface, [case.reference_file], search=30.0, points=100)
     assert str(caught.value.remedy)

@@ -22,6 +22,7 @@ from ortho_pipeline.models.frame.camera import TOPOCENTRIC, FrameCamera
 from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 pytestmark = pytest.mark.realdata
 FRAMES = ("05_0182", "05_0184", "06_0251", "06_0253")
@@ -49,7 +50,7 @@ class QuickBird:
     @property
     def surface(self) -> Surface:
         # Its vertical CRS is EGM2008, whose grid is not everywhere; EGM96 is within a metre of it there.
-        return Surface.open(self.data / "orthority" / "ngi" / "dem.tif", "egm96", override=True)
+        return open_dem(self.data / "orthority" / "ngi" / "dem.tif", "egm96", override=True)
 
     @property
     def points(self) -> Points:

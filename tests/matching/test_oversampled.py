@@ -14,7 +14,7 @@ from trials import matches
 
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 #: As much noise as structure: an enlarged scene has it in wider spots than it has pixels.
 NOISY = Setting(side=360, seed=3, error=12.0, scene=View(noise=0.2), reference=View(noise=0.15))
@@ -66,7 +66,7 @@ class Found:
 
 
 def matched(case: Case, scene: Path, reference: Path, times: int) -> Found:
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     points = matches(
         scene, case.model.scaled(1 / times), surface, [reference], search=case.search, points=200
     )  # fmt: skip

@@ -15,7 +15,7 @@ from ortho_pipeline.commands.control.matching import _partial
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 PLAIN = Setting(side=500, seed=3, error=12.0)
 
@@ -47,7 +47,7 @@ def displaced(case: Case, share: float, by: int, path: Path) -> Path:
 
 
 def matched(case: Case, reference: Path, search: float = 40.0) -> matching.Matches:
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     view = matching.View(Intensity(RasterSource(case.scene_file)), case.model, surface)
     return matching.match(view, matching.open_references([reference]), matching.MatchSettings(search, 80))
 

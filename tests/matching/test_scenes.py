@@ -17,7 +17,7 @@ from scenes import LEVEL, MIDDLE, UTM, Case, Setting, Sky, View
 from skimage.registration import phase_cross_correlation
 
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 QUIET = View(noise=0.0)
 SMALL = Setting(side=280, scene=QUIET, reference=QUIET, error=7.0, relief=5.0)
@@ -111,7 +111,7 @@ def test_the_delivered_model_errs_as_stated(tmp_path, kind):
 def test_the_dem_is_the_relief_with_the_errors_stated(tmp_path):
     case = Case(replace(SMALL, dem_sigma=3.0, dem_length=25.0, dem_noise=1.0), tmp_path)
     case.write_dem()
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     image = np.random.default_rng(1).uniform(0, 1, (4000, 2)) * case.frame
     ground = case.ground_of(image)
     errors = surface.heights(ground[:, :2], UTM) - ground[:, 2]
@@ -119,7 +119,7 @@ def test_the_dem_is_the_relief_with_the_errors_stated(tmp_path):
     assert np.hypot(3.0, 0.5) * 0.7 < errors.std() < np.hypot(3.0, 1.0) * 1.3
     exact = Case(SMALL, tmp_path)
     exact.write_dem()
-    surface = Surface.open(exact.dem_file, "ellipsoid")
+    surface = open_dem(exact.dem_file, "ellipsoid")
     np.testing.assert_allclose(surface.heights(ground[:, :2], UTM), ground[:, 2], atol=1e-3)
 
 

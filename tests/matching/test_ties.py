@@ -27,6 +27,8 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.flat import FlatSurface
 
 Array = NDArray[np.float64]
 
@@ -56,7 +58,7 @@ def looks(folder: Path, angles: list[float], **changes: object) -> tuple[list[Lo
     for look in found:
         write_raster(look.scene_file, look.rendered(), "uint16", rpc=look.model)
     found[0].write_dem()
-    surface = Surface.open(found[0].dem_file, "ellipsoid")
+    surface = open_dem(found[0].dem_file, "ellipsoid")
     return found, [look.view(surface) for look in found]
 
 
@@ -166,7 +168,7 @@ def test_ties_of_scenes_of_different_resolution(tmp_path):
 def test_ties_are_found_where_heights_are_wrong_by_more_than_a_chip(tmp_path):
     """A plane at the wrong height under hills of 15 m: matches lie up to 80 px along the line of sight."""
     scenes, views = looks(tmp_path, [-20.0, 20.0], relief=15.0, margin=60.0)
-    views = [replace(view, surface=Surface.constant(340.0)) for view in views]
+    views = [replace(view, surface=FlatSurface(340.0)) for view in views]
     ties = tie(views, TieSettings(search=25.0, points=120, dem_sigma=25.0))
     across, _, _ = apart(*scenes, ties, (0, 1))
     # Slopes without a DEM shear chips; on the steep ones nothing is found.

@@ -25,6 +25,8 @@ from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.rays import meet_surface
 
 pytestmark = pytest.mark.realdata
@@ -42,15 +44,15 @@ def pleiades(real: Path, name: str) -> tuple[dict[str, Path], dict[str, RPC], Su
         images = {k: real / "s2p" / "input_triplet" / f"img_0{k}.tif" for k in "123"}
         models = {k: rpc_of_dataset(gdal.Open(str(path)))[0] for k, path in images.items()}
         # A hill of 85 to 260 m, taken to be flat: heights are wrong by up to 130 m.
-        return images, models, Surface.constant(210.0)
+        return images, models, FlatSurface(210.0)
     folder, names = real / "shareloc", {"ventoux": ("left_image", "right_image"), "gizeh": ("img1", "img2")}[name]
     images = {one: folder / "image" / f"phr_{name}" / f"{one}.tif" for one in names}
     models = {one: shifted(read_rpc(folder / "rpc" / f"phr_{name}" / f"{one}.geom"), images[one]) for one in names}
     if name == "ventoux":
         dem = folder / "dtm" / "srtm_ventoux" / "srtm90_resampled_UTM31" / "N44E005_UTM.tif"
-        return images, models, Surface.open(dem, "egm96", override=True)
+        return images, models, open_dem(dem, "egm96", override=True)
     # No DEM: the plateau of the pyramids lies 60 m above the sea, and the geoid 15 m above the ellipsoid.
-    return images, models, Surface.constant(75.0)
+    return images, models, FlatSurface(75.0)
 
 
 def tied(images: Mapping[str, Path], models: Mapping[str, RPC], surface: Surface, dem_sigma: float) -> Ties:

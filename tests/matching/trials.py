@@ -23,6 +23,7 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 Array = NDArray[np.float64]
 #: A model is wrong if it is off by more than this (px) and by more than so many of its own sigmas.
@@ -97,7 +98,7 @@ def tried(case: Case, references: Sequence[Path] = (), search: float | None = No
     setting = case.setting
     # The errors of the reference differ from place to place: residuals tell of them. What is stated is that of all.
     sigmas = {"dem_sigma": float(np.hypot(setting.dem_sigma, setting.dem_noise))}
-    surface = Surface.open(case.dem_file, "ellipsoid")
+    surface = open_dem(case.dem_file, "ellipsoid")
     try:
         points = matches(
             case.scene_file, case.model, surface, references or [case.reference_file], search=search or case.search,

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_measure import planning
+from ortho_measure.block.session import open_block_session
+from ortho_measure.project import Project
+from ortho_measure.session import open_session
+from ortho_studies.simulation.scanner import LineScanner
+from ortho_studies.simulation.terrain import Landscape, Terrain
 from osgeo import gdal, osr
 
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.measure import planning
-from ortho_pipeline.measure.block.session import open_block_session
-from ortho_pipeline.measure.project import Project
-from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
-from ortho_pipeline.simulation.scanner import LineScanner
-from ortho_pipeline.simulation.terrain import Landscape, Terrain
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 _PIXEL, _SIDE = 2.5, 1360

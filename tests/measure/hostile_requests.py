@@ -15,11 +15,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from ortho_measure.project import Project
+from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.server import application
 from starlette.testclient import TestClient
-
-from ortho_pipeline.measure.project import Project
-from ortho_pipeline.measure.serving.entry import Entry
-from ortho_pipeline.measure.serving.server import application
 
 HOST, WINDOW = "127.0.0.1:4321", "window-of-tests"
 #: Values of other kinds, sizes and meanings than a page sends. Texts in <> are written into the JSON as they are.

@@ -7,6 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortho_measure.block.left_out import LeftOut
+from ortho_measure.block.planning import BlockGrid, next_of_block
+from ortho_measure.block.solution import figures, solve
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
@@ -15,12 +19,8 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
-from ortho_pipeline.measure.block.left_out import LeftOut
-from ortho_pipeline.measure.block.planning import BlockGrid, next_of_block
-from ortho_pipeline.measure.block.solution import figures, solve
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.simulation.scanner import LineScanner
 
 LABELS = ("fore", "nadir", "aft")
 _BIAS = {"fore": (4.0, -3.0), "nadir": (-6.0, 2.0), "aft": (1.0, 5.0)}

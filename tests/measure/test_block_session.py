@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortho_measure.block.session import BlockSession, open_block_session
+from ortho_measure.serving.guard import MAX_BODY
+from ortho_measure.serving.tiles import Tiles
 
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.measure.block.session import BlockSession, open_block_session
-from ortho_pipeline.measure.serving.guard import MAX_BODY
-from ortho_pipeline.measure.serving.tiles import Tiles
 from ortho_pipeline.options import BlockOptions, MatchOptions, SurfaceOptions
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -253,8 +253,8 @@ def test_what_several_images_have_not_is_refused_in_a_line(block_client: Any, wh
 @pytest.fixture(scope="module")
 def block_client(stereo: Any, tmp_path_factory: pytest.TempPathFactory):
     testclient = pytest.importorskip("starlette.testclient", reason="the extra 'measure' is not installed")
-    from ortho_pipeline.measure.serving.entry import Entry
-    from ortho_pipeline.measure.serving.server import application
+    from ortho_measure.serving.entry import Entry
+    from ortho_measure.serving.server import application
 
     output = tmp_path_factory.mktemp("block") / "p.geojson"
     session = open_block_session([SAMPLE / "scene.tif", stereo.path], output, surface=SURFACE)

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from ortho_pipeline.measure.serving.entry import leading_to
+from ortho_measure.serving.entry import leading_to
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'measure' is not installed")

@@ -18,9 +18,8 @@ from typing import Any
 from urllib import request
 
 import pytest
-
-from ortho_pipeline.measure.serving.listener import MOST, PATIENCE, Listener
-from ortho_pipeline.measure.serving.log import repetitions_counted
+from ortho_measure.serving.listener import MOST, PATIENCE, Listener
+from ortho_measure.serving.log import repetitions_counted
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 DESCRIPTORS, STRANGERS = 256, 300
@@ -127,7 +126,7 @@ def test_only_this_machine_connects() -> None:
 
 
 def test_the_number_of_connections_leaves_descriptors_for_files() -> None:
-    code = "from ortho_pipeline.measure.serving.listener import _affordable; print(_affordable())"
+    code = "from ortho_measure.serving.listener import _affordable; print(_affordable())"
     most = [
         int(subprocess.run(["bash", "-c", f'ulimit -n {limit}; exec "$0" -c "$1"', sys.executable, code],
                            check=True, capture_output=True, text=True).stdout)

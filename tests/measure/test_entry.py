@@ -15,8 +15,7 @@ from pathlib import Path
 from urllib import error, request
 
 import pytest
-
-from ortho_pipeline.measure.serving.entry import private_file
+from ortho_measure.serving.entry import private_file
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 BROWSER = """#!{python}

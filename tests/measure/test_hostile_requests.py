@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
 
 from hostile_requests import check
+from ortho_measure.journal import REST, Journal
+from ortho_measure.project import Project
+from ortho_measure.session import Session
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.measure.journal import REST, Journal
-from ortho_pipeline.measure.project import Project
-from ortho_pipeline.measure.session import Session
 
 GROUND = [33.35, 37.25, 900.0]
 MARK = {"id": "A", "image": [400.0, 500.0], "ground": GROUND, "ground_from": "reference"}

@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
+from ortho_measure.journal import Journal
+from ortho_measure.marks import History
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.measure.journal import Journal
-from ortho_pipeline.measure.marks import History
 
 
 def put(name: str, column: float = 10.25) -> dict:
@@ -93,8 +93,8 @@ WRITES = """
 import sys
 from pathlib import Path
 from ortho_pipeline.files import write_json
-from ortho_pipeline.measure.journal import Journal
-from ortho_pipeline.measure.marks import History
+from ortho_measure.journal import Journal
+from ortho_measure.marks import History
 folder = Path(sys.argv[1])
 journal, history = Journal(folder / "p.geojson.journal"), History()
 for action in journal.actions:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_measure.marks import History, Mark, mark_of, marks_of
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_json
-from ortho_pipeline.measure.marks import History, Mark, mark_of, marks_of
 from ortho_pipeline.points import read_points
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"

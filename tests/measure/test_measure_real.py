@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_measure.session import open_session
 from test_match_real import QuickBird
 
-from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
 
 pytestmark = [pytest.mark.realdata, pytest.mark.slow]

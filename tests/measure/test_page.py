@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).resolve().parents[2] / "ortho_pipeline/measure/page"
+PAGE = Path(__file__).resolve().parents[2] / "plugins/ortho_measure/page"
 SCRIPTS = {name: (PAGE / name).read_text(encoding="utf-8") for name in ("app.js", "views.js", "table.js")}
 
 
@@ -22,7 +22,7 @@ def test_every_element_that_a_script_names_is_in_the_page() -> None:
 
 
 def test_everything_that_the_page_asks_is_answered() -> None:
-    from ortho_pipeline.measure.serving.server import ASKED
+    from ortho_measure.serving.server import ASKED
 
     asked = {name for text in SCRIPTS.values() for name in re.findall(r"ask(?:\)\()?\(?'(\w+)'", text)}
     assert asked <= set(ASKED)

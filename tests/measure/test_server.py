@@ -13,18 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ortho_measure.project import Project
+from ortho_measure.session import open_session
 
 from ortho_pipeline import commands
-from ortho_pipeline.measure.project import Project
-from ortho_pipeline.measure.session import open_session
 from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 
 pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
+from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.guard import MAX_BODY, REPORT_POLICY
+from ortho_measure.serving.server import PAGE, application
 from starlette.testclient import TestClient
-
-from ortho_pipeline.measure.serving.entry import Entry
-from ortho_pipeline.measure.serving.guard import MAX_BODY, REPORT_POLICY
-from ortho_pipeline.measure.serving.server import PAGE, application
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 FOLDER, HOST, WINDOW = "a-folder-of-tests", "127.0.0.1:4321", "window-one"

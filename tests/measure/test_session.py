@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ortho_measure.serving.tiles import Tiles
+from ortho_measure.session import Session, open_session
 
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.measure.serving.tiles import Tiles
-from ortho_pipeline.measure.session import Session, open_session
 from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"

@@ -376,7 +376,7 @@ def test_rfm3_with_40_points_is_no_catastrophe(ridge, sets):
         points = points.with_roles(np.where(np.arange(240) < 40, "control", "check"))
         dlt = fit_family("dlt", points, size=SIZE)
         rfm = fit_family("rfm3", points, size=SIZE, ridge=ridge)
-        assert rfm.rmse("check")["total"] < 2 * dlt.rmse("check")["total"]
+        assert rfm.rmse("check").total < 2 * dlt.rmse("check").total
         assert any(text.startswith("unstable") for text in rfm.warnings)
         assert rfm.effective_parameters < 40
         assert rfm.degrees_of_freedom == pytest.approx(80 - rfm.effective_parameters)
@@ -430,7 +430,7 @@ def test_prune_takes_out_what_is_not_there():
         assert {r.name for r in pruned.removed}.isdisjoint(pruned.fit.param_names)
         assert all(r.p > 0.01 and abs(r.t) < 3 for r in pruned.removed)
         assert pruned.fit.redundancy == 120 - len(pruned.fit.param_names)
-        assert pruned.fit.rmse("loo")["total"] < fit_family(name, points, size=SIZE).rmse("loo")["total"]
+        assert pruned.fit.rmse("loo").total < fit_family(name, points, size=SIZE).rmse("loo").total
         check_sensor_model(pruned.fit.model, points.ground)
 
 
@@ -467,4 +467,4 @@ def test_a_rejected_point_stays_out_when_pruned():
 
 
 def test_a_thousand_points_are_all_left_out_in_turn():
-    assert fit_family("rfm3", make_points(1000)).rmse("loo")["n"] == 1000
+    assert fit_family("rfm3", make_points(1000)).rmse("loo").n == 1000

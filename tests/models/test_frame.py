@@ -312,5 +312,5 @@ def test_map_frame_is_worse_over_a_large_scene():
     truth = satellite(8, 12)
     points = measured(truth, 44)
     in_map = fit(resect(points, BILSAT, map_crs="EPSG:32636"), points, robust=False)
-    assert 0.01 < in_map.rmse("control")["total"] < 2.0
-    assert fit(resect(points, BILSAT), points, robust=False).rmse("control")["total"] < 1e-6
+    assert 0.01 < in_map.rmse("control").total < 2.0
+    assert fit(resect(points, BILSAT), points, robust=False).rmse("control").total < 1e-6

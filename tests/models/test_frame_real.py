@@ -20,6 +20,7 @@ from ortho_pipeline.models.frame.camera import MAP, TOPOCENTRIC, FrameCamera
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.rays import meet_surface
 
 pytestmark = pytest.mark.realdata
@@ -84,7 +85,7 @@ def test_ngi_camera_stands_where_it_is_said_to(real, tmp_path, strip):
 @pytest.mark.slow
 def test_ngi_orthos_of_side_lapping_frames_agree(real, tmp_path):
     folder = real / "orthority"
-    surface = Surface.open(folder / "ngi" / "dem.tif", "egm96", override=True)
+    surface = open_dem(folder / "ngi" / "dem.tif", "egm96", override=True)
     crs = parse_crs((folder / "io" / "ngi_xyz_opk.prj").read_text().strip())
     grid = Grid.of_extent(crs, (-60000, -3735000, -53000, -3724000), (5, 5))
     orthos = {
@@ -153,7 +154,7 @@ def test_odm_orientations_are_those_given_and_project_as_opensfm_does(real):
 
 def test_odm_orthos_agree(real, tmp_path):
     folder = real / "orthority"
-    surface = Surface.open(folder / "odm" / "odm_dem" / "dsm.tif", "ellipsoid")
+    surface = open_dem(folder / "odm" / "odm_dem" / "dsm.tif", "ellipsoid")
     grid = Grid.of_extent(parse_crs("EPSG:32651"), (292600, 2730920, 292880, 2731180), (0.2, 0.2))
     # Cameras 80 m above trees: the heights of a block are more than its lattice's polynomial follows to 0.1 px.
     orthos = {
@@ -203,7 +204,7 @@ def test_a_drone_scene_is_usable_by_default(real, tmp_path):
     assert 40 < low < 80 < high < 125
     step, _ = report["ortho"]["resolution"]
     assert 0.11 <= step <= 0.18
-    surface = Surface.open(folder / "odm_dem" / "dsm.tif", "ellipsoid")
+    surface = open_dem(folder / "odm_dem" / "dsm.tif", "ellipsoid")
     rays = np.random.default_rng(2).uniform(0, 1, (4000, 2)) * (1368, 912)
     met = np.isfinite(meet_surface(saved, rays, surface)).all(axis=1).mean()
     assert report["surface"]["coverage"] == pytest.approx(met, abs=0.03)

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from measured import points_of
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.fit import fit
@@ -26,7 +27,6 @@ from ortho_pipeline.models.pushbroom.metadata import mounting_of_angles, pushbro
 from ortho_pipeline.models.pushbroom.rotations import angles_of, rotations
 from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
 from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_angles, rotations_of_quaternions
-from ortho_pipeline.simulation.scanner import LineScanner
 from ortho_pipeline.testing import check_sensor_model
 
 FOCAL, PIXEL = 1.945, 7e-6

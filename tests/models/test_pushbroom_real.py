@@ -19,11 +19,11 @@ from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_files import read_rpc_text
 from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.models.pushbroom.splines import SplineForm
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor_model
 
 SCENE = "P1BP--2018122638935449CP"

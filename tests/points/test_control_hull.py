@@ -59,9 +59,9 @@ def test_a_missing_corner_is_named_and_not_warned_of():
 
 def test_the_hull_is_that_of_the_report():
     found = control_hull(np.array([(0, 0), (500, 0), (500, 800), (0, 800.0)]), SIZE)
-    assert found == {"share": 0.5, "n": 4, "outline": found["outline"]}
+    assert (found.share, found.n) == (0.5, 4)
     assert control_hull(np.zeros((2, 2)), SIZE) is None
-    assert control_hull(np.array([(0, 0), (1, 1), (2, 2.0)]), SIZE)["outline"] == []
+    assert control_hull(np.array([(0, 0), (1, 1), (2, 2.0)]), SIZE).outline == ()
 
 
 def left_half(tiny, tmp_path):

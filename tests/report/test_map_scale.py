@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.hookspecs import Scene
@@ -14,8 +16,6 @@ from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.report.document import build_report
 from ortho_pipeline.report.map_scale import judge, map_scale, nmas_limit
 from ortho_pipeline.report.records import SceneReport
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)

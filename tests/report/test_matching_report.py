@@ -13,6 +13,8 @@ import jsonschema
 import numpy as np
 import pytest
 from defusedxml import ElementTree
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from osgeo import gdal
 
 from ortho_pipeline.commands.control.matching import Matched, Search
@@ -29,8 +31,6 @@ from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.plots import plots
 from ortho_pipeline.report.records import SceneReport
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs" / "report.schema.json").read_text())
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
@@ -91,7 +91,7 @@ def case(count: int = 40, rejected: int = 6, *, reference: str = "ortho.tif", **
     )
     done = fit(ImageCorrection(CAMERA, "shift", (500.0, 500.0), np.zeros(6)), points, name="camera+shift")
     scene = Scene("simulated", "folder/scene.tif", 1000, 1000, {"camera": CAMERA}, "from a seed", {})
-    return Case(matches, done, reports.build_report(scene=scene, fit=done, matching=matched.to_json()))
+    return Case(matches, done, reports.build_report(scene=scene, fit=done, matching=matched.tested_by(done)))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import base64
 import importlib
 import re
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -63,13 +64,10 @@ def test_ipython_shows_what_is_displayed():
 
 
 def test_names_from_files_are_text_and_not_html():
-    from ortho_pipeline.report.notebook.tables import fit_html, text_html
+    from ortho_pipeline.report.notebook.tables import text_html
 
-    document = {
-        "model": "<b>", "rmse": {"control": {"n": 1, "col": 0.1, "row": 0.1, "total": 0.14}, "check": None},
-        "parameters": {}, "rejected": [{"id": "<script>", "reason": "&"}], "warnings": [],
-    }  # fmt: skip
-    html = fit_html(document)
+    found = op.open_scene(SAMPLE / "scene.tif").fit(op.read_points(SAMPLE / "gcps.geojson"), "shift")
+    html = op.html(replace(found, model_name="<b>", rejected=(("<script>", "&"),)))
     assert "<script>" not in html
     assert "&lt;b&gt;" in html
     assert text_html("a < b") == "<pre>a &lt; b</pre>"

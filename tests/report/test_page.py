@@ -15,6 +15,8 @@ import numpy as np
 import pyproj
 import pytest
 import shapely
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from osgeo import gdal
 
 from ortho_pipeline.display.drawing import Drawing
@@ -33,8 +35,6 @@ from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
 from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, SceneReport
 from ortho_pipeline.report.wording import NO_SCALE, UNKNOWN, few_check_points, fitness, scale_rules, verdict
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))

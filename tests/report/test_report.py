@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 from defusedxml import ElementTree
+from ortho_studies.simulation.scanner import LineScanner, simulate_points
+from ortho_studies.simulation.terrain import Terrain
 from osgeo import gdal
 
 from ortho_pipeline.display.notices import Notice
@@ -30,8 +32,6 @@ from ortho_pipeline.report import document as report
 from ortho_pipeline.report.page import behaviour
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.report.wording import few_check_points
-from ortho_pipeline.simulation.scanner import LineScanner, simulate_points
-from ortho_pipeline.simulation.terrain import Terrain
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ortho_asp.cameras import adjusted, read_adjust, read_aster, read_tsai
+from ortho_csm.files import read_csm, write_csm
 from ortho_maxar.isd import read_isd_pushbroom
 from products import aster_text, isd_text, tsai_text
 from used import pixels, ran, used
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.csm import read_csm, write_csm
 from ortho_pipeline.geodesy.ellipsoid import geocentric, geodetic, meet_height
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import Pushbroom
-from ortho_pipeline.plugins import open_scene
 
 ASP = Path("sensors", "asp_plot")
 SIZE = (60, 50)

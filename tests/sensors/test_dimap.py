@@ -32,11 +32,11 @@ from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.light import LightPath
 from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.testing import check_sensor_model
 

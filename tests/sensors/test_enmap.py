@@ -14,8 +14,8 @@ from seeds import SIZE, rpc
 from used import pixels, used
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import RPC
-from ortho_pipeline.plugins import open_scene
 
 REAL = Path(
     "sensors", "rpcm", "ENMAP01-____L1B-DT0000001011_20220609T081225Z_001_V010111_20230119T143357Z-METADATA.XML"

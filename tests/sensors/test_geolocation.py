@@ -14,8 +14,8 @@ from used import pixels, ran
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene
 
 SIZE = (120, 96)
 

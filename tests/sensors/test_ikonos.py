@@ -22,9 +22,9 @@ from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc, write_rpb, write_rpc_txt
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.host import Host
 from ortho_pipeline.models import ImageCorrection, MapPlane, Pieces
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import Host
 from ortho_pipeline.testing import check_sensor, check_sensor_model
 
 UTM = "EPSG:32639"
@@ -638,7 +638,7 @@ def test_components_share_one_adjustment(tmp_path, correction):
     first, second = (commands.fit(image, PointOptions(gcps=gcps, correction=correction)).fit for image in images)
     assert first.used.sum() == second.used.sum() == 12
     assert isinstance(first.model.model, Pieces)
-    np.testing.assert_allclose(first.rmse("control")["total"], second.rmse("control")["total"], rtol=1e-6)
+    np.testing.assert_allclose(first.rmse("control").total, second.rmse("control").total, rtol=1e-6)
     # One correction of the whole plane: seen from either component it moves the same place alike.
     places = np.array([[20.0, 30.0], [380.0, 200.0], [1700.0, 100.0]])
     offset = np.array([1600.0, -37.0])

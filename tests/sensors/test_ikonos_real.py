@@ -177,7 +177,7 @@ def relief(model: Any, image: np.ndarray, low: float, high: float) -> np.ndarray
 
 
 def test_relief_from_the_real_angles_is_that_of_the_real_rpc(blosseville):
-    """Docs/formats/ikonos.md reports these numbers."""
+    """The page docs/engineering/block-adjustment.md reports these numbers."""
     scene, rpc = blosseville
     geo = scene.model
     assert isinstance(geo, MapPlane)

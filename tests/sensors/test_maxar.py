@@ -19,12 +19,12 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import RPC, Pushbroom
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.light import LightPath
 from ortho_pipeline.models.polynomials import terms_of
 from ortho_pipeline.models.rpc_box import RPC_TERMS
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor_model
 
 ASP = Path("sensors", "asp_plot")

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from ortho_orbview3.label import read_label
 from ortho_orbview3.product import read_product
-from ortho_orbview3.simulation import write_product
+from ortho_studies.orbview3.simulation import write_product
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -21,9 +21,9 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.spatial.correlation import in_metres
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import PointOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.testing import check_sensor
@@ -143,7 +143,7 @@ def test_a_small_family_is_far_off_on_an_original_scene(delivery):
     for family in ("affine14", "affine12", "affine3d", "dlt"):
         options = PointOptions(f"{stem}_gcps.csv", fit_model=family)
         found = commands.fit(f"{stem}.tif", options)
-        totals[family] = found.fit.rmse("control")["total"] * 24
+        totals[family] = found.fit.rmse("control").total * 24
         said = [text for text in found.warnings if "original scene" in text]
         assert said == [text for name, text in ortho_orbview3.UNSUITED.items() if name == family]
     # Also when the search for gross errors has taken the worst points out.

@@ -15,8 +15,8 @@ from osgeo import gdal
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.exchange.rpc_files import rpc_metadata
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import RPC
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor
 
 pytestmark = pytest.mark.realdata

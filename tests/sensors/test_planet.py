@@ -15,9 +15,9 @@ from used import pixels, ran, used
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_files import read_rpc_text, write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.plugins import open_scene
 
 ITEM = "20200101_081500_12_2401"
 

@@ -15,7 +15,7 @@ from used import pixels, used
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric, geodetic
-from ortho_pipeline.plugins import open_scene
+from ortho_pipeline.host import open_scene
 
 SIZE, CRS = (60, 50), "EPSG:32633"
 STEM = "CAPELLA_C02_SM_GEO_HH_20210101000000_20210101000003"

@@ -21,9 +21,9 @@ from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric, meet_height
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene
 from ortho_pipeline.testing import check_sensor_model
 
 SIZE = (60, 50)

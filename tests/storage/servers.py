@@ -25,8 +25,8 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.commands import rectify
-from ortho_pipeline.files.storage.objects import Objects
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
+from ortho_pipeline.stores.objects import Objects
 
 
 @contextmanager

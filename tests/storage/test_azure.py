@@ -16,8 +16,8 @@ import pytest
 from servers import installed_server, on_a_faulty_way, rectify_within
 
 from ortho_pipeline.errors import StorageError
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import PART, Conflict, Objects
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import PART, Conflict, Objects
 
 #: Account and key of every Azurite, as its documentation has them.
 ACCOUNT = "devstoreaccount1"

@@ -21,13 +21,13 @@ import pytest
 from osgeo import gdal
 from servers import rectify_within, running
 
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.shared.leases import Lease, Leases, Lost
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import PART, Conflict, Objects
 from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import PART, Conflict, Objects
 
 XML = 'xmlns="http://doc.s3.amazonaws.com/2006-03-01"'
 
@@ -164,7 +164,7 @@ def test_leases_are_renewed_and_taken_over(google: GoogleStore) -> None:
     assert isinstance(taken, Lease)
     with pytest.raises(Lost):
         lease.renew()
-    taken.finish(Record("s", "", "failed"))
+    taken.finish(RunRecord(name="s", key="", status="failed"))
     assert mine.finished() == {"a"}
 
 

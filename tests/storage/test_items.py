@@ -17,8 +17,9 @@ from ortho_pipeline.commands import fit, info, rectify
 from ortho_pipeline.commands.stac.given import resolved
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_files import write_rpc_txt
-from ortho_pipeline.files.stac.item import is_item, item_of, read_item
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.stores.stac.item import item_of, read_item
 
 gdal.UseExceptions()
 TIFF, TEXT = "image/tiff; application=geotiff; profile=cloud-optimized", "text/plain"
@@ -176,13 +177,12 @@ def test_an_item_leads_to_no_files_elsewhere_on_this_machine(href: str, tmp_path
 
 
 def test_what_may_be_an_item_is_told_by_its_name() -> None:
-    assert is_item("a/b.json")
-    assert is_item(Path("b.geojson"))
-    assert is_item("https://h/stac/v1/collections/c/items/S_1")
-    assert is_item("https://h/one.json?key=1")
-    assert not is_item("s3://h/one.tif")
-    assert not is_item("auto")
-    assert not is_item(None)
+    assert Location("a/b.json").is_item
+    assert Location(Path("b.geojson")).is_item
+    assert Location("https://h/stac/v1/collections/c/items/S_1").is_item
+    assert Location("https://h/one.json?key=1").is_item
+    assert not Location("s3://h/one.tif").is_item
+    assert not Location("auto").is_item
 
 
 def test_answers_that_fail_in_passing_are_asked_for_again(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from dying import SOURCE
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, together, write_text
-from ortho_pipeline.files.storage import kept
-from ortho_pipeline.files.storage.objects import Content
+from ortho_pipeline.stores import kept
+from ortho_pipeline.stores.objects import Content
 
 ADDRESS = "https://example.org/cells/N37E033.tif"
 DATA = b"heights"
@@ -43,8 +43,8 @@ def names(folder: Path) -> list[str]:
 #: Fetches a file and dies at the k-th call of the system that changes the folder.
 DYING = f"""{SOURCE}
 import hashlib, sys
-from ortho_pipeline.files.storage import kept
-from ortho_pipeline.files.storage.objects import Content
+from ortho_pipeline.stores import kept
+from ortho_pipeline.stores.objects import Content
 def fetched(path):
     path.write_bytes(b"heights")
     return Content(7, hashlib.sha256(b"heights").hexdigest(), (), None)

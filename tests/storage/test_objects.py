@@ -24,10 +24,10 @@ from servers import FaultyWay, installed_server, moto_server, on_a_faulty_way, r
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import export, rectify
 from ortho_pipeline.errors import InputError, OrthoError, StorageError
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import Conflict, Objects
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import Conflict, Objects
 
 gdal.UseExceptions()
 QUICK: dict[str, Any] = {

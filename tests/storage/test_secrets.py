@@ -16,8 +16,8 @@ from servers import PublicFolder, moto_server, on_a_faulty_way, serving
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.files.storage import objects
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.stores import objects
+from ortho_pipeline.stores.objects import Objects
 
 SECRET = "5ecretValue"
 KEYS = {"AWS_ACCESS_KEY_ID": f"AKIA{SECRET}1", "AWS_SECRET_ACCESS_KEY": f"{SECRET}2", "AWS_SESSION_TOKEN": f"{SECRET}3"}

@@ -13,7 +13,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.surface.accuracy import check_dem, read_check_heights, slopes_at
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 
 UTM = "EPSG:32634"
 WEST, NORTH, STEP, SIDE = 500_000.0, 4_000_000.0, 10.0, 300
@@ -54,7 +54,7 @@ def made(tmp_path_factory):
 
 
 def opened(made, **options):
-    return Surface.open(made / "dem.tif", Vertical.parse("egm96"), **options)
+    return open_dem(made / "dem.tif", Vertical.parse("egm96"), **options)
 
 
 def test_the_error_of_each_class_of_slope_is_found(made):

@@ -24,14 +24,14 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.commands.heights.automatic import extent_under
 from ortho_pipeline.errors import CoverageError, DatumError, InputError, StorageError
-from ortho_pipeline.files.storage import kept, objects
+from ortho_pipeline.host import open_scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
-from ortho_pipeline.plugins import open_scene
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.stores import kept, objects
 from ortho_pipeline.surface.cells import sources
 from ortho_pipeline.surface.cells.assembled import open_cells
 from ortho_pipeline.surface.cells.copernicus import Cell, Extent, cells_of_list, columns_at, extent_of
 from ortho_pipeline.surface.cells.sources import source_of
+from ortho_pipeline.surface.dem import open_dem
 
 gdal.UseExceptions()
 EGM2008 = Path("/usr/share/proj/us_nga_egm08_25.tif")
@@ -106,7 +106,7 @@ def test_the_extent_of_a_ring_runs_over_the_antimeridian_and_around_a_pole() -> 
 def test_heights_from_a_bucket_are_those_of_a_local_mosaic(bucket: PublicFolder, geoid: str, tmp_path: Path) -> None:
     paths = sorted(str(path) for path in bucket.folder.glob("*/*.tif"))
     gdal.BuildVRT(str(bucket.folder / "all.vrt"), paths).FlushCache()
-    local = Surface.open(bucket.folder / "all.vrt", geoid, roots=[bucket.folder])
+    local = open_dem(bucket.folder / "all.vrt", geoid, roots=[bucket.folder])
     dem = found(bucket.address, Extent(19.5, -30.5, 20.5, -29.5), geoid)
     assert dem.shape == local.shape
     np.testing.assert_allclose(dem.grid.crs_from_pixel, local.grid.crs_from_pixel, rtol=1e-14)
@@ -345,7 +345,7 @@ def test_what_is_kept_is_checked_and_heals(bucket: PublicFolder, geoid: str) -> 
 
 _FETCHING = """
 import sys
-from ortho_pipeline.files.storage import kept, objects
+from ortho_pipeline.stores import kept, objects
 store = objects.Objects(sys.argv[1], allow_network=True)
 print(kept.kept("dem", store.of(sys.argv[2]), lambda path: store.fetch(sys.argv[2], path, 10**9)))
 """

@@ -22,12 +22,12 @@ from ortho_pipeline.batch.runner import list_scenes, run
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import check, rectify
 from ortho_pipeline.errors import CoverageError, DatumError, InputError
-from ortho_pipeline.files.stac import collection as collections
-from ortho_pipeline.files.stac import item as stac_item
-from ortho_pipeline.files.stac.collection import Collection
-from ortho_pipeline.files.stac.item import item_of
-from ortho_pipeline.files.stac.places import boxes_of, meet, questions
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.stores.stac import collection as collections
+from ortho_pipeline.stores.stac import item as stac_item
+from ortho_pipeline.stores.stac.collection import Collection
+from ortho_pipeline.stores.stac.item import item_of
+from ortho_pipeline.stores.stac.places import boxes_of, meet, questions
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
 

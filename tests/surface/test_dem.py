@@ -23,8 +23,9 @@ from ortho_pipeline.geodesy.crs import GroundTransform, Vertical
 from ortho_pipeline.geodesy.datum import dem_unit
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import TILE, Tiles
+from ortho_pipeline.surface.dem import TILE, Tiles, open_dem
 from ortho_pipeline.surface.dem_file import DemFile
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.footprint import image_grid, lay
 from ortho_pipeline.surface.rays import meet_surface
 
@@ -75,7 +76,7 @@ def hills(rows: int = 60, columns: int = 80) -> np.ndarray:
 def test_a_dem_without_height_datum_is_refused(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "d.tif", hills())
     with pytest.raises(DatumError) as caught:
-        Surface.open(path)
+        open_dem(path)
     text = str(caught.value)
     assert str(path) in text
     for word in ("`surface.vertical`", "ellipsoid", "egm96", "egm2008", "EPSG:n", "grid file"):
@@ -90,12 +91,12 @@ def test_the_undulation_is_added_once(tmp_path: Path) -> None:
     place = np.array([[UTM_BOX[0] + 3050.0, UTM_BOX[1] - 2050.0]])
     lon, lat, _ = GroundTransform("EPSG:32735", "EPSG:4979")([[*place[0], 0]])[0]
     undulation = Vertical.parse("egm96").undulation([lon], [lat])[0]
-    base = Surface.open(plain, "ellipsoid").heights(place)[0]
+    base = open_dem(plain, "ellipsoid").heights(place)[0]
     assert base == pytest.approx(hills()[20, 30])
-    by_option = Surface.open(plain, "egm96").heights(place)[0]
-    by_file = Surface.open(declared).heights(place)[0]
-    both = Surface.open(declared, "egm96").heights(place)[0]
-    by_grid = Surface.open(plain, str(EGM96)).heights(place)[0]
+    by_option = open_dem(plain, "egm96").heights(place)[0]
+    by_file = open_dem(declared).heights(place)[0]
+    both = open_dem(declared, "egm96").heights(place)[0]
+    by_grid = open_dem(plain, str(EGM96)).heights(place)[0]
     assert by_option == pytest.approx(base + undulation, abs=0.002)
     assert by_option == by_file == both == pytest.approx(by_grid, abs=1e-9)
 
@@ -103,9 +104,9 @@ def test_the_undulation_is_added_once(tmp_path: Path) -> None:
 def test_an_option_against_a_coded_datum_needs_an_override(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "d.tif", hills(), "EPSG:32735+5773")
     with pytest.raises(DatumError, match="EGM96") as caught:
-        Surface.open(path, "ellipsoid")
+        open_dem(path, "ellipsoid")
     assert "override" in str(caught.value)
-    surface = Surface.open(path, "ellipsoid", override=True)
+    surface = open_dem(path, "ellipsoid", override=True)
     assert surface.heights([[UTM_BOX[0] + 50, UTM_BOX[1] - 50]])[0] == pytest.approx(300.0)
     assert surface.provenance["override"] is True
     assert surface.provenance["warnings"]
@@ -115,13 +116,13 @@ def test_an_option_against_a_coded_datum_needs_an_override(tmp_path: Path) -> No
 def test_a_declared_datum_whose_grid_is_missing(tmp_path: Path) -> None:
     path = write_dem(tmp_path / "d.tif", hills(), "EPSG:32735+3855")
     with pytest.raises(DatumError, match=r"us_nga_egm08_25\.tif") as caught:
-        Surface.open(path)
+        open_dem(path)
     assert "surface.vertical" in str(caught.value)
     assert "EGM2008" in str(caught.value)
     with pytest.raises(DatumError, match="override"):
-        Surface.open(path, "egm96")
+        open_dem(path, "egm96")
     # A grid file is how the declared geoid is brought along.
-    assert Surface.open(path, str(EGM96)).provenance["warnings"]
+    assert open_dem(path, str(EGM96)).provenance["warnings"]
 
 
 def test_the_grid_has_to_reach_the_dem(tmp_path: Path) -> None:
@@ -129,30 +130,30 @@ def test_the_grid_has_to_reach_the_dem(tmp_path: Path) -> None:
         tmp_path / "geoid.tif", np.full((20, 20), 30.0), "EPSG:4326", (0, 0.1, 0, 10, 0, -0.1), kind=gdal.GDT_Float32
     )
     with pytest.raises(DatumError, match="does not reach"):
-        Surface.open(write_dem(tmp_path / "d.tif", hills()), str(geoid))
+        open_dem(write_dem(tmp_path / "d.tif", hills()), str(geoid))
 
 
 @pytest.mark.parametrize(
     ("unit", "factor"), [("ft", 0.3048), ("US survey foot", 1200 / 3937), ("metre", 1.0), ("", 1.0)]
 )
 def test_units_end_at_the_border(tmp_path: Path, unit: str, factor: float) -> None:
-    surface = Surface.open(write_dem(tmp_path / "d.tif", hills(), unit=unit), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", hills(), unit=unit), "ellipsoid")
     assert surface.window(3, 4, 1, 1)[0, 0] == pytest.approx(hills()[4, 3] * factor)
 
 
 def test_feet_of_the_crs_and_units_that_contradict(tmp_path: Path) -> None:
     crs = "EPSG:32735+8228"
     feet = write_dem(tmp_path / "d.tif", hills(), crs)
-    surface = Surface.open(feet, "ellipsoid", override=True)
+    surface = open_dem(feet, "ellipsoid", override=True)
     assert surface.window(3, 4, 1, 1)[0, 0] == pytest.approx(hills()[4, 3] * 0.3048)
     with pytest.raises(DatumError, match="unit"):
-        dem_unit("x", "furlong", None)
+        dem_unit("furlong", None)
 
 
 @pytest.mark.parametrize("fill", ["bad", "nan", float("inf")])
 def test_fill_rules_are_checked(tmp_path: Path, fill: str | float) -> None:
     with pytest.raises(InputError, match=r"surface\.fill"):
-        Surface.open(write_dem(tmp_path / "d.tif", hills()), "ellipsoid", fill=fill)
+        open_dem(write_dem(tmp_path / "d.tif", hills()), "ellipsoid", fill=fill)
 
 
 # -- encodings
@@ -193,7 +194,7 @@ def encodings() -> dict[str, tuple[str, tuple[float, ...], bool]]:
 def test_one_plane_in_six_encodings(tmp_path: Path, name: str) -> None:
     crs, transform, point = encodings()[name]
     path = write_dem(tmp_path / "d.tif", fill_plane(crs, transform, 200, 200), crs, transform, point=point)
-    surface = Surface.open(path, "ellipsoid")
+    surface = open_dem(path, "ellipsoid")
     rng = np.random.default_rng(0)
     where = ALONG + rng.uniform(-0.015, 0.015, (500, 2))
     assert surface.heights(where, "EPSG:4326") == pytest.approx(plane(*where.T), abs=0.002)
@@ -211,7 +212,7 @@ def test_one_plane_in_six_encodings(tmp_path: Path, name: str) -> None:
 def test_a_dem_across_the_antimeridian(tmp_path: Path) -> None:
     transform = (179.0, 0.01, 0, -16.0, 0, -0.01)
     v, u = np.mgrid[:100, :200]
-    surface = Surface.open(write_dem(tmp_path / "d.tif", u + 0.5 * v, "EPSG:4326", transform), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", u + 0.5 * v, "EPSG:4326", transform), "ellipsoid")
     both = surface.heights([[179.505, -16.505], [-179.495, -16.505], [180.505, -16.505]], "EPSG:4326")
     assert both == pytest.approx([75, 175, 175])
 
@@ -220,7 +221,7 @@ def test_the_seam_of_a_global_dem(tmp_path: Path) -> None:
     # Heights that go round the world with the longitude.
     lon = np.arange(-180, 180) + 0.5
     heights = np.tile(1000 + 500 * np.cos(np.radians(lon)), (180, 1))
-    surface = Surface.open(write_dem(tmp_path / "d.tif", heights, "EPSG:4326", (-180, 1, 0, 90, 0, -1)), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", heights, "EPSG:4326", (-180, 1, 0, 90, 0, -1)), "ellipsoid")
     where = np.array([[179.9, 5.0], [-179.9, 5.0], [180.0, 5.0], [175.0, 5.0]])
     here = surface.around(179.0)
     assert here.shape == surface.shape
@@ -240,7 +241,7 @@ def test_voids_are_not_heights_and_do_not_mix(tmp_path: Path, void: float) -> No
     heights = hills()
     heights[20, 30] = void
     nodata = 0.0 if void == 0.0 else None
-    surface = Surface.open(write_dem(tmp_path / "d.tif", heights, nodata=nodata), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", heights, nodata=nodata), "ellipsoid")
     x, y, step = UTM_BOX
     around = np.array(
         [
@@ -267,7 +268,7 @@ def test_scale_offset_and_integers(tmp_path: Path) -> None:
     dataset.GetRasterBand(1).SetScale(0.1)
     dataset.GetRasterBand(1).SetOffset(50.0)
     dataset = None
-    window = Surface.open(path, "ellipsoid").window(0, 0, 2, 2)
+    window = open_dem(path, "ellipsoid").window(0, 0, 2, 2)
     assert window == pytest.approx(np.array([[150.0, 250.0], [np.nan, 350.0]]), nan_ok=True)
 
 
@@ -278,18 +279,18 @@ def test_outside_is_nan_and_fill_rules_say_otherwise(tmp_path: Path) -> None:
     x, y, step = UTM_BOX
     void, far = [x + 11.5 * step, y - 11.5 * step], [x - 5000, y + 5000]
     for rule in ("error", "mask"):
-        surface = Surface.open(path, "ellipsoid", fill=rule)
+        surface = open_dem(path, "ellipsoid", fill=rule)
         assert np.isnan(surface.heights([void, far])).all()
         window = surface.window(-3, -2, 8, 6)
         assert np.isnan(window[:2]).all()
         assert np.isnan(window[:, :3]).all()
         assert (window[2:, 3:] == heights[:4, :5]).all()
-    constant = Surface.open(path, "ellipsoid", fill=123.0)
+    constant = open_dem(path, "ellipsoid", fill=123.0)
     assert (constant.heights([void, far]) == 123.0).all()
     assert np.isfinite(constant.window(-3, -2, 20, 20)).all()
     assert constant.height_range[0] == 123.0
     assert constant.coverage([void, far]) == 0.0
-    nearest = Surface.open(path, "ellipsoid", fill="nearest")
+    nearest = open_dem(path, "ellipsoid", fill="nearest")
     assert nearest.heights([far])[0] == heights[0, 0]
     assert nearest.window(9, 10, 2, 1)[0] == pytest.approx([heights[10, 9], heights[10, 9]])
     assert nearest.coverage([void, far]) == 0.0
@@ -304,18 +305,18 @@ def test_a_look_with_another_rule_leaves_a_surface_as_it_was(tmp_path: Path, fil
     path = write_dem(tmp_path / "dem.tif", heights, nodata=-9999.0)
     image = np.array([[3000.0, 2000.0], [3250.0, 2150.0], [7000.0, 5000.0]])
     ground = image * [1.0, -1.0] + UTM_BOX[:2]
-    untouched = Surface.open(path, "ellipsoid", fill=fill).heights(ground)
-    surface = Surface.open(path, "ellipsoid", fill=fill)
+    untouched = open_dem(path, "ellipsoid", fill=fill).heights(ground)
+    surface = open_dem(path, "ellipsoid", fill=fill)
     # Its border must lie on the DEM: only then are tiles read.
     assert lay(Oblique(0.0), surface, 6000, 5000).voids == 24
     np.testing.assert_array_equal(surface.heights(ground), untouched)
     other = surface.with_fill("12.0")
     np.testing.assert_array_equal(other.heights(ground[1:2]), [12.0])
     np.testing.assert_array_equal(surface.heights(ground), untouched)
-    assert (surface.fill, surface.provenance["fill"]) == (Surface.open(path, "ellipsoid", fill=fill).fill,) * 2
+    assert (surface.fill, surface.provenance["fill"]) == (open_dem(path, "ellipsoid", fill=fill).fill,) * 2
     assert other.provenance["fill"] == 12.0
     assert other.height_range[0] == 12.0
-    assert surface.height_range == Surface.open(path, "ellipsoid", fill=fill).height_range
+    assert surface.height_range == open_dem(path, "ellipsoid", fill=fill).height_range
     with pytest.raises(AttributeError):
         surface.fill = "mask"  # type: ignore[misc]
 
@@ -331,7 +332,7 @@ def global_dem(folder: Path, **options: str) -> Surface:
     heights = np.arange(20.0 * 36).reshape(20, 36)
     heights[5, 17:19] = -9999.0
     path = write_dem(folder / "world.tif", heights, "EPSG:4326", (-180, 10, 0, 90, 0, -9), nodata=-9999.0)
-    return Surface.open(path, "ellipsoid", **options)
+    return open_dem(path, "ellipsoid", **options)
 
 
 def test_no_two_surfaces_share_what_they_keep(tmp_path: Path) -> None:
@@ -353,7 +354,7 @@ def test_no_two_surfaces_share_what_they_keep(tmp_path: Path) -> None:
 def test_a_worker_process_gets_a_surface(tmp_path: Path) -> None:
     surface = global_dem(tmp_path, fill="nearest").around(179.0)
     where = np.array([[-0.5, 42.0], [179.9, 10.0], [-179.9, 10.0]])
-    flat = Surface.constant(7.5)
+    flat = FlatSurface(7.5)
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         np.testing.assert_array_equal(pool.submit(surface.heights, where).result(), surface.heights(where))
         np.testing.assert_array_equal(pool.submit(flat.heights, where).result(), [7.5, 7.5, 7.5])
@@ -372,7 +373,7 @@ def test_the_size_of_samples_is_that_on_the_ground(tmp_path: Path, code: int, x:
     u, v = np.array([20.0, 21.0, 20.0]), np.array([20.0, 20.0, 21.0])
     lon, lat = to_lonlat.transform(x + side * (u + 0.5), y - side * (v + 0.5))
     _, _, metres = pyproj.Geod(ellps="GRS80").inv(lon[[0, 0]], lat[[0, 0]], lon[1:], lat[1:])
-    assert Surface.open(path, "ellipsoid").sample_size == pytest.approx(max(metres), rel=1e-3)
+    assert open_dem(path, "ellipsoid").sample_size == pytest.approx(max(metres), rel=1e-3)
 
 
 def test_rays_that_stand_far_apart_read_every_tile_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -381,7 +382,7 @@ def test_rays_that_stand_far_apart_read_every_tile_once(tmp_path: Path, monkeypa
     heights = hills(side, side).astype(np.float32)
     heights[700:760, 900:980] = -9999.0
     path = write_dem(tmp_path / "d.tif", heights, transform=transform, nodata=-9999.0, kind=gdal.GDT_Float32)
-    surface = Surface.open(path, "ellipsoid", fill="nearest")
+    surface = open_dem(path, "ellipsoid", fill="nearest")
     model = Oblique(lean=0.02)
     reads: list[int] = []
     inside = DemFile.read
@@ -409,7 +410,7 @@ def test_heights_that_are_kept_take_no_more_memory_than_they_may(tmp_path: Path)
     large = Tiles(8)
     assert large.get("a", lambda: np.zeros(10)) is large.get("a", lambda: np.ones(10)), "the last one stays"
     path = write_dem(tmp_path / "d.tif", hills())
-    assert Surface.open(path, "ellipsoid", memory=80_000_000).cache_bytes == 10_000_000
+    assert open_dem(path, "ellipsoid", memory=80_000_000).cache_bytes == 10_000_000
 
 
 def test_windows_do_not_depend_on_how_they_are_cut(tmp_path: Path) -> None:
@@ -417,7 +418,7 @@ def test_windows_do_not_depend_on_how_they_are_cut(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     heights[rng.random(heights.shape) < 0.3] = np.nan
     heights[100:180, 50:200] = np.nan
-    surface = Surface.open(write_dem(tmp_path / "d.tif", heights), "egm96", fill="nearest")
+    surface = open_dem(write_dem(tmp_path / "d.tif", heights), "egm96", fill="nearest")
     whole = surface.window(-10, -10, 340, 320)
     assert np.isfinite(whole).all()
     for u0, v0, nu, nv in ((40, 90, 70, 64), (-5, 100, 33, 21), (110, 120, 1, 1), (250, 250, 80, 60)):
@@ -427,7 +428,7 @@ def test_windows_do_not_depend_on_how_they_are_cut(tmp_path: Path) -> None:
 @pytest.mark.skipif(not EGM96.is_file(), reason="Debian's proj-data (egm96_15.gtx) is not installed")
 def test_the_undulation_between_its_lattice_is_exact_to_millimetres(tmp_path: Path) -> None:
     transform = (UTM_BOX[0], 7.0, 0, UTM_BOX[1], 0, -7.0)
-    surface = Surface.open(write_dem(tmp_path / "d.tif", np.zeros((700, 900)), transform=transform), "egm96")
+    surface = open_dem(write_dem(tmp_path / "d.tif", np.zeros((700, 900)), transform=transform), "egm96")
     v, u = np.mgrid[:700:13, :900:11]
     ground = np.column_stack([UTM_BOX[0] + 7 * (u.ravel() + 0.5), UTM_BOX[1] - 7 * (v.ravel() + 0.5), np.zeros(u.size)])
     lonlat = GroundTransform("EPSG:32735", "EPSG:4979")(ground)
@@ -436,7 +437,7 @@ def test_the_undulation_between_its_lattice_is_exact_to_millimetres(tmp_path: Pa
 
 
 def test_threads_share_a_surface(tmp_path: Path) -> None:
-    surface = Surface.open(write_dem(tmp_path / "d.tif", hills(600, 700), kind=gdal.GDT_Float32), "egm96")
+    surface = open_dem(write_dem(tmp_path / "d.tif", hills(600, 700), kind=gdal.GDT_Float32), "egm96")
     expected = surface.window(0, 0, 700, 600)
     wrong: list[int] = []
 
@@ -460,30 +461,30 @@ def test_threads_share_a_surface(tmp_path: Path) -> None:
 
 def test_no_georeference(tmp_path: Path) -> None:
     with pytest.raises(CrsError, match="no CRS"):
-        Surface.open(write_dem(tmp_path / "d.tif", hills(), crs=None), "ellipsoid")
+        open_dem(write_dem(tmp_path / "d.tif", hills(), crs=None), "ellipsoid")
     dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "e.tif"), 5, 5, 1, gdal.GDT_Float32)
     reference = osr.SpatialReference()
     reference.ImportFromEPSG(32735)
     dataset.SetSpatialRef(reference)
     dataset = None
     with pytest.raises(CrsError, match="no geotransform"):
-        Surface.open(tmp_path / "e.tif", "ellipsoid")
+        open_dem(tmp_path / "e.tif", "ellipsoid")
 
 
 def test_nothing_but_voids(tmp_path: Path) -> None:
-    surface = Surface.open(write_dem(tmp_path / "d.tif", np.full((5, 5), np.nan)), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", np.full((5, 5), np.nan)), "ellipsoid")
     with pytest.raises(InputError, match="no valid height"):
         _ = surface.height_range
 
 
 def test_a_plane() -> None:
-    surface = Surface.constant(85.5)
+    surface = FlatSurface(85.5)
     assert surface.height == 85.5
     assert surface.heights([[24.0, -33.0], [np.nan, 0]], "EPSG:4326") == pytest.approx([85.5, np.nan], nan_ok=True)
     assert surface.height_range == (85.5, 85.5)
     assert surface.coverage([[0, 0]]) == 1.0
     with pytest.raises(InputError):
-        Surface.constant(float("nan"))
+        FlatSurface(float("nan"))
 
 
 # -- rays
@@ -516,7 +517,7 @@ class Oblique(SensorModel):
 
 @pytest.mark.parametrize("lean", [0.0, 0.3, -0.7, 1.7])
 def test_rays_meet_the_terrain(tmp_path: Path, lean: float) -> None:
-    surface = Surface.open(write_dem(tmp_path / "d.tif", hills()), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", hills()), "ellipsoid")
     model = Oblique(lean=lean)
     rng = np.random.default_rng(2)
     image = rng.uniform([1500, 500], [6000, 5500], (300, 2)) - [lean * 300, 0]
@@ -533,7 +534,7 @@ def wall() -> np.ndarray:
 
 
 def test_the_visible_side_of_a_ridge_is_found(tmp_path: Path) -> None:
-    surface = Surface.open(write_dem(tmp_path / "d.tif", wall()), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", wall()), "ellipsoid")
     # The sensor is in the east: coming down, a ray goes west and meets the top or the eastern face of the wall first.
     model = Oblique(lean=1.0)
     west = np.array([[4050.0 + k - 500.0, 3000.0] for k in (0.0, 60.0, 150.0, 300.0)])
@@ -547,7 +548,7 @@ def test_the_visible_side_of_a_ridge_is_found(tmp_path: Path) -> None:
 
 
 def test_rays_that_leave_the_dem_are_nan(tmp_path: Path) -> None:
-    surface = Surface.open(write_dem(tmp_path / "d.tif", hills()), "ellipsoid")
+    surface = open_dem(write_dem(tmp_path / "d.tif", hills()), "ellipsoid")
     ground = meet_surface(Oblique(), np.array([[-500.0, 100.0], [4000.0, 3000.0], [np.nan, 1.0]]), surface)
     assert np.isnan(ground[[0, 2]]).all()
     assert np.isfinite(ground[1]).all()
@@ -556,7 +557,7 @@ def test_rays_that_leave_the_dem_are_nan(tmp_path: Path) -> None:
 
 
 def test_rays_meet_a_plane() -> None:
-    ground = meet_surface(Oblique(lean=0.5), np.array([[100.0, 50.0]]), Surface.constant(200.0))
+    ground = meet_surface(Oblique(lean=0.5), np.array([[100.0, 50.0]]), FlatSurface(200.0))
     assert ground.tolist() == [[UTM_BOX[0] + 200, UTM_BOX[1] - 50, 200.0]]
 
 
@@ -568,14 +569,14 @@ def test_the_real_dem_refuses_without_option_and_takes_egm96(real: Path) -> None
     path = real / "orthority/ngi/dem.tif"
     if not EGM2008.is_file():
         with pytest.raises(DatumError) as caught:
-            Surface.open(path)
+            open_dem(path)
         text = str(caught.value)
         for word in ("EGM2008", "us_nga_egm08_25.tif", "`surface.vertical`"):
             assert word in text
-    surface = Surface.open(path, "egm96")
+    surface = open_dem(path, "egm96")
     assert any("EGM2008" in warning for warning in surface.provenance["warnings"])
     where = np.array([[24.4, -33.65]])
-    raw = Surface.open(path, "ellipsoid").heights(where, "EPSG:4326")
+    raw = open_dem(path, "ellipsoid").heights(where, "EPSG:4326")
     assert surface.heights(where, "EPSG:4326") - raw == pytest.approx(28.208, abs=0.01)
 
 
@@ -583,7 +584,7 @@ def test_the_real_dem_refuses_without_option_and_takes_egm96(real: Path) -> None
 @pytest.mark.parametrize("opener", [lambda p: p / "N44E005.hgt"])
 @pytest.mark.driver("SRTMHGT")
 def test_a_real_srtm_tile(real: Path, opener: Callable[[Path], Path]) -> None:
-    surface = Surface.open(opener(real / "shareloc/dtm/srtm_ventoux/srtm90_non_void_filled"), "egm96")
+    surface = open_dem(opener(real / "shareloc/dtm/srtm_ventoux/srtm90_non_void_filled"), "egm96")
     # Mont Ventoux: 1909 m above the sea.
     lon, lat = np.meshgrid(np.linspace(5.25, 5.31, 60), np.linspace(44.15, 44.2, 60))
     peak = np.nanmax(surface.heights(np.column_stack([lon.ravel(), lat.ravel()]), "EPSG:4326"))

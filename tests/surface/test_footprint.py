@@ -16,6 +16,7 @@ from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay
 from ortho_pipeline.surface.writing import write_dem
 
@@ -37,7 +38,7 @@ def surface(folder: Path, heights: Any = GROUND, west: float = -450.0, **options
     field = np.broadcast_to(np.asarray(heights, dtype=float), (rows, columns)).copy()
     path = folder / "dem.tif"
     write_dem(path, field, (X + west - 1.0, Y + 451.0), 2.0, CRS)
-    return Surface.open(path, "ellipsoid", **options)
+    return open_dem(path, "ellipsoid", **options)
 
 
 def laid(model: Any, on: Surface) -> Footprint:

@@ -14,10 +14,10 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.errors import CrsError, DatumError, InputError
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.runtime.process_limits import Resources
+from ortho_pipeline.surface.dem import open_dem
 
 gdal.UseExceptions()
 #: Samples from one degree to the next in this test's cells.
@@ -59,7 +59,7 @@ def test_many_files_are_the_dem_that_gdals_mosaic_of_them_is(tmp_path: Path) -> 
     holes[3:6, 7:12] = -9999.0
     paths = [write_cell(tmp_path, 30, 41), write_cell(tmp_path, 31, 41, heights=holes), write_cell(tmp_path, 31, 40)]
     gdal.BuildVRT(str(tmp_path / "all.vrt"), [str(path) for path in sorted(paths)]).FlushCache()
-    one, many = (Surface.open(tmp_path / name, "ellipsoid", fill="mask") for name in ("all.vrt", "*.tif"))
+    one, many = (open_dem(tmp_path / name, "ellipsoid", fill="mask") for name in ("all.vrt", "*.tif"))
     # GDAL computes the spacing of a mosaic from the first file's, which costs the last bit.
     np.testing.assert_allclose(many.grid.crs_from_pixel, one.grid.crs_from_pixel, rtol=1e-15)
     assert many.provenance["path"] == str(tmp_path / "*.tif")
@@ -102,7 +102,7 @@ def test_cells_of_several_widths_are_each_sampled_in_their_own_grid(tmp_path: Pa
         for lon in (30, 31):
             cells[lon, -1 - lat] = noise.uniform(0, 900, (ROWS, count)).astype(np.float32)
             write_cell(tmp_path, lon, -1 - lat, count, heights=cells[lon, -1 - lat])
-    dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask")
+    dem = open_dem(tmp_path / "*.tif", "ellipsoid", fill="mask")
     last = -len(columns) + 1.01 / ROWS
     places = noise.uniform((30.0, last), (31.7, 0.0), (400, 2))
     border = np.column_stack([places[:100, 0], noise.uniform(-1.0, -1.0 + 1 / ROWS, 100)])
@@ -125,7 +125,7 @@ def test_columns_without_a_common_multiple_are_refused(tmp_path: Path) -> None:
     odd = write_cell(tmp_path, 30, 41, 31)
     write_cell(tmp_path, 30, 42, 30)
     with pytest.raises(CrsError, match=r"no common columns.*N42") as caught:
-        Surface.open(tmp_path / "*.tif", "ellipsoid")
+        open_dem(tmp_path / "*.tif", "ellipsoid")
     assert caught.value.file == str(odd)
     assert caught.value.remedy
 
@@ -134,7 +134,7 @@ def test_cells_on_both_sides_of_the_antimeridian_are_neighbours(tmp_path: Path) 
     east = write_cell(tmp_path, 179, 10, heights=np.full((ROWS, ROWS), 100.0))
     west = write_cell(tmp_path, -180, 10, heights=np.full((ROWS, ROWS), 200.0))
     assert east.name > west.name[:5]
-    dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask").around(180.0)
+    dem = open_dem(tmp_path / "*.tif", "ellipsoid", fill="mask").around(180.0)
     places = np.array([[179.5, 10.5], [180.5, 10.5], [-179.5, 10.5], [179.975, 10.5]])
     np.testing.assert_allclose(dem.heights(places), [100.0, 200.0, 200.0, 150.0])
 
@@ -154,21 +154,21 @@ def test_what_is_not_one_dem_is_refused_by_the_name_of_the_file(
     write_cell(tmp_path, 30, 41)
     odd = write_cell(tmp_path, 31, 41, **other)
     with pytest.raises(error, match=said) as caught:
-        Surface.open(tmp_path / "*.tif", "ellipsoid")
+        open_dem(tmp_path / "*.tif", "ellipsoid")
     assert caught.value.file == str(odd)
     assert caught.value.remedy
 
 
 def test_a_pattern_without_files_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="0 files"):
-        Surface.open(tmp_path / "*.tif", "ellipsoid")
+        open_dem(tmp_path / "*.tif", "ellipsoid")
 
 
 def test_few_files_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for lon in range(10):
         write_cell(tmp_path, lon, 0)
     monkeypatch.setattr("ortho_pipeline.surface.mosaic._OPEN_FILES", 3)
-    dem = Surface.open(tmp_path / "*.tif", "ellipsoid", fill="mask")
+    dem = open_dem(tmp_path / "*.tif", "ellipsoid", fill="mask")
     whole = dem.window(0, 0, *dem.shape[::-1])
     assert not np.isnan(whole).any()
     opened = sum(hasattr(part.samples._local, "dataset") for part in dem.file.layers[0].parts)
@@ -223,7 +223,7 @@ def test_an_ortho_over_the_border_of_two_widths(tiny: Any, tmp_path: Path) -> No
         (folder / "*.tif", Resources(threads=1, memory=30_000_000)), (folder / "*.tif", Resources(threads=3)),
     ]):  # fmt: skip
         made = tmp_path / f"{k}.tif"
-        on = Surface.open(dem, "ellipsoid")
+        on = open_dem(dem, "ellipsoid")
         warp(tiny.model, RasterSource(tiny.image), on, grid, made, driver="GTiff", resources=resources)
         orthos.append(gdal.Open(str(made)).ReadAsArray())
     assert (orthos[0] > 0).mean() > 0.9

@@ -12,6 +12,7 @@ from osgeo import gdal
 from ortho_pipeline.models import RPC
 from ortho_pipeline.surface import rays
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.rays import MANY, meet_surface
 
 
@@ -40,7 +41,7 @@ def surface(tmp_path: Path, model) -> Surface:
     dataset.SetGeoTransform((left, step, 0, top, 0, -step))
     dataset.WriteArray(rough(x, y))
     dataset = None
-    return Surface.open(path, "ellipsoid", fill="mask")
+    return open_dem(path, "ellipsoid", fill="mask")
 
 
 def image_points(count: int = MANY) -> np.ndarray:
@@ -91,7 +92,7 @@ def test_the_surface_may_be_in_any_crs(tmp_path, model, surface):
     dataset.WriteArray(np.full((100, 100), 512.5))
     dataset = None
     image = np.random.default_rng(2).uniform(100, 500, (MANY, 2))
-    ground = meet_surface(model, image, Surface.open(path, "ellipsoid"))
+    ground = meet_surface(model, image, open_dem(path, "ellipsoid"))
     np.testing.assert_allclose(ground, model.image_to_ground(image, 512.5), atol=2e-8)
 
 
@@ -100,7 +101,7 @@ def test_a_fill_rule_goes_on_beyond_the_dem_for_many_points_too(model, surface, 
     """Half of the points look past the DEM, which covers half of the image."""
     path = str(Path(surface.provenance["path"]).with_name("half.tif"))
     gdal.Translate(path, surface.provenance["path"], srcWin=[0, 0, 65, 130])
-    half = Surface.open(path, "ellipsoid", fill=fill)
+    half = open_dem(path, "ellipsoid", fill=fill)
     image = np.random.default_rng(3).uniform(20, 580, (MANY, 2))
     ground = meet_surface(model, image, half)
     # The compiled inverse of many points and the one of few agree to rounding.

@@ -15,6 +15,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.flat import FlatSurface
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def test_a_number_goes_with_the_surface_wherever_it_goes(tiny):
         assert typical_sigma(surface) == 2.5
         for same in (surface.with_fill("mask"), surface.around(20.0), pickle.loads(pickle.dumps(surface))):
             assert same.sigma == 2.5
-    assert typical_sigma(Surface.constant(500.0)) is None
+    assert typical_sigma(FlatSurface(500.0)) is None
 
 
 def test_a_raster_is_read_where_it_lies_and_its_voids_are_unknown(tiny, quality):

@@ -10,18 +10,18 @@ from ortho_pipeline.models import SensorModel
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engines import engine_of
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 
 def rectify(
     model: SensorModel, source: RasterSource, surface: Surface, grid: Grid, path: Path | str | Hiding, **options: Any
-) -> WarpResult:
+) -> WarpRecord:
     return engine_of("ortho").rectify(WarpJob(model, source, surface, grid, **options), path)
 
 
 def rectify_gdal(
     model: SensorModel, exported: RpcExport | None, source: RasterSource, surface: Surface, grid: Grid, path: Path,
     **options: Any,
-) -> WarpResult:  # fmt: skip
+) -> WarpRecord:  # fmt: skip
     return engine_of("gdal").rectify(WarpJob(model, source, surface, grid, exported=exported, **options), path)

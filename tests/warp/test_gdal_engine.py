@@ -6,12 +6,12 @@ coordinates that the engine used.
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from orthos import rectify, rectify_gdal
 from osgeo import gdal
 
@@ -20,7 +20,6 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.exchange.rpc_fit import RpcExport
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import FrameCamera, ImageCorrection, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
@@ -28,11 +27,13 @@ from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
-from ortho_pipeline.warp.job import WarpJob, WarpResult
+from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.layers.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -103,7 +104,7 @@ def terrain(folder: Path, *, void: bool = False) -> Surface:
     dataset.GetRasterBand(1).SetNoDataValue(-9999)
     dataset.WriteArray(heights)
     dataset = None
-    return Surface.open(path, "ellipsoid", fill="mask") if void else Surface.open(path, "ellipsoid")
+    return open_dem(path, "ellipsoid", fill="mask") if void else open_dem(path, "ellipsoid")
 
 
 def ramp(folder: Path) -> RasterSource:
@@ -121,7 +122,7 @@ def rpc_of(model: SensorModel) -> RpcExport | None:
         return None
 
 
-def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple[float, float, WarpResult]:
+def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple[float, float, WarpRecord]:
     """Return the largest difference (px) of the engines, the share of pixels of one alone, and what GDAL's says."""
     source, grid, found = ramp(folder), GRID, []
     ours = rectify(model, source, surface, grid, folder / "ours.tif", driver="GTiff")
@@ -144,7 +145,7 @@ def test_an_unknown_engine_is_refused_with_the_names_of_those_there_are():
 
 
 def test_gdals_warper_refuses_to_look_for_what_terrain_hides(tmp_path):
-    source, surface = ramp(tmp_path), Surface.constant(500.0)
+    source, surface = ramp(tmp_path), FlatSurface(500.0)
     job = WarpJob(frame(), source, surface, GRID)
     with pytest.raises(InputError, match="hides") as refused:
         engine_of("gdal").rectify(job, Hiding(tmp_path / "ortho.tif", (400.0, 600.0)))
@@ -207,13 +208,13 @@ def test_small_pieces_of_the_ortho_find_their_windows_beside_a_cliff(tmp_path):
 def test_a_correction_of_a_polynomial_is_one(tmp_path):
     """No table of classes says what stands for a model: it is tried."""
     model = ImageCorrection(fitted("poly2"), "shift", (0.0, 0.0), [3.0, 0, 0, -2.0, 0, 0])
-    assert both(model, Surface.constant(80.0), tmp_path)[2].transformer == "GCP_POLYNOMIAL"
+    assert both(model, FlatSurface(80.0), tmp_path)[2].transformer == "GCP_POLYNOMIAL"
 
 
 def test_the_error_is_that_of_the_transformer_at_the_ortho(tmp_path):
     """A polynomial of the first order for a model of the second: its error, found here at all pixels."""
     model, grid, dataset = fitted("poly2"), GRID, ramp(tmp_path).dataset
-    exact = Exact(model, Surface.constant(80.0), grid, SIZE)
+    exact = Exact(model, FlatSurface(80.0), grid, SIZE)
     ground = model.image_to_ground(np.random.default_rng(0).uniform(0, SIZE, (50, 2)), 80.0)
     gcps = tuple(gdal.GCP(*row) for row in np.column_stack([ground, model.ground_to_image(ground)]).tolist())
     affine = Transformer(
@@ -235,7 +236,7 @@ def test_the_error_is_that_of_the_transformer_at_the_ortho(tmp_path):
 def test_where_nothing_stands_for_the_model_the_remedy_is_our_engine(tmp_path, monkeypatch):
     monkeypatch.setattr(Transformer, "limit", -1.0)
     with pytest.raises(InputError, match=r"RPC: .* px off; GEOLOC_ARRAY: ") as caught:
-        both(frame(k1=-0.05), Surface.constant(80.0), tmp_path)
+        both(frame(k1=-0.05), FlatSurface(80.0), tmp_path)
     assert "`output.engine=ortho`" in str(caught.value.remedy)
     assert [path.name for path in tmp_path.iterdir() if "gdal" in path.name] == []
 
@@ -245,7 +246,9 @@ def test_what_gdals_warper_cannot_do_as_asked_is_refused_or_said(tiny, tmp_path)
     with pytest.raises(InputError, match=r"output\.dem_interpolation"):
         commands.rectify(tiny.image, tmp_path / "cubic", surface=SurfaceOptions(height=500.0), output=cubic)
     assert not list((tmp_path / "cubic").glob("*.tif"))
-    arrays = WarpResult(0.0, 0.1, 1, 0, 0, 10_000_000, 1, 1.0, "GEOLOC_ARRAY")
+    arrays = WarpRecord(
+        max_error_px=0.0, tolerance_px=0.1, pixels=10_000_000, valid_pixels=1, transformer="GEOLOC_ARRAY"
+    )
     assert "about 1000 MB" in arrays.notes(512_000_000)[0]
     assert not arrays.notes(1_000_000_000)
-    assert not dataclasses.replace(arrays, transformer="RPC").notes(512_000_000)
+    assert not arrays.replaced(transformer="RPC").notes(512_000_000)

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from ortho_studies.simulation.scanner import LineScanner
 from orthos import rectify
 from osgeo import gdal
 
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.crs import GroundTransform
 from ortho_pipeline.models import Pushbroom, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
@@ -23,9 +23,11 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables
 from ortho_pipeline.raster.source import Grid, RasterSource
-from ortho_pipeline.simulation.scanner import LineScanner
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.job import WarpResult
+from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.flat import FlatSurface
+from ortho_pipeline.warp.job import WarpRecord
 from ortho_pipeline.warp.lattice import Lattices, OutputBlock, Terrain
 
 UTM = pyproj.CRS.from_epsg(32651)
@@ -59,13 +61,13 @@ def compare(
     *,
     height: float = np.nan,
     surface: Surface | None = None,
-) -> tuple[float, int, WarpResult]:
+) -> tuple[float, int, WarpRecord]:
     """Return the worst error (px) of all output pixels that show the image, their number, and what the warp says."""
     columns, rows = np.meshgrid(np.arange(grid.width) + 0.5, np.arange(grid.height) + 0.5)
     x, y = grid.xy(columns.ravel(), rows.ravel())
     ground = np.stack([x, y, np.full(x.size, height)], axis=1)
     if surface is None:
-        surface = Surface.constant(height)
+        surface = FlatSurface(height)
     else:
         ground[:, 2] = surface.heights(ground[:, :2])
     path = folder / "o.tif"
@@ -180,7 +182,7 @@ def mountains(folder: Path) -> Surface:
     noise = np.random.default_rng(0).normal(0, 5, (80, 80))
     dataset.WriteArray(300 + 150 * np.sin(columns / 5) * np.cos(rows / 7) + noise)
     dataset = None
-    return Surface.open(path, "ellipsoid")
+    return open_dem(path, "ellipsoid")
 
 
 @pytest.mark.parametrize(("length", "amplitude"), [(33_000.0, 300.0), (1000.0, 1.0), (128.0, 0.02), (66.0, 300.0)])

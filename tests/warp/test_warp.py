@@ -22,11 +22,13 @@ from scipy.ndimage import minimum_filter
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import export_rpc, rpc_metadata
 from ortho_pipeline.files import sha256
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, SensorModel
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp import engine as warp
 from ortho_pipeline.warp import kernels
 
@@ -104,7 +106,7 @@ class Scene:
         return path
 
     def surface(self, **options) -> Surface:
-        return Surface.open(self.dem(**options), "ellipsoid")
+        return open_dem(self.dem(**options), "ellipsoid")
 
 
 @pytest.fixture
@@ -250,7 +252,7 @@ def test_gdalwarp_on_the_command_line_agrees(scene, tmp_path):
 def test_one_bright_pixel_lands_on_its_ground_point(scene, tmp_path, kernel):
     pixels = np.zeros((1, HEIGHT, WIDTH), np.float32)
     pixels[0, 300, 350] = 1000.0
-    surface = Surface.constant(700.0)
+    surface = FlatSurface(700.0)
     ground = scene.model.image_to_ground([[350.5, 300.5]], 700.0)
     east, north = pyproj.Transformer.from_crs(4326, UTM, always_xy=True).transform(*ground[0, :2])
     fine = 0.05  # ten output pixels to one of the source show the kernel's centre
@@ -278,7 +280,7 @@ def test_a_rendered_ground_pattern_comes_back(tmp_path):
     pixels = pattern(x, y).reshape(1, HEIGHT, WIDTH).astype(np.float32)
     grid = grid_of(240.0)
     rectify(
-        scene.model, RasterSource(scene.write(pixels)), Surface.constant(level), grid, tmp_path / "o.tif",
+        scene.model, RasterSource(scene.write(pixels)), FlatSurface(level), grid, tmp_path / "o.tif",
         resampling="cubic", driver="GTiff",
     )  # fmt: skip
     found, valid = read(tmp_path / "o.tif")
@@ -319,7 +321,7 @@ class Bent(SensorModel):
 def test_lattice_is_refined_until_it_holds_the_tolerance(scene, tmp_path):
     model, grid = Bent(), grid_of(200.0)
     result = rectify(
-        model, RasterSource(scene.write(ramps())), Surface.constant(700.0), grid, tmp_path / "o.tif", driver="GTiff"
+        model, RasterSource(scene.write(ramps())), FlatSurface(700.0), grid, tmp_path / "o.tif", driver="GTiff"
     )
     rows, columns = np.mgrid[0 : grid.height, 0 : grid.width] + 0.5
     x, y = grid.xy(columns.ravel(), rows.ravel())
@@ -333,7 +335,7 @@ def test_a_scene_smaller_than_a_lattice_cell_is_found(scene, tmp_path):
     """An overview of 10 m pixels in a wide grid: the scene lies between nodes that the model cannot project."""
     source, wide = RasterSource(scene.write(np.full((1, HEIGHT, WIDTH), 5, np.uint8))), 10.0
     grid = Grid.of_extent(UTM, (EAST - 3000, NORTH - 2500, EAST + 2600, NORTH + 2100), (wide, wide))
-    result = rectify(scene.model, source, Surface.constant(700.0), grid, tmp_path / "o.tif", driver="GTiff")
+    result = rectify(scene.model, source, FlatSurface(700.0), grid, tmp_path / "o.tif", driver="GTiff")
     # 700 x 620 pixels of half a metre, to half an output pixel all around.
     expected = WIDTH * HEIGHT * GSD**2 / wide**2
     assert result.valid_pixels == pytest.approx(expected, rel=0.06)
@@ -452,7 +454,7 @@ def test_voids_of_the_dem_are_holes_and_do_not_bleed(scene, tmp_path):
     dataset = None
     grid = grid_of(200.0)
     rectify(
-        scene.model, RasterSource(scene.write(texture())), Surface.open(dem, "ellipsoid", fill="mask"), grid,
+        scene.model, RasterSource(scene.write(texture())), open_dem(dem, "ellipsoid", fill="mask"), grid,
         tmp_path / "o.tif", driver="GTiff",
     )  # fmt: skip
     _, valid = read(tmp_path / "o.tif")
@@ -495,7 +497,7 @@ def test_overshoot_is_clipped_in_every_type(scene, tmp_path, dtype, kernel):
     pixels[:, :, ::9] = high
     path = scene.write(pixels)
     rectify(
-        scene.model, RasterSource(path), Surface.constant(700.0), grid_of(100.0), tmp_path / "o.tif", resampling=kernel,
+        scene.model, RasterSource(path), FlatSurface(700.0), grid_of(100.0), tmp_path / "o.tif", resampling=kernel,
         driver="GTiff",
     )  # fmt: skip
     found, valid = read(tmp_path / "o.tif")
@@ -564,7 +566,7 @@ def test_a_valid_pixel_never_becomes_nodata(scene, tmp_path):
     pixels = np.full((1, HEIGHT, WIDTH), 4, np.uint8)
     pixels[:, :, ::2] = 6
     path = scene.write(pixels, nodata=5)
-    rectify(scene.model, RasterSource(path), Surface.constant(700.0), grid_of(150.0), tmp_path / "o.tif")
+    rectify(scene.model, RasterSource(path), FlatSurface(700.0), grid_of(150.0), tmp_path / "o.tif")
     assert set(np.unique(read(tmp_path / "o.tif")[0])) == {4, 6}
 
 
@@ -575,7 +577,7 @@ def test_it_moves_to_the_value_that_gdal_takes(scene, tmp_path, nodata, moved):
     source = RasterSource(path)
     for kernel in ("nearest", "bilinear"):
         rectify(
-            scene.model, source, Surface.constant(700.0), grid_of(150.0), tmp_path / "o.tif", resampling=kernel,
+            scene.model, source, FlatSurface(700.0), grid_of(150.0), tmp_path / "o.tif", resampling=kernel,
             profile=Profile.of(source, nodata=nodata),
         )  # fmt: skip
         assert set(np.unique(read(tmp_path / "o.tif")[0])) == {moved}
@@ -598,9 +600,9 @@ def test_palette_is_kept_by_nearest_and_refused_by_others(scene, tmp_path):
     dataset = None
     source = RasterSource(path)
     with pytest.raises(InputError, match="palette"):
-        rectify(scene.model, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif")
+        rectify(scene.model, source, FlatSurface(700.0), grid_of(50.0), tmp_path / "o.tif")
     rectify(
-        scene.model, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif", resampling="nearest",
+        scene.model, source, FlatSurface(700.0), grid_of(50.0), tmp_path / "o.tif", resampling="nearest",
         driver="GTiff",
     )  # fmt: skip
     dataset = gdal.Open(str(tmp_path / "o.tif"))  # a band does not keep its dataset alive
@@ -628,11 +630,11 @@ def test_average_is_the_mean_under_the_output_pixel(scene, tmp_path):
     pixels = texture(np.float32)
     path, step = scene.write(pixels), 4.0  # eight source pixels a side
     rectify(
-        scene.model, RasterSource(path), Surface.constant(700.0), grid_of(160.0, step), tmp_path / "a.tif",
+        scene.model, RasterSource(path), FlatSurface(700.0), grid_of(160.0, step), tmp_path / "a.tif",
         resampling="average", driver="GTiff",
     )  # fmt: skip
     rectify(
-        scene.model, RasterSource(path), Surface.constant(700.0), grid_of(160.0, step / 64), tmp_path / "f.tif",
+        scene.model, RasterSource(path), FlatSurface(700.0), grid_of(160.0, step / 64), tmp_path / "f.tif",
         resampling="nearest", driver="GTiff",
     )  # fmt: skip
     coarse, fine = read(tmp_path / "a.tif")[0][0], read(tmp_path / "f.tif")[0][0]
@@ -658,7 +660,7 @@ def test_nothing_is_left_when_the_source_is_cut_off(scene, tmp_path):
     path.write_bytes(path.read_bytes()[:200_000])
     (tmp_path / "o.tif").write_bytes(b"the old one")
     with pytest.raises(InputError) as caught:
-        rectify(scene.model, RasterSource(path), Surface.constant(700.0), grid_of(), tmp_path / "o.tif")
+        rectify(scene.model, RasterSource(path), FlatSurface(700.0), grid_of(), tmp_path / "o.tif")
     assert str(path) in str(caught.value)
     assert (tmp_path / "o.tif").read_bytes() == b"the old one"
     assert sorted(item.name for item in tmp_path.iterdir()) == ["o.tif", "source.tif"]
@@ -668,7 +670,7 @@ def test_nothing_is_left_when_the_source_is_cut_off(scene, tmp_path):
 def test_unknown_creation_options_are_refused(scene, tmp_path, options):
     with pytest.raises(InputError, match="creation option"):
         rectify(
-            scene.model, RasterSource(scene.write(texture())), Surface.constant(700.0), grid_of(50.0),
+            scene.model, RasterSource(scene.write(texture())), FlatSurface(700.0), grid_of(50.0),
             tmp_path / "o.tif", creation_options=options,
         )  # fmt: skip
 
@@ -746,9 +748,9 @@ def test_a_mask_beside_nodata_counts(scene, tmp_path):
 def test_integers_of_64_bits_are_only_copied(scene, tmp_path):
     source = RasterSource(scene.write(np.full((1, HEIGHT, WIDTH), 2**62 + 1, np.int64)))
     with pytest.raises(InputError, match="64 bits"):
-        rectify(scene.model, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif")
+        rectify(scene.model, source, FlatSurface(700.0), grid_of(50.0), tmp_path / "o.tif")
     rectify(
-        scene.model, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif", resampling="nearest",
+        scene.model, source, FlatSurface(700.0), grid_of(50.0), tmp_path / "o.tif", resampling="nearest",
         driver="GTiff",
     )  # fmt: skip
     assert set(np.unique(read(tmp_path / "o.tif")[0])) == {2**62 + 1}
@@ -767,7 +769,7 @@ def test_the_end_of_the_model_may_cross_the_image(tmp_path):
         )  # fmt: skip
         scene = Scene(tmp_path, model)
         result = rectify(
-            model, RasterSource(scene.write(texture())), Surface.constant(700.0), grid_of(), tmp_path / "o.tif",
+            model, RasterSource(scene.write(texture())), FlatSurface(700.0), grid_of(), tmp_path / "o.tif",
             driver="GTiff",
         )  # fmt: skip
         box = 3 * fields["lon_scale"] * 92_800 / GSD * 3 * fields["lat_scale"] * 110_900 / GSD
@@ -776,7 +778,7 @@ def test_the_end_of_the_model_may_cross_the_image(tmp_path):
 
 def test_a_fine_dem_under_a_coarse_output_stays_within_the_memory(scene, tmp_path):
     """A block would look at 2,600² heights: with little memory it is made cell by cell, with the same pixels."""
-    surface = Surface.open(scene.dem(step=0.5, count=1000), "ellipsoid")
+    surface = open_dem(scene.dem(step=0.5, count=1000), "ellipsoid")
     outputs = []
     for memory in (512_000_000, 400_000):
         rectify(
@@ -818,16 +820,14 @@ def test_masked_pixels_are_the_same_for_any_memory(scene, tmp_path):
 
 def test_names_with_brackets_leave_nothing_behind(scene, tmp_path):
     out = tmp_path / "out"
-    rectify(
-        scene.model, RasterSource(scene.write(texture())), Surface.constant(700.0), grid_of(50.0), out / "o[1]*.tif"
-    )
+    rectify(scene.model, RasterSource(scene.write(texture())), FlatSurface(700.0), grid_of(50.0), out / "o[1]*.tif")
     assert [path.name for path in out.iterdir()] == ["o[1]*.tif"]
 
 
 def test_gdals_warper_refuses_several_files(scene, tmp_path):
     source = RasterSource(scene.write(texture(), "a.tif"), scene.write(texture(), "b.tif"))
     with pytest.raises(InputError, match="one file"):
-        rectify_gdal(scene.model, None, source, Surface.constant(700.0), grid_of(50.0), tmp_path / "o.tif")
+        rectify_gdal(scene.model, None, source, FlatSurface(700.0), grid_of(50.0), tmp_path / "o.tif")
 
 
 def vrt(path: Path, source: str) -> Path:
@@ -874,7 +874,7 @@ def test_a_sparse_source_of_70000_pixels_a_side_in_little_memory(tmp_path):
     scales = half, half, half * GSD / 92_800, half * GSD / 110_900, 500.0
     model = RPC(half, half, *CENTRE, 700.0, *scales, col, one, row, one)
     grid = Grid.of_extent(UTM, (EAST - 400, NORTH - 400, EAST + 400, NORTH + 400), (GSD, GSD))
-    result = rectify(model, RasterSource(path), Surface.constant(700.0), grid, tmp_path / "o.tif", driver="GTiff")
+    result = rectify(model, RasterSource(path), FlatSurface(700.0), grid, tmp_path / "o.tif", driver="GTiff")
     pixels, _ = read(tmp_path / "o.tif")
     assert result.valid_pixels == grid.width * grid.height
     # 512 x 512 source pixels of 77, seen through a slightly rotated grid of the same resolution.
@@ -887,7 +887,7 @@ def test_many_bands_take_no_more_memory_than_tiles_of_8_mb(scene, tmp_path):
 
     path, options = tmp_path / "many.tif", ["SPARSE_OK=TRUE", "TILED=YES"]
     gdal.GetDriverByName("GTiff").Create(str(path), 600, 600, 32, gdal.GDT_UInt16, options).FlushCache()
-    source, surface = RasterSource(path), Surface.constant(700.0)
+    source, surface = RasterSource(path), FlatSurface(700.0)
     rectify(scene.model, source, surface, grid_of(size=50.0), tmp_path / "loads.tif", driver="GTiff")
     tracemalloc.start()
     try:
@@ -929,7 +929,7 @@ def test_strong_downsampling_stays_within_the_memory(scene, tmp_path):
     outputs = []
     for memory in (512_000_000, 200_000):
         rectify(
-            scene.model, RasterSource(path), Surface.constant(700.0), grid_of(300.0, step), tmp_path / "o.tif",
+            scene.model, RasterSource(path), FlatSurface(700.0), grid_of(300.0, step), tmp_path / "o.tif",
             resampling="average", resources=Resources(memory), driver="GTiff",
         )  # fmt: skip
         outputs.append(read(tmp_path / "o.tif"))
@@ -960,7 +960,7 @@ def test_equal_orthos_are_equal_files_whatever_the_number_of_threads(scene, tmp_
     source, found = RasterSource(scene.write(texture())), set()
     for threads in (1, 4, 4, 7):
         out = tmp_path / "o.tif"
-        rectify(scene.model, source, Surface.constant(700.0), grid_of(step=0.1), out, driver="GTiff",
+        rectify(scene.model, source, FlatSurface(700.0), grid_of(step=0.1), out, driver="GTiff",
                 resources=Resources(threads=threads), creation_options=options)  # fmt: skip
         found.add(sha256(out))
     assert len(found) == 1

@@ -7,8 +7,7 @@ import ortho_tinysat
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.plugin import InputError, geocentric
 from ortho_pipeline.testing import check_sensor
 
 gdal.UseExceptions()

@@ -13,10 +13,10 @@ import socket
 import threading
 from collections.abc import Iterator
 
-from ortho_pipeline.batch.records import MAX_BYTES, Record
+from ortho_pipeline.batch.records import MAX_BYTES, RunRecord
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import json_text
-from ortho_pipeline.files.storage.objects import Conflict, Objects
+from ortho_pipeline.stores.objects import Conflict, Objects
 
 #: Seconds after which a lease that nobody renews is another's to take; it is renewed four times in that time.
 PATIENCE = 120.0
@@ -72,7 +72,7 @@ class Lease:
                 self._lost = True
                 raise Lost(f"another worker has taken over {self.name!r}") from error
 
-    def finish(self, result: Record) -> None:
+    def finish(self, result: RunRecord) -> None:
         """Write the result of the scene, its record, in place of an older one.
 
         Raises
@@ -108,10 +108,10 @@ class Leases:
             return ""
         return Lease(self._store, name, made.version, self._holder)
 
-    def result(self, name: str) -> Record | None:
+    def result(self, name: str) -> RunRecord | None:
         """Return the result of a scene, None where there is none of its name that can be understood."""
         try:
-            found = Record.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
+            found = RunRecord.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
         except (FileNotFoundError, InputError):
             return None
         return found if found is not None and found.name == name else None

@@ -1,7 +1,7 @@
 """A run whose outputs go to a folder of objects, by any number of workers at once.
 
 Each worker makes the scenes of its part, then those that nobody has begun, then those whose worker has died. A scene is
-made in a folder of this machine and uploaded, its result last (see `leases`, `files.storage.delivery`).
+made in a folder of this machine and uploaded, its result last (see `leases`, `stores.delivery`).
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import Any
 from ortho_pipeline.batch.executors import Crew, completed
 from ortho_pipeline.batch.freshness import inputs_as_recorded, is_scene
 from ortho_pipeline.batch.plan import STATE, Job, Plan
-from ortho_pipeline.batch.records import Record
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.leases import PATIENCE, Lease, Leases, Lost
 from ortho_pipeline.errors import InputError, OrthoError, error_document
 from ortho_pipeline.files import json_text
-from ortho_pipeline.files.process_limits import Progress
-from ortho_pipeline.files.storage.delivery import delivered
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.runtime.process_limits import Progress
+from ortho_pipeline.stores.delivery import delivered
+from ortho_pipeline.stores.objects import Objects
 
 _SUMMARY = "run.json"
 #: Seconds between two looks at what the others do.
@@ -90,9 +90,9 @@ def _made(where: SharedFolder, make: Make, job: Job, lease: Lease) -> Outcome:
     with tempfile.TemporaryDirectory(prefix="ortho_run_") as scratch:
         local = dataclasses.replace(job, output=Path(scratch))
         outcome = make(local)
-        record = Record.read(local.record)
+        record = RunRecord.at(local.record)
         if record is None:
-            record = Record(job.name, "", "failed", seconds=outcome.seconds, error=outcome.error)
+            record = RunRecord(name=job.name, key="", status="failed", seconds=outcome.seconds, error=outcome.error)
         if outcome.status != "failed":
             lease.renew()
             with delivered(address, job.name, allow_network=where.allow_network, keep=_goes_along) as delivery:
@@ -100,11 +100,9 @@ def _made(where: SharedFolder, make: Make, job: Job, lease: Lease) -> Outcome:
                     path.replace(delivery.folder / path.name)
             stored = delivery.stored
             outputs = tuple(
-                dataclasses.replace(one, mtime_ns=0, tag=stored[one.path].tag)
-                for one in record.outputs
-                if one.path in stored
+                one.replaced(mtime_ns=0, tag=stored[one.path].tag) for one in record.outputs if one.path in stored
             )
-            record = dataclasses.replace(record, outputs=outputs)
+            record = record.replaced(outputs=outputs)
             outcome = dataclasses.replace(outcome, files=_files(where, record))
     lease.finish(record)
     return outcome
@@ -114,11 +112,11 @@ def _goes_along(path: Path) -> bool:
     return path.suffix != ".vrt"
 
 
-def _files(where: SharedFolder, record: Record) -> dict[str, str]:
+def _files(where: SharedFolder, record: RunRecord) -> dict[str, str]:
     return {one.role: f"{where.address_of(record.name)}/{one.path}" for one in record.outputs}
 
 
-def why_stale(where: SharedFolder, job: Job, record: Record) -> str:
+def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
     """Return in what a scene is not as its record says; empty if it is.
 
     Outputs are asked of the store: size and tag, or with `where.checksums` the content.
@@ -141,7 +139,7 @@ def why_stale(where: SharedFolder, job: Job, record: Record) -> str:
     return ""
 
 
-def outcome_of(where: SharedFolder, record: Record) -> Outcome:
+def outcome_of(where: SharedFolder, record: RunRecord) -> Outcome:
     """Return the outcome that a record tells: what another worker, or an earlier run, has made is unchanged."""
     status = "failed" if record.status == "failed" else "unchanged"
     return Outcome(record.name, status, record.seconds, _files(where, record), record.facts, record.error)

@@ -10,8 +10,8 @@ import numpy as np
 from ortho_pipeline.block.equations.image_pairs import Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 #: Numbers of a matrix that is made for some of the pairs at once.
 _AT_ONCE = 1 << 19

@@ -26,8 +26,8 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Misfits
 from ortho_pipeline.block.equations.reduced_system import NormalSystem, Solution
-from ortho_pipeline.files.process_limits import parts_of, side_by_side
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.runtime.process_limits import parts_of, side_by_side
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.equations import point_kernel

@@ -49,17 +49,6 @@ class ImagePairs:
         return cls(first, second, slot)
 
     @cached_property
-    def _by_second(self) -> Index:
-        return np.argsort(self.second, kind="stable")
-
-    def summed(self, values: Array, *, of_second: bool = False) -> Array:
-        """Return the sums ``(images, p)`` of values ``(S, p)`` of pairs over those with one first (second) image."""
-        numbers = self.second[self._by_second] if of_second else self.first
-        values = values[self._by_second] if of_second else values
-        # Each image has a pair with itself, so there is one of all of them.
-        return np.asarray(np.add.reduceat(values, np.searchsorted(numbers, np.arange(len(self.slot)))))
-
-    @cached_property
     def levels(self) -> tuple[Index, ...]:
         """Images in levels."""
         tied = self.slot >= 0

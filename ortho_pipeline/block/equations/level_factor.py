@@ -33,22 +33,19 @@ class LevelMatrix:
     """Normal equations with blocks ``(S, p, p)`` of pairs of images, their diagonal scaled to ones."""
 
     def __init__(self, levels: Levels, blocks: Array, damping: float = 0.0) -> None:
-        self.levels, self.damping = levels, damping
+        self.levels = levels
         padded = levels.columns.padded
         images = np.arange(len(padded))
         diagonal = np.diagonal(blocks[levels.pairs.slot[images, images]], axis1=1, axis2=2)
         self.lengths = lengths_of(np.sqrt(np.maximum(diagonal, 0.0)))
-        self.scaled = self._scaled(blocks)
+        # Of the levels, and between a level and the next.
+        own, between = levels.split(self._scaled(blocks))
+        self._parts = [part + damping * np.eye(len(part)) if damping else part for part in own], between
 
     def _scaled(self, blocks: Array) -> Array:
         pairs = self.levels.pairs
         lengths = self.lengths[pairs.first][:, :, None] * self.lengths[pairs.second][:, None, :]
         return np.asarray(blocks / lengths)
-
-    def _split(self) -> tuple[list[Array], list[Array]]:
-        """Return the matrices of the levels, and those between a level and the next."""
-        own, between = self.levels.split(self.scaled)
-        return [part + self.damping * np.eye(len(part)) if self.damping else part for part in own], between
 
     @property
     def _lengths(self) -> Array:
@@ -57,18 +54,19 @@ class LevelMatrix:
 
     def _product(self, right: Array) -> Array:
         """Return the scaled matrix times ``(P,)``."""
-        pairs, padded = self.levels.pairs, self.levels.columns.padded
-        wide = np.append(right, 0.0)[padded]
-        found = pairs.summed((self.scaled @ wide[pairs.second][:, :, None])[:, :, 0])
-        turned = (wide[pairs.first][:, None, :] @ self.scaled)[:, 0]
-        turned[pairs.first == pairs.second] = 0.0
-        found += pairs.summed(turned, of_second=True)
-        return np.asarray(found[padded >= 0] + self.damping * right)
+        columns, (own, between) = self.levels.of_level, self._parts
+        parts, found = [right[part] for part in columns], np.empty_like(right)
+        for number, matrix in enumerate(own):
+            found[columns[number]] = matrix @ parts[number]
+        for number, matrix in enumerate(between):
+            found[columns[number + 1]] += matrix @ parts[number]
+            found[columns[number]] += matrix.T @ parts[number + 1]
+        return found
 
     def dense(self) -> Array:
         """Return the scaled matrix ``(P, P)``."""
         columns, size = self.levels.of_level, self.levels.columns.size
-        found, (own, between) = np.zeros((size, size)), self._split()
+        found, (own, between) = np.zeros((size, size)), self._parts
         for number, part in enumerate(own):
             found[np.ix_(columns[number], columns[number])] = part
         for number, part in enumerate(between):
@@ -90,7 +88,7 @@ class LevelFactor(LevelMatrix):
         super().__init__(levels, blocks, damping)
         self._lower: list[Array] = []
         self._along: list[Array] = []
-        own, between = self._split()
+        own, between = self._parts
         for number, part in enumerate(own):
             left = part
             if number:

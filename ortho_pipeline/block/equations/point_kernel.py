@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 Array = Any
 

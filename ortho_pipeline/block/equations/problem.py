@@ -120,9 +120,9 @@ class PseudoEquations:
 class BlockProblem:
     """Everything that is observed; `known` ``(N, 3)`` is the ground of control as lon, lat, h (NaN: not observed).
 
-    `assumed` are the sigmas (m) in plan and height of known ground that states none, `heights` what a surface says of
-    points without a known height. `target` ``(N, 3)`` is known
-    ground in the frame, `enu` ``(N, 3, 3)`` turns from the frame to east, north, up there.
+    `assumed` are the sigmas (m) in plan and height of known ground that states none, `heights` the heights of a surface
+    under points without a known height. `target` ``(N, 3)`` is known ground in the frame, `enu` ``(N, 3, 3)`` turns
+    from the frame to east, north, up there.
     """
 
     points: BlockPoints
@@ -188,8 +188,12 @@ class BlockProblem:
     def ordering(self, selection: Selection) -> Ordering:
         """Return the order in which the unknowns of the active points and of the models are eliminated."""
         rays = selection.rays & self.active(selection)[self.points.point]
-        grounded = selection.ground & self.placed
-        return Ordering.of(self.points, rays, grounded if self.heights is None else grounded | self.heights.on)
+        return Ordering.of(self.points, rays, self._grounded(selection))
+
+    def _grounded(self, selection: Selection) -> Mask:
+        """Return the points ``(N,)`` whose place is observed by itself: known ground, and heights of a surface."""
+        grounded: Mask = selection.ground & self.placed
+        return grounded if self.heights is None else grounded | self.heights.on
 
     # -- sigmas ------------------------------------------------------------------------------------------------------
 

@@ -1,1 +1,1 @@
-"""Heights of a surface under the points of a block: what is observed, what it has in common, when it stands."""
+"""Heights of a DEM under the points of a block: as observations, with the errors that they share."""

@@ -1,10 +1,10 @@
-r"""Errors that heights of a DEM share, as unknowns of a block: its bias and shift, and what is alike over a distance.
+r"""Errors that heights of a DEM share, as unknowns of a block: its bias, its shift, and errors correlated by distance.
 
 Heights err by :math:`L c + e`, with :math:`c \sim N(0, I)`, loads :math:`L` in metres and an own error :math:`e` of
 each. One column of :math:`L` is the bias, two are the slopes, by which a shift of the DEM is seen. The others are the
-leading modes of the covariance :math:`\sigma^2 e^{-d / \lambda}`; what they leave is in the own errors. So a thousand
-ties tell of the bias what one tells. The unknowns are solved for beside the block as in `block.common_error`. What they
-move is seen at heights alone, so no further elimination is needed for it.
+leading modes of the covariance :math:`\sigma^2 e^{-d / \lambda}`; the rest is in the own errors. So a thousand ties
+do not average out the bias. The unknowns are solved for next to the block as in `block.common_error`. Only heights
+depend on them, so they need no further elimination.
 
 Source: Nuth and Kääb 2011 (shifts of DEMs by slope and aspect); Koch 1999, section 3.2 (elimination of unknowns);
 Williams and Seeger 2001 (leading modes of many points).
@@ -24,13 +24,13 @@ from ortho_pipeline.models.base import Array
 
 #: Modes are of the covariance of so many points at most, and are so many at most, of a block of `_MANY` points fewer.
 _ANCHORS, _MODES, _MANY = 800, 120, 5_000
-#: What all modes that are kept hold of the variance.
+#: The share of the variance in all modes that are kept.
 _HELD = 0.99
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CommonHeights(CommonUnknown):
-    """What heights have in common, and what a block tells of it.
+    """Errors that heights share, and what a block tells of them.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class CommonHeights(CommonUnknown):
 
     @classmethod
     def of(cls, loads: Array, bias: float, points: int, parameters: int) -> CommonHeights:
-        """Return it before anything tells of it."""
+        """Return them before the adjustment."""
         count, modes = loads.shape
         return cls(
             sigma=bias, points=points, value=np.zeros(modes), told=np.zeros((modes, modes)), loads=loads,
@@ -65,14 +65,14 @@ class CommonHeights(CommonUnknown):
         return float(self.value[0] * self.sigma), float(np.sqrt(self.left[0, 0]) * self.sigma)
 
     def with_slopes(self, slopes: Array, shift: float) -> CommonHeights:
-        """Return it with other slopes ``(N, 2)``, of a DEM that lies right to `shift` m."""
+        """Return them with other slopes ``(N, 2)``; `shift` is the standard deviation of the DEM's position, m."""
         loads = self.loads.copy()
-        # A DEM that lies too far east is too low where it rises to the east.
+        # A DEM shifted to the east is too low where it rises to the east.
         loads[:, 1:3] = -shift * slopes
         return replace(self, loads=loads)
 
     def shift(self, shift: float) -> tuple[Array, Array]:
-        """Return the estimate ``(2,)`` of where the DEM lies, east and north of the truth, and its covariance, m²."""
+        """Return the estimate ``(2,)`` of the DEM's shift to the east and north, m, and its covariance, m²."""
         return self.value[1:3] * shift, self.left[1:3, 1:3] * shift**2
 
     @property
@@ -81,7 +81,7 @@ class CommonHeights(CommonUnknown):
         return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))
 
     def moved_by(self, solved: Solved) -> tuple[CommonHeights, Array]:
-        """Return it with what a solution tells of it, and the slope of half the sum of squares ``(k,)``."""
+        """Return them with what a solution tells of them, and the slope of half the sum of squares ``(k,)``."""
         linear, problem, ordering = solved.linear, solved.problem, solved.linear.ordering
         assert problem.heights is not None
         rows = ordering.grounded[problem.heights.on[ordering.grounded]]
@@ -131,15 +131,13 @@ def _normals(linear: Linear) -> Array:
     return np.asarray(found + ground.swapaxes(1, 2) @ ground)
 
 
-def alike(places: Array, sigmas: Array, length: float) -> tuple[Array, Array]:
-    """Return the loads ``(n, k)`` of errors that are alike over a length (m), and what they leave ``(n,)``, m².
+def correlated(places: Array, length: float) -> tuple[Array, Array]:
+    """Return the loads ``(n, k)`` of errors of sigma 1 correlated over a length (m), and the variances ``(n,)`` left.
 
     Parameters
     ----------
     places : ndarray (n, 3)
         In metres.
-    sigmas : ndarray (n,)
-        Of the heights there.
     """
     count = len(places)
     chosen = np.random.default_rng(0).permutation(count)[:_ANCHORS]
@@ -154,10 +152,10 @@ def alike(places: Array, sigmas: Array, length: float) -> tuple[Array, Array]:
         loads[part] = _correlation(places[part], places[chosen], length) @ modes
     own = np.maximum(1.0 - (loads**2).sum(axis=1), 1.0 - _HELD)
     if held[most - 1] < _HELD:
-        # What is left is still alike between neighbours: together they say no more than few.
+        # The rest is still correlated between neighbours, which together have the information of few.
         left = _correlation(places[chosen], places[chosen], length) - loads[chosen] @ loads[chosen].T
         own *= max(1.0, density * float(np.maximum(left, 0.0).sum() / np.trace(left)))
-    return loads * sigmas[:, None], own * sigmas**2
+    return loads, own
 
 
 def _correlation(one: Array, other: Array, length: float) -> Array:

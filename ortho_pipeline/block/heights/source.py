@@ -1,4 +1,4 @@
-"""What a DEM says of the points of a block: their height, as a plane near each of them, with its sigma."""
+"""Heights of a DEM under the points of a block, each as a plane near its point, with a sigma."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
-#: Sigma (m) of a DEM of which nobody says how accurate it is: what is assumed of it for matching, too.
-USUAL = 10.0
+#: Sigma (m) of a DEM without a stated accuracy; matching assumes the same.
+DEFAULT_SIGMA = 10.0
 #: Times that a ray is followed to the height of the DEM below it: terrain is less steep than the ray.
 _FOLLOWED = 6
-#: The option of each number that is said of a DEM.
+#: The option of each number that describes a DEM.
 _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
 #: Slopes are taken over so many sigmas of the heights to each side, from one to so many samples.
 _SLOPE, _WIDEST = 8.0, 3.0
@@ -34,18 +34,18 @@ _AROUND = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 
 @dataclass(frozen=True, eq=False)
 class DemHeights:
-    """A DEM whose heights are observations; how accurate each is stands with the DEM (`Surface.with_sigma`).
+    """A DEM whose heights are observations; the DEM itself has their sigma (`Surface.with_sigma`).
 
     Parameters
     ----------
     surface : DemSurface
     bias : float, optional
-        Standard deviation (m) of an error that all heights have in common; by default that of a single height.
+        Standard deviation (m) of an error that all heights share; by default that of a single height.
     shift : float, optional
-        Standard deviation (m) of where the DEM lies, east and north; by default half of its samples' side.
+        Standard deviation (m) of the position of the DEM, east and north; by default half a sample.
     correlation : float, optional
-        Distance (m) over which errors are alike: their correlation falls with exp(-d / correlation). By default each
-        sample of the DEM errs on its own, beside the bias.
+        Distance (m) over which errors are correlated, by exp(-d / correlation). By default each sample of the DEM has
+        its own error, besides the bias.
     """
 
     surface: DemSurface
@@ -69,7 +69,7 @@ class DemHeights:
             return heights
         if isinstance(heights, DemSurface):
             return cls(heights)
-        raise InputError("flat ground says nothing of heights", field="heights", remedy="give a DEM")
+        raise InputError("flat ground is no observation of heights", field="heights", remedy="give a DEM")
 
     def at(self, ground: Array, sigmas: Array) -> tuple[Array, Array]:
         """Return heights ``(n,)`` at lon, lat ``(n, 2+)``, and the slope ``(n, 2)`` to the east and to the north.
@@ -96,16 +96,16 @@ class DemHeights:
         return np.asarray(np.abs(found[1:] - planes).max(axis=0))
 
     def sigmas(self, ground: Array) -> Array | None:
-        """Return the stated sigma ``(n,)`` of the heights at lon, lat; None where nobody says."""
+        """Return the stated sigma ``(n,)`` of the heights at lon, lat; None if none is stated."""
         sigma = self.surface.sigma
         if isinstance(sigma, Surface):
             return sigma.heights(ground[:, :2], GEODETIC)
         return None if sigma is None else np.full(len(ground), float(sigma))
 
-    def cells(self, ground: Array) -> Array:
-        """Return how many places ``(n,)`` say together what each of them, lon, lat ``(n, 2+)``, says alone.
+    def sharing(self, ground: Array) -> Array:
+        """Return how many of the places, lon, lat ``(n, 2+)``, share the information of each ``(n,)``.
 
-        Those among the same four samples, and as many as share one or two of them.
+        Those between the same four samples, and those that share one or two of these.
         """
         places = np.column_stack([ground[:, :2], np.zeros(len(ground))])
         samples = np.floor(np.nan_to_num(self.surface.sampler(GEODETIC)(places))).astype(np.int64)
@@ -138,7 +138,7 @@ def starts(source: DemHeights, problem: BlockProblem, models: Sequence[SensorMod
         return np.asarray(sums / counts[:, None])
 
 
-def begun(source: DemHeights, problem: BlockProblem, state: State, rays: Mask) -> Array:
+def started(source: DemHeights, problem: BlockProblem, state: State, rays: Mask) -> Array:
     """Return the places ``(N, 3)`` of a state with points on the DEM, as far as all their rays see them there."""
     found = starts(source, problem, state.models, rays, problem.points.tie & ~problem.placed)
     seen = np.isfinite(predict(problem.frame, state.models, problem.points, found)).all(axis=1)
@@ -157,7 +157,7 @@ def planes_at(
     sigmas : ndarray (N,)
         Standard deviations of the heights, metres upwards.
     offset : ndarray (N,)
-        What is known of their errors.
+        Estimates of their errors.
     """
     frame, count = problem.frame, len(local)
     ground = np.where(problem.placed[:, None], problem.known, frame.geodetic(local))

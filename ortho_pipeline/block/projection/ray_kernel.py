@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
 from ortho_pipeline.models.rpc_kernel import BLOCK, linearise_rpc, normalised
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 Array = Any
 

@@ -10,10 +10,10 @@ import numpy as np
 from ortho_pipeline.block.local_frame import GEODETIC, Places
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.block.projection import ray_kernel
-from ortho_pipeline.files.process_limits import parts_of, side_by_side
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import COEFFICIENTS
+from ortho_pipeline.runtime.process_limits import parts_of, side_by_side
 
 #: Rays that are worth a thread.
 _SHARE = 10_000

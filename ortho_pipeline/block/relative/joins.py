@@ -52,9 +52,12 @@ class Join:
         east, north = np.linalg.eigh(self.covariance)[1][:, -1]
         return math.degrees(math.atan2(east, north)) % 180.0
 
-    def figures(self) -> dict[str, Any]:
-        """Return what documents say of it."""
-        return {"sigma_px": self.sigma, "sigma_m": self.sigma * self.pixel, "azimuth_deg": self.azimuth_deg}
+    def figures(self, limit: float) -> dict[str, Any]:
+        """Return its members of a `block.network.ImagePairRecord`; beyond a limit (px) it is weak."""
+        sigma = self.sigma
+        return {
+            "sigma_px": sigma, "sigma_m": sigma * self.pixel, "azimuth_deg": self.azimuth_deg, "weak": sigma > limit,
+        }  # fmt: skip
 
 
 def joins_of(fit: BlockFit) -> tuple[Join, ...]:
@@ -105,28 +108,21 @@ def _between(fit: BlockFit, first: int, second: int, rows: int, columns: int) ->
     return np.asarray(fit.cofactors.between(*(index.astype(np.int64) for index in both))[0, :rows, :columns])
 
 
-def weak_joins(joins: tuple[Join, ...], limit: float, *, with_heights: bool) -> list[Notice]:
-    """Return a notice of pairs that may be farther apart than a limit (px), with what would help."""
+def weak_joins(joins: tuple[Join, ...], limit: float, *, with_heights: bool) -> tuple[Notice, ...]:
+    """Return a notice of pairs whose relative position is less accurate than a limit (px), with what would help."""
     weak = sorted((join for join in joins if join.sigma > limit), key=lambda join: -join.sigma)
     if not weak:
-        return []
+        return ()
     named = "; ".join(
         f"{join.first} and {join.second} by {join.sigma:.1f} px ({join.sigma * join.pixel:.2g} m) along azimuth "
         f"{join.azimuth_deg:.0f}°" for join in weak[:_NAMED]
     )  # fmt: skip
     more = f"; and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
-    remedy = (
-        ("a more accurate DEM (", Setting("surface.sigma"), "), control points or another view would help")
-        if with_heights
-        else ("heights (", Setting("surface.dem"), "), control points or another view would help")
-    )
+    dem = ("give a more accurate DEM",) if with_heights else ("give a DEM (", Setting("surface.dem"), ")")
     text = Text(
-        f"{counted(len(weak), 'pair of neighbouring images', 'pairs of neighbouring images')} may be shifted against "
-        f"each other (sigma): {named}{more}; ", *remedy,
+        f"{counted(len(weak), 'pair of images', 'pairs of images')} may be shifted against each other (sigma): "
+        f"{named}{more}; ", *dem, ", control points, or another view",
     )  # fmt: skip
     worst = weak[0]
-    return [
-        Notice(
-            "weak-join", text, pairs=len(weak), worst=[worst.first, worst.second], sigma_px=worst.sigma, limit_px=limit
-        )
-    ]
+    fields = {"worst": [worst.first, worst.second], "sigma_px": worst.sigma, "limit_px": limit}
+    return (Notice("weak-join", text, pairs=len(weak), **fields),)

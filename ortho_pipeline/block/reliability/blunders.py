@@ -20,11 +20,11 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection, State
 from ortho_pipeline.block.equations.solver import NEAR, Solved, attempt, once, solve_inside
 from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.reliability.standardised_residuals import SCALE_FLOOR, StandardisedResiduals, standardise
+from ortho_pipeline.block.reliability.standardised_residuals import StandardisedResiduals, standardise
 from ortho_pipeline.block.reliability.suspects import GrossError, Trusted, judge
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.grid import estimate, reweighed
-from ortho_pipeline.estimation.blunders import BLUNDER_RISK, refuse_many
+from ortho_pipeline.estimation.blunders import BLUNDER_RISK, SCALE_FLOOR, refuse_many
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.estimation.statistics import chance_of
 from ortho_pipeline.models.base import Array

@@ -20,15 +20,10 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.standardised_residuals import standardise_ground
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.estimation.blunders import FAR_ABOVE, are_alike, contradicting
+from ortho_pipeline.estimation.blunders import FAR_ABOVE, NAMED, OUTLYING_RISK, are_alike, contradicting
 from ortho_pipeline.estimation.statistics import chance_of, rms
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
-
-#: Chance that of a good block any point is named.
-_RISK = 0.01
-#: Contradicting check points that one notice names.
-_NAMED = 10
 
 
 class ContradictedPoint(Record):
@@ -104,7 +99,7 @@ def outlying(
             }
         )
         for k, what, metres, sigmas, chance in found
-        if chance < _RISK / len(found)
+        if chance < OUTLYING_RISK / len(found)
     )
 
 
@@ -135,10 +130,10 @@ def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals:
     )
     text = f"{who}: RMSE {_both(every)} over all {tested.sum()}{without}; {places}"
     fields = {
-        "count": int(tested.sum()), "off": int(off.sum()), "rmse_m": every, "points": names[:_NAMED],
+        "count": int(tested.sum()), "off": int(off.sum()), "rmse_m": every, "points": names[:NAMED],
         "rest_m": rest if without else None, "alike": are_alike(np.nan_to_num(residuals[off])),
     }  # fmt: skip
-    others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:_NAMED]]
+    others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:NAMED]]
     return [Notice("checks-apart", text, **fields), *others]
 
 

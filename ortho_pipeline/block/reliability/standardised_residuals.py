@@ -13,13 +13,12 @@ import numpy as np
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
+from ortho_pipeline.estimation.blunders import SCALE_FLOOR
 from ortho_pipeline.estimation.statistics import left_out
 from ortho_pipeline.models.base import Array
 
-#: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
-SCALE_FLOOR = 1e-3
 #: Directions in which a part has less than this share of redundancy cannot be tested in it.
-_TESTABLE = 0.01
+TESTABLE = 0.01
 #: Median of chi squared of 1, 2 and 3 degrees of freedom.
 _MEDIANS = np.array([np.nan, 0.4549, 1.3863, 2.3660])
 
@@ -59,7 +58,7 @@ def standardise(solved: Solved) -> StandardisedResiduals:
     linear, weights = solved.linear, solved.linear.weights
     of_rays, of_ground = solved.points.hats(solved.cofactors)
     rays, ray_rank = np.zeros(len(of_rays)), np.zeros(len(of_rays), dtype=np.int64)
-    point_kernel.squares(linear.ordering.rays, of_rays, linear.misfits.rays, _TESTABLE, rays, ray_rank)
+    point_kernel.squares(linear.ordering.rays, of_rays, linear.misfits.rays, TESTABLE, rays, ray_rank)
     ground, ground_rank = _of_ground(solved, of_ground)
     return StandardisedResiduals(rays / weights.ray_weights, ray_rank, ground / weights.ground_weights, ground_rank)
 
@@ -76,9 +75,9 @@ def _of_ground(solved: Solved, hats: Array) -> tuple[Array, Index]:
     """
     used = solved.linear.ordering.grounded
     squares, rank = np.zeros(len(hats)), np.zeros(len(hats), dtype=np.int64)
-    found = left_out(np.eye(3) - hats[used], solved.linear.misfits.ground[used], known=_TESTABLE)
+    found = left_out(np.eye(3) - hats[used], solved.linear.misfits.ground[used], known=TESTABLE)
     squares[used] = found.squares
-    # A height of a surface weighs less where it contradicts, but is not tested here.
+    # Heights of a surface are weighed by their squares too, but tested in `block.heights`.
     control = solved.problem.placed[used]
     rank[used[control]] = found.rank[control]
     return squares, rank

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -13,8 +12,39 @@ from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text, counted
+
+
+class ImageVariance(Record):
+    """The factor of the stated sigmas of measurements, and their part of the redundancy."""
+
+    factor: float
+    redundancy: float
+
+
+class GroundVariance(Record):
+    """The sigma of ground that states none, of how many points, and its part of the redundancy."""
+
+    sigma: float | None
+    points: Count
+    redundancy: float
+
+
+class UnstatedGround(Record):
+    """In plan (each axis) and in height."""
+
+    xy: GroundVariance
+    h: GroundVariance
+
+
+class VariancesRecord(Record):
+    """Standard deviations of the observations, as stated or found; separable is whether they can be told apart."""
+
+    image: ImageVariance
+    unstated_ground: UnstatedGround
+    separable: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,19 +141,19 @@ class Variances:
         text = Text(f"{who}: estimated as {' and '.join(found)}; ", remedy)
         return [Notice("unstated-sigma", text, count=number, sigma_xy=self.sigma_xy, sigma_h=self.sigma_h)]
 
-    def to_json(self) -> dict[str, Any]:
-        """Return JSON values."""
-        ground = {
-            axis: {"sigma": sigma, "points": points, "redundancy": part}
-            for axis, sigma, points, part in zip(
-                ("xy", "h"), (self.sigma_xy, self.sigma_h), self.unstated, self.redundancy[1:], strict=True
-            )
-        }
-        return {
-            "image": {"factor": self.image, "redundancy": self.redundancy[0]},
-            "unstated_ground": ground,
-            "separable": self.separable,
-        }
+    @property
+    def record(self) -> VariancesRecord:
+        """What is published of them."""
+        of_image, of_plan, of_height = self.redundancy
+        plan, height = self.unstated
+        return VariancesRecord(
+            image=ImageVariance(factor=self.image, redundancy=of_image),
+            unstated_ground=UnstatedGround(
+                xy=GroundVariance(sigma=self.sigma_xy, points=plan, redundancy=of_plan),
+                h=GroundVariance(sigma=self.sigma_h, points=height, redundancy=of_height),
+            ),
+            separable=self.separable,
+        )
 
 
 @dataclass(frozen=True, eq=False)

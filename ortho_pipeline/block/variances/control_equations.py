@@ -20,7 +20,7 @@ _FINEST = 1e-4
 #: what is known counts as nothing.
 _FAR_LESS, _TOLD = 0.5, 1e-13
 #: Numbers of the equations of nodes that are in memory together: what a processor keeps near.
-_AT_ONCE = 1 << 17
+_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class ControlEquations:
         ground = problem.on_points(linear.state.local, self.rows)
         self.observed, self.d = ground.observed, ground.apart
         self.u, by_params, self.ue = self._control(linear, ground.axes)
-        self.unstated = self.observed & (problem.points.sigma_ground[self.rows] == 0)
+        self.unstated = problem.unstated[self.rows]
         self.weights = ground.sigmas**-2.0
         own = self.u + diagonal(self.weights)
         self.root = _root(solved.cofactors, own, by_params, linear.pseudo_design)
@@ -91,7 +91,7 @@ class ControlEquations:
         self.image_right = flat.T @ right.ravel() - self.pseudo_right
         self.square = float((linear.misfits.rays**2).sum())
         self.points = linear.ordering.points
-        # Heights of a surface under ties are of the rest, which they leave less to determine.
+        # Heights of a surface under ties are not of the control, but determine a part of the unknowns.
         of_heights, hats = solved.heights
         self.observations = linear.ordering.observations + float(hats[~problem.placed[of_heights]].sum())
         pixel = np.linalg.norm(linear.by_point, axis=2)[linear.by_point.any(axis=(1, 2))]
@@ -213,7 +213,7 @@ def _inverted(matrices: Array) -> tuple[Array, Array]:
 def _factors(matrices: Array) -> Array:
     """Return the lower Cholesky factors of matrices ``(b, k, k)``; NaN where they are not positive definite."""
     try:
-        return np.linalg.cholesky(matrices)
+        return np.asarray(np.linalg.cholesky(matrices))
     except np.linalg.LinAlgError:
         if len(matrices) == 1:
             return np.full_like(matrices, np.nan)

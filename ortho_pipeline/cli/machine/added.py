@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import click
 
 from ortho_pipeline.errors import PluginError, described
-from ortho_pipeline.plugins.registry import Registry
+from ortho_pipeline.host.registry import Registry
 
 if TYPE_CHECKING:
     from ortho_pipeline.hookspecs import Subcommand
-    from ortho_pipeline.plugins.registry import Broken, Provenance
+    from ortho_pipeline.host.registry import Broken, Origin
 
 GROUP = "ortho_pipeline_commands"
 
@@ -36,7 +36,7 @@ class AddedCommands:
         self._registry.register_installed()
         self.offers: Mapping[str, Subcommand] = self._registry.commands()
 
-    def packages(self) -> tuple[Provenance, ...]:
+    def packages(self) -> tuple[Origin, ...]:
         """Return where each package came from."""
         return tuple(self._registry.origin.values())
 

@@ -19,8 +19,8 @@ def doctor(fetch_grids: bool, as_json: bool) -> None:
     from ortho_pipeline.cli.program import cli
 
     document = commands.doctor(fetch_grids=fetch_grids)
-    document["plugins"] += [one.to_json() for one in cli.added.packages()]
-    document["broken"] += [one.to_json() for one in cli.added.broken()]
+    document["plugins"] += [vars(one) for one in cli.added.packages()]
+    document["broken"] += [vars(one) for one in cli.added.broken()]
     if as_json:
         return print_json(document)
     gdal, proj = document["gdal"], document["proj"]
@@ -35,6 +35,7 @@ def doctor(fetch_grids: bool, as_json: bool) -> None:
         say(f"fetched    {fetched['grid']} to {fetched['path']}")
     for plugin in document["plugins"]:
         say(f"plugin     {plugin['plugin']} ({plugin['distribution']} {plugin['version']})")
+    say(f"formats    {', '.join(document['formats'])}")
     for broken in document["broken"]:
         say(f"broken     {broken['plugin']}: {broken['error']}")
     return None

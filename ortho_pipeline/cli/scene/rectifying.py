@@ -79,17 +79,23 @@ def rectify(
     return print_result(result, as_json)
 
 
+class _Formats(click.Option):
+    """The option ``--format``: its help names the formats that are installed."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the option and its help, for which the plugins are loaded."""
+        from ortho_pipeline import commands
+
+        listed = ", ".join(f"{name} ({title})" for name, title in commands.formats().items())
+        self.help = f"{listed}. May be repeated.  [default: the four kinds of RPC]"
+        return super().get_help_record(ctx)
+
+
 @click.command(cls=Command)
 @image_argument
 @folder_option
-@click.option(
-    "--format",
-    "formats",
-    multiple=True,
-    metavar="F[,F...]",
-    help="rpc-txt, rpb, tag, vrt, gcp, gcp-tag, geolocation, csm; may be repeated  [default: the four kinds of RPC]",
-)
-@click.option("--force", is_flag=True, help="Accept an RPC that is more than 0.1 px from the model.")
+@click.option("--format", "formats", cls=_Formats, multiple=True, metavar="F[,F...]", help="What to write.")
+@click.option("--force", is_flag=True, help="Accept a file that is more than 0.1 px from the model.")
 @point_options
 @match_options
 @scene_options

@@ -1,4 +1,4 @@
-"""Examples of every command: they stand in its help, and the tests run them in a copy of the sample data."""
+"""Examples of every command of the host: they stand in its help; tests run them in a copy of the sample data."""
 
 from __future__ import annotations
 
@@ -48,12 +48,6 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
         (
             "Control points from an orthoimage, and a page that shows them:",
             "ortho match scene.tif --reference reference.tif --dem dem.tif -o matches.geojson --report matches.html",
-        ),
-    ),
-    "measure": (
-        (
-            "Points by hand, beside the reference, in the browser:",
-            "ortho measure scene.tif --reference reference.tif --dem dem.tif -o points.geojson",
         ),
     ),
     "export": (
@@ -115,10 +109,3 @@ def with_examples(text: str | None, examples: Sequence[tuple[str, str]]) -> str 
         return text
     lines = [f"    {line}" for about, command in examples for line in (f"# {about}", command)]
     return "\n\n".join([inspect.cleandoc(text or ""), "\b\nExamples:", "\n".join(["\b", *lines])])
-
-
-def examples_of_study(group: str, name: str) -> Sequence[tuple[str, str]]:
-    """Return the example of a study's command: what a plugin brings has one, too."""
-    if group == "simulate":
-        return (("Always the same scene for the same seed:", f"ortho simulate {name} --seed 1 -o {name}_1"),)
-    return (("Quickly, with less certain percentiles:", f"ortho reproduce {name} --realisations 3 -o {name}_page"),)

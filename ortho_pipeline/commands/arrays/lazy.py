@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.commands.heights.surfaces import require_heights
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
-from ortho_pipeline.commands.resolved.request import Request, point_options
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.scene_fit import adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.process_limits import Resources, one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -26,12 +25,14 @@ from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.runtime.process_limits import Resources, one_blas_thread
 from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     import xarray
 
     from ortho_pipeline.warp.engine import TileMaker
+    from ortho_pipeline.warp.job import WarpJob
 
 #: Options of files, and of rasters besides the ortho.
 _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
@@ -72,17 +73,15 @@ def ortho_array(
     InputError
         As `rectify`; for chunks that are no multiple, options that mean further files, and without xarray and dask.
     """
+    assert isinstance(points, PointOptions), "with_items makes options of points"
     side = _side(chunks)
     for field in _IDLE:
         if getattr(output, field) != getattr(OutputOptions(), field):
             raise InputError("an array is the ortho alone", field=f"output.{field}", remedy="leave it out")
-    if output.engine != "ortho":
-        raise InputError(
-            "GDAL's warper makes files", field="output.engine", remedy=Text("leave out ", Setting("output.engine"))
-        )
+    _tile_maker_of(output)
     surface = dem if isinstance(dem, SurfaceOptions) else SurfaceOptions(dem=dem)
     require_heights(surface)
-    request = Request(image, scene, point_options(points), surface, match, output)
+    request = Request(image, scene, points, surface, match, output)
     placed = place_scene(adjustable(request))
     path = placed.scene.path if isinstance(image, Scene) else image
     # What is sent to other processes holds no options but these.
@@ -101,6 +100,17 @@ def _side(chunks: int | None) -> int:
             f"blocks of {chunks} pixels are not made", field="chunks", remedy=f"a multiple of {BLOCK}, such as {TILE}"
         )
     return side
+
+
+def _tile_maker_of(output: OutputOptions) -> Callable[[WarpJob], TileMaker]:
+    from ortho_pipeline.warp.engines import engine_of
+
+    make = engine_of(output.engine).tile_maker
+    if make is None:
+        raise InputError(
+            "GDAL's warper only makes files", field="output.engine", remedy=Text("leave out ", Setting("output.engine"))
+        )
+    return make
 
 
 class Tiles:
@@ -129,13 +139,12 @@ class Tiles:
         return made.pixels, made.valid
 
     def _ready(self) -> TileMaker:
-        from ortho_pipeline.warp.engine import tile_maker
         from ortho_pipeline.warp.job import WarpJob
 
         with self._lock:
             if self._maker is None:
                 model, _, surface, grid, output = self._parts
-                self._maker = tile_maker(WarpJob(
+                self._maker = _tile_maker_of(output)(WarpJob(
                     model, self._source, surface, grid, output.resampling, output.dem_interpolation, output.tolerance,
                     Resources(output.memory), profile=self.profile,
                 ))  # fmt: skip

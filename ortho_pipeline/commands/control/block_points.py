@@ -170,12 +170,13 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
 
 
 def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
-    """Refuse what is said of heights that are no observations."""
+    """Refuse options of observed heights if no heights are observed."""
+    remedy = Setting("surface.dem") if surface.dem is None else Setting("points.dem_heights", "on")
     for name in ("dem_bias", "dem_correlation", "dem_shift_sigma"):
         if getattr(options, name) is not None and not observes(options, surface):
             raise InputError(
-                "this is said of heights that are observed, and there are none", field=f"points.{name}",
-                remedy=Text("leave it out, or give ", Setting("surface.dem")),
+                "this describes DEM heights that are observations, and there are none", field=f"points.{name}",
+                remedy=Text("leave it out, or give ", remedy),
             )  # fmt: skip
 
 

@@ -20,10 +20,10 @@ from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import together
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import write_points
 from ortho_pipeline.report import document as reports
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.base import Surface
 
 #: Suffixes of files that say all that is known of a match.

@@ -14,13 +14,13 @@ import numpy as np
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.points import read_control
-from ortho_pipeline.commands.heights.automatic import is_automatic
+from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
 from ortho_pipeline.commands.resolved.request import Request
-from ortho_pipeline.commands.stac.given import is_collected
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.crop import UndecidedCrop, nearer, noted_offset
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
@@ -108,7 +108,7 @@ def _by_points(undecided: UndecidedCrop, points: Points) -> tuple[bool, str] | N
 
 def _by_heights(undecided: UndecidedCrop, surface: SurfaceOptions, options: SceneOptions) -> tuple[bool, str] | None:
     """Return whether the model is to be moved, where the DEM lies under the crop for one of both alone."""
-    if surface.dem is None or is_automatic(surface) or is_collected(surface.dem):
+    if surface.dem is None or surface.dem == AUTO or Location(surface.dem).is_collection:
         return None
     heights = open_surface(surface, options)
     assert isinstance(heights, DemSurface)

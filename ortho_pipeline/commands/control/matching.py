@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Iterator
@@ -15,8 +16,8 @@ import numpy as np
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
@@ -26,7 +27,15 @@ from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
-from ortho_pipeline.report.matching import MatchComponents
+from ortho_pipeline.report.matching import (
+    Candidate,
+    MatchComponents,
+    MatchCoverage,
+    MatchingRecord,
+    MatchLevel,
+    Tested,
+)
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
 
@@ -107,47 +116,59 @@ class Matched:
         shift: Array = -np.median(self.matches.offset[self.kept], axis=0)
         return shift
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the section ``matching`` of documents (docs/formats.md)."""
+    @functools.cached_property
+    def record(self) -> MatchingRecord:
+        """What is published of it; what its points say of a fit is told by `tested_by`."""
         from ortho_pipeline.imaging.matching import REASONS
 
         matches, kept, points = self.matches, self.kept, self.matches.points
         reasons = {name: int((matches.reason == name).sum()) for name in REASONS}
-        parts = matches.components
-        found = {
-            "references": list(self.references),
-            "reference_sigma_m": self.options.reference_sigma,
-            "dem_sigma_m": self.dem_sigma,
-            "search_m": self.search.distance,
-            "search_from": self.search.source,
-            "pixel_m": self.pixel,
-            "tried": len(kept),
-            "kept": int(kept.sum()),
-            "control": int(points.control.sum()),
-            "check": int(points.check.sum()),
-            "reasons": {name: count for name, count in reasons.items() if count},
-            "levels": [
-                {"factor": one.factor, "radius": one.radius, "chips": one.chips, "agreeing": one.agreeing,
-                 "shift_px": [-one.shift[0], -one.shift[1]]}
+        shift, parts = self.shift, matches.components
+        return MatchingRecord(
+            references=self.references,
+            reference_sigma_m=self.options.reference_sigma,
+            dem_sigma_m=self.dem_sigma,
+            search_m=self.search.distance,
+            search_from=self.search.source,
+            pixel_m=self.pixel,
+            tried=len(kept),
+            kept=int(kept.sum()),
+            control=int(points.control.sum()),
+            check=int(points.check.sum()),
+            reasons={name: count for name, count in reasons.items() if count},
+            levels=tuple(
+                MatchLevel(factor=one.factor, radius=one.radius, chips=one.chips, agreeing=one.agreeing,
+                           shift_px=(-one.shift[0], -one.shift[1]))
                 for one in matches.levels
-            ],
-            "shift_px": self.shift,
-            "shift_m": float(np.hypot(*self.shift)) * self.pixel,
-            "components": {"matching": parts.matching, "height_m": parts.height, "other_px": parts.other},
-            "sigma_px": float(np.median(points.sigma_image)),
-            "correlation": median_correlation(matches),
-            "coverage": self._coverage(),
-            "candidates": [
-                {"id": f"m{cell}", "image": place, "score": score, "reason": reason or None}
+            ),
+            shift_px=(shift[0], shift[1]),
+            shift_m=float(np.hypot(*shift)) * self.pixel,
+            components=MatchComponents(matching=parts.matching, height_m=parts.height, other_px=parts.other),
+            sigma_px=float(np.median(points.sigma_image)),
+            correlation=median_correlation(matches),
+            coverage=self._coverage(),
+            candidates=tuple(
+                Candidate(id=f"m{cell}", image=place, score=score, reason=reason or None)
                 for cell, place, score, reason in zip(
-                    matches.cell, matches.image, matches.score, matches.reason, strict=True
+                    matches.cell, *map(json_value, (matches.image, matches.score, matches.reason)), strict=True
                 )
-            ],
-        }  # fmt: skip
-        document: dict[str, Any] = json_value(found)
-        return document
+            ),
+            relative=None,
+            absolute=None,
+        )  # fmt: skip
 
-    def _coverage(self) -> dict[str, Any]:
+    def tested_by(self, fit: Fit) -> MatchingRecord:
+        """Return the record with what matches and measured points say of a fit that they took no part in."""
+        checks, matched = fit.points.check, fit.points.groups >= 0
+        return self.record.replaced(
+            relative=Tested.of(fit, checks & matched), absolute=Tested.of(fit, checks & ~matched)
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the section ``matching`` of documents without a fit (docs/engineering/formats.md)."""
+        return self.record.model_dump(mode="json", exclude={"relative", "absolute"})
+
+    def _coverage(self) -> MatchCoverage:
         """Return how many matches were tried and kept in each field of the image, rows of columns."""
         counts = {}
         side = int(np.clip(round(math.sqrt(len(self.kept) / _PER_FIELD)), 1, _FIELDS))
@@ -155,31 +176,30 @@ class Matched:
             part = np.clip(self.matches.image[mask] / self.size * side, 0, side - 1).astype(int)
             counts[name] = np.bincount(part[:, 1] * side + part[:, 0], minlength=side**2).reshape(side, side)
         share = float((counts["kept"] > 0).mean())
-        return {"share": share, **{name: number.tolist() for name, number in counts.items()}}
+        return MatchCoverage.model_validate({"share": share, **{name: one.tolist() for name, one in counts.items()}})
 
     def summary(self) -> list[tuple[str, str]]:
         """Return what people read of it, as rows of a name and a text."""
         from ortho_pipeline.imaging.matching import REASONS
 
-        said = self.to_json()
-        column, row = said["shift_px"]
-        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said["reasons"].items())
+        said = self.record
+        column, row = said.shift_px
+        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said.reasons.items())
         levels = "; ".join(
-            f"{one['agreeing']} of {counted(one['chips'], 'chip')} of 1/{one['factor']} resolution agree"
-            for one in said["levels"]
+            f"{one.agreeing} of {counted(one.chips, 'chip')} of 1/{one.factor} resolution agree" for one in said.levels
         )
         sigma = self.options.reference_sigma
         return [
             ("reference", ", ".join(Path(one).name for one in self.references)
              + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated")),
-            ("matches", f"{said['kept']} of {said['tried']} tried{': ' + reasons if reasons else ''}"),
-            ("", f"{said['control']} control, {said['check']} check (every fifth cell), in "
-             f"{said['coverage']['share']:.0%} of the fields of the image"),
+            ("matches", f"{said.kept} of {said.tried} tried{': ' + reasons if reasons else ''}"),
+            ("", f"{said.control} control, {said.check} check (every fifth cell), in "
+             f"{said.coverage.share:.0%} of the fields of the image"),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             ("model off", f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
-             f"{metres(said['shift_m'])}"),
-            ("accuracy", f"{px(said['sigma_px'])} in the middle of the matches, relative to the reference: "
-             f"{MatchComponents(**said['components']).text()}"),
+             f"{metres(said.shift_m)}"),
+            ("accuracy", f"{px(said.sigma_px)} in the middle of the matches, relative to the reference: "
+             f"{said.components.text()}"),
         ]  # fmt: skip
 
 

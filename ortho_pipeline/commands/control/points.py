@@ -166,7 +166,7 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
     }
     name, path = Path(scene.path).name, located(path, allow_network=request.scene.allow_network)
     table = read_table(path, name, pieces)
-    points = points_of(path, table, crs, vertical, origin)
+    points = points_of(table, crs, vertical, origin)
     # The same rows in the same order: the table says in which image each of them was measured.
     named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in table.rows])
     for piece in scene.pieces:

@@ -28,7 +28,6 @@ from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import one_blas_thread
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
@@ -36,6 +35,7 @@ from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.accuracy import typical_sigma
 from ortho_pipeline.surface.base import Surface
 
@@ -70,7 +70,7 @@ class Tied:
     notices: tuple[Notice, ...] = field(default=())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the section ``ties`` of documents (docs/formats/block-points.md)."""
+        """Return the section ``ties`` of documents (docs/engineering/formats.md)."""
         names = self.points.images
         counts = np.bincount(np.bincount(self.points.point))
         found: dict[str, Any] = {

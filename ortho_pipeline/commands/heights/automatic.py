@@ -23,11 +23,6 @@ from ortho_pipeline.surface.footprint import border
 AUTO = "auto"
 
 
-def is_automatic(options: SurfaceOptions) -> bool:
-    """Tell whether heights are to be found."""
-    return options.dem == AUTO
-
-
 def open_automatic(options: SurfaceOptions, access: SceneOptions, memory: int, scenes: Iterable[Scene]) -> DemSurface:
     """Return the heights under scenes, of the cells of the Copernicus DEM.
 

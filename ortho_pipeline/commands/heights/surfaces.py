@@ -6,10 +6,10 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 
-from ortho_pipeline.commands.heights.automatic import extents_under, is_automatic, open_automatic
-from ortho_pipeline.commands.stac.given import heights_given, is_collected
+from ortho_pipeline.commands.heights.automatic import AUTO, extents_under, open_automatic
+from ortho_pipeline.commands.stac.given import heights_given
 from ortho_pipeline.errors import InputError, completed, of_option
-from ortho_pipeline.files.stac.item import split
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
@@ -17,7 +17,8 @@ from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
-from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem import DemSurface, open_dem
+from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.mosaic import matching_files
 
 #: No height is less certain (m) than that: the Earth has none of that size.
@@ -53,13 +54,13 @@ def open_surface(
     require_heights(options)
     sigma = open_sigma(options, scene, memory)
     if options.height is not None:
-        return Surface.constant(options.height).with_sigma(sigma)
+        return FlatSurface(options.height).with_sigma(sigma)
     assert options.dem is not None
-    if is_automatic(options):
+    if options.dem == AUTO:
         return open_automatic(options, scene, memory, under).with_sigma(sigma)
     path = heights_given(options.dem, scene)
-    extents = extents_under(under) if is_collected(path) else []
-    return open_dem(path, options, scene, memory, extents).with_sigma(sigma)
+    extents = extents_under(under) if path.is_collection else []
+    return dem_as_stated(path, options, scene, memory, extents).with_sigma(sigma)
 
 
 def open_sigma(
@@ -80,7 +81,7 @@ def open_sigma(
     except (TypeError, ValueError):
         with completed(field="surface.sigma"):
             path = os.fspath(options.sigma)  # type: ignore[arg-type]
-            return Surface.open(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
+            return open_dem(path, "ellipsoid", override=True, fill="mask", memory=memory, **scene.access)
     if 0 < number <= _LARGEST_SIGMA:
         return number
     raise InputError(
@@ -89,8 +90,8 @@ def open_sigma(
     )  # fmt: skip
 
 
-def open_dem(
-    path: str | os.PathLike[str],
+def dem_as_stated(
+    path: Location,
     options: SurfaceOptions,
     scene: SceneOptions,
     memory: int = OutputOptions.memory,
@@ -111,22 +112,21 @@ def open_dem(
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     with completed(field="surface.dem"):
-        if is_collected(path):
+        if path.is_collection:
             return open_collected(
                 path, extents, vertical, options.override_vertical, options.fill, memory, scene.access
             )  # fmt: skip
-        return Surface.open(
+        return open_dem(
             path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
         )
 
 
 def dem_files(options: SurfaceOptions) -> list[str]:
     """Return the files of the DEM that the user gave: one, those of a pattern, a collection's document, or none."""
-    if options.dem is None or is_automatic(options):
+    if options.dem is None or options.dem == AUTO:
         return []
-    if is_collected(options.dem):
-        return [split(options.dem)[0]]
-    return [*(matching_files(options.dem) or [os.fspath(options.dem)])]
+    dem = Location(options.dem)
+    return [dem.document] if dem.is_collection else [*(matching_files(dem) or [dem])]
 
 
 def require_heights(options: SurfaceOptions) -> None:

@@ -17,18 +17,18 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report.document import accuracy_style
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
 if TYPE_CHECKING:
     from ortho_pipeline.raster.regridded import Regridded
-    from ortho_pipeline.warp.job import WarpResult
+    from ortho_pipeline.warp.job import WarpRecord
     from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
     from ortho_pipeline.warp.layers.hiding import Hiding
 
@@ -197,7 +197,7 @@ def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | No
 
 
 def write_layers(
-    placed: Placement, known: Known | None, warped: WarpResult, files: Mapping[str, Path]
+    placed: Placement, known: Known | None, warped: WarpRecord, files: Mapping[str, Path]
 ) -> AccuracyLayer | None:
     """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
     if known is None:

@@ -11,13 +11,13 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import ENDINGS, Result, attempted, to_store
 from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import allowed, states, together, write_json
-from ortho_pipeline.files.locations import is_far, located, place
-from ortho_pipeline.files.process_limits import Resources
+from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.options import MosaicOptions
 from ortho_pipeline.raster.block_cache import cache_restored
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.report.mosaic.document import mosaic_document, summary_text
 from ortho_pipeline.report.mosaic.page import write_page
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.warp.mosaic import (
     Ortho,
     Overlap,
@@ -78,7 +78,7 @@ def mosaic(
 
 def _refuse_far(orthos: Sequence[Path]) -> None:
     for ortho in orthos:
-        if is_far(ortho):
+        if Location(ortho).is_far:
             raise InputError("a VRT refers to orthos below its own folder", file=ortho, field="output",
                              remedy="let the name of the mosaic end in .tif")  # fmt: skip
 
@@ -104,7 +104,7 @@ def assemble(
     resources: Resources | None = None,
     measure: Measure | None = None,
 ) -> tuple[dict[str, Any], ReportError | None]:
-    """Write a mosaic and its page; return its document (docs/run.md), which the caller writes.
+    """Write a mosaic and its page; return its document (docs/mosaic.md), which the caller writes.
 
     The error is that of a page that could not be made; it costs no mosaic.
 

@@ -15,18 +15,17 @@ from typing import Any
 import pyproj
 
 from ortho_pipeline.commands.resolved.request import Request
-from ortho_pipeline.commands.stac.given import is_collected
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import sha256, states
 from ortho_pipeline.files.json.values import software_version
-from ortho_pipeline.files.locations import archive_of, is_far
-from ortho_pipeline.files.process_limits import thread_pool
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.files.traffic import bytes_read
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
+from ortho_pipeline.runtime.process_limits import thread_pool
 from ortho_pipeline.surface.base import Surface
 
 #: Roles of files that have pixels, and of those among them whose side-cars are entered too.
@@ -71,14 +70,14 @@ class Ledger:
 
         def enter(role: str, paths: Iterable[str | os.PathLike[str] | None], *, attached: bool = False) -> None:
             for name in (name for name in paths if name is not None):
-                path = archive_of(os.fspath(name)) or Path(name)
+                path = Location(name).archive or Path(name)
                 if path.is_file():
                     found.setdefault(path, role)
                 if attached:
                     enter(role, _files_of(name, request.scene))
 
         for role, path in request.files:
-            enter(role, [path], attached=role in _ATTACHING and not (role == "DEM" and is_collected(path)))
+            enter(role, [path], attached=role in _ATTACHING and not (role == "DEM" and Location(path).is_collection))
         if scene is not None:
             enter("image", [scene.path, *scene.rasters])
             if scene.path != Path(request.image):
@@ -87,7 +86,8 @@ class Ledger:
         if surface is not None:
             # Of heights that were found: what led to them, and the files.
             enter("DEM", surface.provenance.get("documents", ()))
-            enter("DEM", (one for one in surface.files if Path(one) not in found and not is_far(one)), attached=True)
+            read = (one for one in surface.files if Path(one) not in found and not Location(one).is_far)
+            enter("DEM", read, attached=True)
         roles = dict(sorted(found.items(), key=lambda entry: _ORDER.get(entry[1], 1)))
         return cls(roles, {**states(roles), **(begun or {})})
 

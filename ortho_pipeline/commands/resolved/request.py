@@ -8,15 +8,9 @@ from typing import Any
 
 from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.points import Points
 
 #: In place of a file of points: the ground control points that the image itself holds.
 OWN_POINTS = "own"
-
-
-def point_options(points: PointOptions | Points) -> PointOptions:
-    """Return options; points that are read already are used as they are."""
-    return PointOptions(gcps=points) if isinstance(points, Points) else points
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 
 from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.points import read_control
@@ -11,15 +12,18 @@ from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
-from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.errors import InputError, ModelError, completed
 from ortho_pipeline.files import states
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import lay
 
 
 def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
-    """Open the scene of a request, its heights and its points.
+    """Open the scene of a request, its heights, its points and the raster that gives the grid.
 
     Points, heights and matches settle whether the model of a crop belongs to it.
 
@@ -40,7 +44,7 @@ def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
         surface = open_surface(request.surface, request.scene, request.output.memory, [scene])
     ledger = Ledger.of(request, scene, surface, begun)
     scene = on_surface(scene, surface)
-    return Resolved(request, scene, surface, read_control(scene, request, surface), ledger)
+    return Resolved(request, scene, surface, read_control(scene, request, surface), _grid_like(request), ledger)
 
 
 def on_surface(scene: Scene, surface: Surface | None) -> Scene:
@@ -55,3 +59,19 @@ def on_surface(scene: Scene, surface: Surface | None) -> Scene:
         with contextlib.suppress(ModelError, InputError):
             models[name] = lay(model, surface, scene.width, scene.height).fitted(model)
     return dataclasses.replace(scene, models=models)
+
+
+def _grid_like(request: Request) -> Grid | None:
+    """Return the grid of the raster that an ortho is to match; None where none is given."""
+    output = request.output
+    if output.like is None:
+        return None
+    given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
+    if given:
+        raise InputError(
+            Text(Setting("output.like"), " gives the grid, and ", Setting(f"output.{given[0]}"), " would change it"),
+            field=f"output.{given[0]}",
+            remedy="leave out one of the two",
+        )  # fmt: skip
+    with completed(os.fspath(output.like), field="output.like"):
+        return grid_of(output.like, **request.scene.access)

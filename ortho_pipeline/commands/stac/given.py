@@ -11,11 +11,11 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.beside import ask_beside
-from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.stac.collection import is_collection
-from ortho_pipeline.files.stac.item import Asset, Item, is_item, item_at, read_item, split
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.points import Points
+from ortho_pipeline.stores.beside import ask_beside
+from ortho_pipeline.stores.stac.item import Asset, Item, item_at, read_item
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -44,7 +44,7 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
                 given[name], scene = resolved(value, scene)
             elif name == _IMAGES:
                 given[name] = [_one_of_several(image, scene) for image in value]
-            elif name == _DEM and not isinstance(value, SurfaceOptions):
+            elif name == _DEM and not isinstance(value, SurfaceOptions | None):
                 given[name] = heights_given(value, scene)
             else:
                 given[name] = _in_options(value, scene)
@@ -71,45 +71,47 @@ def resolved(image: Any, scene: SceneOptions) -> tuple[Any, SceneOptions]:
     InputError
         If it is no item, or its asset is not known.
     """
-    if not is_item(image):
+    place = _item_at(image)
+    if place is None:
         return image, scene
-    item, chosen = _chosen(image, scene)
+    item, chosen = _chosen(place, scene)
     if scene.rpc is not None or scene.model is not None or "rpc" in scene.sensor_options:
         return chosen.href, scene
     rpc = item.rpc_of(chosen)
     return chosen.href, scene if rpc is None else replace(scene, rpc=rpc.href)
 
 
-def is_collected(dem: str | os.PathLike[str]) -> bool:
-    """Tell by its name whether a DEM is a STAC collection; an item has given way to its raster before."""
-    return is_collection(split(dem)[0])
-
-
-def heights_given(dem: Any, scene: SceneOptions) -> Any:
-    """Return the raster of heights that a STAC item stands for; a collection, and anything else, as it is.
+def heights_given(dem: str | os.PathLike[str], scene: SceneOptions) -> Location:
+    """Return where heights are: of a STAC item its raster; a collection, and anything else, as it is.
 
     Raises
     ------
     InputError
         If its asset is not known.
     """
-    if not is_item(dem):
-        return dem
-    address, key = split(dem)
-    item = item_at(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
-    return dem if item is None else item.heights(key).href
+    place = Location(dem)
+    if not place.is_item:
+        return place
+    item = item_at(place.document, allow_network=scene.allow_network, roots=tuple(scene.roots))
+    return place if item is None else Location(item.heights(place.asset).href)
 
 
-def _chosen(image: Any, scene: SceneOptions) -> tuple[Item, Asset]:
-    address, key = split(image)
-    item = read_item(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
-    return item, item.image(key)
+def _item_at(value: Any) -> Location | None:
+    """Return the place that a value names, if it may be that of a STAC item."""
+    place = Location(value) if isinstance(value, str | os.PathLike) else None
+    return place if place is not None and place.is_item else None
+
+
+def _chosen(place: Location, scene: SceneOptions) -> tuple[Item, Asset]:
+    item = read_item(place.document, allow_network=scene.allow_network, roots=tuple(scene.roots))
+    return item, item.image(place.asset)
 
 
 def _one_of_several(image: Any, scene: SceneOptions) -> Any:
-    if not is_item(image):
+    place = _item_at(image)
+    if place is None:
         return image
-    item, chosen = _chosen(image, scene)
+    item, chosen = _chosen(place, scene)
     rpc = item.rpc_of(chosen)
     if rpc is not None:
         raise InputError(
@@ -120,33 +122,37 @@ def _one_of_several(image: Any, scene: SceneOptions) -> Any:
 
 
 def _in_options(value: Any, scene: SceneOptions) -> Any:
-    """Return options with the files in place of items."""
+    """Return options with the files in place of items; points that are read already become options."""
 
     def raster(path: Any) -> Any:
-        return _chosen(path, scene)[1].href if is_item(path) else path
+        place = _item_at(path)
+        return path if place is None else _chosen(place, scene)[1].href
 
     if isinstance(value, SurfaceOptions):
-        return replace(value, dem=heights_given(value.dem, scene), sigma=raster(value.sigma))
+        dem = None if value.dem is None else heights_given(value.dem, scene)
+        return replace(value, dem=dem, sigma=raster(value.sigma))
     if isinstance(value, MatchOptions):
         return replace(value, reference=tuple(map(raster, value.reference)))
     if isinstance(value, OutputOptions):
         return replace(value, fill_from=raster(value.fill_from), like=raster(value.like))
-    if isinstance(value, PointOptions) and is_item(value.gcps):
-        return replace(value, gcps=_points(cast(str, value.gcps), scene))
+    if isinstance(value, Points):
+        return PointOptions(gcps=value)
+    if isinstance(value, PointOptions) and (table := _item_at(value.gcps)) is not None:
+        return replace(value, gcps=_points(table, scene))
     return value
 
 
-def _points(path: str | os.PathLike[str], scene: SceneOptions) -> str | os.PathLike[str]:
+def _points(place: Location, scene: SceneOptions) -> str:
     """Return the table of an item; a GeoJSON file that is no item is a table itself."""
-    address, key = split(path)
-    if not key and not is_far(address) and b'"stac_version"' not in read_bounded(address, _TABLE_BYTES):
-        return path
+    file, key = place.document, place.asset
+    if not key and not file.is_far and b'"stac_version"' not in read_bounded(file, _TABLE_BYTES):
+        return place
     try:
-        item = read_item(address, allow_network=scene.allow_network, roots=tuple(scene.roots))
+        item = read_item(file, allow_network=scene.allow_network, roots=tuple(scene.roots))
     except InputError:
         if key:
             raise
-        return path
+        return place
     return item.table(key).href
 
 
@@ -155,9 +161,9 @@ def _far(given: dict[str, Any]) -> list[Any]:
     images = [given.get(_IMAGE), *(given.get(_IMAGES) or ())]
     for value in given.values():
         if isinstance(value, SurfaceOptions):
-            images.append(None if value.dem is None or is_collected(value.dem) else value.dem)
+            images.append(None if value.dem is None or Location(value.dem).is_collection else value.dem)
         elif isinstance(value, MatchOptions):
             images += value.reference
         elif isinstance(value, OutputOptions):
             images += value.files.values()
-    return [path for path in images if isinstance(path, str | os.PathLike) and is_far(path)]
+    return [path for path in images if isinstance(path, str | os.PathLike) and Location(path).is_far]

@@ -9,13 +9,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-from ortho_pipeline import plugins
+from ortho_pipeline import host
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.plugins.unread import unread
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 
@@ -48,7 +49,7 @@ _MOST, _DEPTH = 2000, 3
 
 
 @dataclass(frozen=True)
-class Found:
+class SurveyedFile:
     """A file, by its path from the folder: what it is taken for, and what there is to say about it."""
 
     path: str
@@ -61,7 +62,7 @@ class Survey:
     """What lies in a folder."""
 
     folder: Path
-    found: tuple[Found, ...]
+    found: tuple[SurveyedFile, ...]
 
     def of(self, kind: Kind) -> list[str]:
         """Return the paths of a kind, from the folder."""
@@ -86,8 +87,7 @@ class Survey:
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho info FOLDER --json``."""
-        files = [{"path": one.path, "kind": one.kind, "said": one.said} for one in self.found]
-        return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": files}
+        return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": json_value(self.found)}
 
 
 def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Survey:
@@ -122,7 +122,7 @@ def _files(folder: Path, depth: int) -> Iterator[Path]:
             yield from _files(Path(entry.path), depth - 1)
 
 
-def _looked_at(path: Path, folder: Path, options: SceneOptions) -> Found | None:
+def _looked_at(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile | None:
     if any(path.name.endswith(ending) for ending in ENDINGS.values()) and _is_ours(path):
         return None
     suffix, name = path.suffix.lower(), str(path.relative_to(folder))
@@ -137,49 +137,55 @@ def _is_ours(path: Path) -> bool:
     return path.with_name(path.name.removesuffix(ending) + ENDINGS["report"]).exists()
 
 
-def _image(path: Path, name: str, options: SceneOptions) -> Found | None:
+def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
     try:
-        scene = plugins.open_scene(path, options.sensor, dict(options.sensor_options), **options.access)
+        scene = host.open_scene(path, options.sensor, dict(options.sensor_options), **options.access)
     except OrthoError as error:
         return _raster(path, name, options, error)
     models = ", ".join(scene.models)
-    return Found(
+    return SurveyedFile(
         name, "scene", f"{scene.width} x {scene.height}, {scene.sensor}, {models} of {_short(scene.model_source)}"
     )
 
 
-def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -> Found | None:
+def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -> SurveyedFile | None:
     """Say what an image is that no sensor opens; None for what is no image."""
     try:
         dataset = open_dataset(path, **options.access)
     except OrthoError as error:
-        return Found(name, "image", f"cannot be opened: {error.message}") if path.suffix.lower() in _PIXELS else None
+        return (
+            SurveyedFile(name, "image", f"cannot be opened: {error.message}")
+            if path.suffix.lower() in _PIXELS
+            else None
+        )
     size = f"{dataset.RasterXSize} x {dataset.RasterYSize}"
     kind = kind_of(dataset)
     if kind is None or not (is_upright(dataset) or unread(dataset) is None):
-        return Found(name, "image", f"{size}, no model: {refused.message}")
+        return SurveyedFile(name, "image", f"{size}, no model: {refused.message}")
     crs = dataset.GetSpatialRef()
     said = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
     datum = crs is None or crs.IsCompound() or crs.GetAxesCount() == 3
-    return Found(name, kind, said if kind != "dem" or datum else f"{said}, {NO_DATUM}")
+    return SurveyedFile(name, kind, said if kind != "dem" or datum else f"{said}, {NO_DATUM}")
 
 
-def _points(path: Path, name: str) -> Found | None:
+def _points(path: Path, name: str) -> SurveyedFile | None:
     try:
         points = read_points(path)
     except OrthoError as error:
         # Any text may end so; a table that says in its first line what it is gets told what it lacks.
         return (
-            Found(name, "points", f"to be completed: {error.message}") if error.field in ("crs", "vertical") else None
+            SurveyedFile(name, "points", f"to be completed: {error.message}")
+            if error.field in ("crs", "vertical")
+            else None
         )
     roles = [
         counted(int(mask.sum()), f"{role} point")
         for role, mask in (("control", points.control), ("check", points.check))
     ]
-    return Found(name, "points", ", ".join(roles))
+    return SurveyedFile(name, "points", ", ".join(roles))
 
 
-def _without_parts(found: list[Found]) -> list[Found]:
+def _without_parts(found: list[SurveyedFile]) -> list[SurveyedFile]:
     """Leave out what opens as the same image as another file: the metadata beside it."""
     scenes = {Path(one.path).with_suffix("") for one in found if one.kind == "scene" and not one.path.endswith(".xml")}
     return [

@@ -9,7 +9,7 @@ the errors at all points that took no part: check points, and control points eac
 3. Of the models within 2 % of the smallest expected error, the one with the fewest parameters.
 
 The smallest error at the points would be that of a model that is best by chance: there are some twenty candidates, and
-those with nearly as many parameters as observations vary most. docs/accuracy.md has what the choice costs.
+those with nearly as many parameters as observations vary most. docs/engineering/accuracy.md has what the choice costs.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
-from ortho_pipeline.estimation.choice.row import Row
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.models.base import Array
@@ -35,7 +35,7 @@ _Squares = dict[str, Array]
 
 
 def recommend(
-    rows: Sequence[Row],
+    rows: Sequence[ComparedModel],
     *,
     preferred: Sequence[str] = (),
     unsuited: Sequence[str] = (),
@@ -90,7 +90,7 @@ def _but(
     squares: _Squares,
     errors: Mapping[str, float],
     doubts: Mapping[str, str],
-    rows: Mapping[str, Row],
+    rows: Mapping[str, ComparedModel],
 ) -> str:
     """Return in words why the model with the smallest error at the points is not taken, and what to mind."""
     text = ""
@@ -111,7 +111,7 @@ def _shown(squares: Array) -> str:
     return f"{math.sqrt(squares.mean()):.3g} px"
 
 
-def _tests(rows: Sequence[Row]) -> tuple[_Squares, np.ndarray, int]:
+def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:
     """Return squared errors (px²) of each model at the points that test all of them, their mask, how many are checks.
 
     Without redundancy no control point can be left out; such models are tested where check points alone test all.
@@ -144,7 +144,7 @@ def _squares(found: Fit) -> Array:
     return squares
 
 
-def _doubts(row: Row, unsuited: Sequence[str]) -> str:
+def _doubts(row: ComparedModel, unsuited: Sequence[str]) -> str:
     """Return why a model is not recommended whatever its errors; empty if there is no reason.
 
     That it is uncertain at a corner is part of the error that is expected of it.
@@ -153,7 +153,9 @@ def _doubts(row: Row, unsuited: Sequence[str]) -> str:
     return " and ".join([*found, *(["unsuited to the scene"] if row.model in unsuited else [])])
 
 
-def _choose(squares: _Squares, errors: Mapping[str, float], rows: Mapping[str, Row], preferred: Sequence[str]) -> str:
+def _choose(
+    squares: _Squares, errors: Mapping[str, float], rows: Mapping[str, ComparedModel], preferred: Sequence[str]
+) -> str:
     """Return the model to take."""
     candidates: Sequence[str] = list(errors)
     if preferred:

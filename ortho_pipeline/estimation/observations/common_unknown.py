@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -95,10 +95,3 @@ class CommonUnknown:
             found = replace(found, value=found.value + step)
             solution = again(found, solution)
         return solution, found
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the section ``common_error`` of documents: sigmas and estimate per axis in metres."""
-        return {
-            "points": self.points, "sigma_m": self.sigma, "estimate_m": (self.value * self.sigma).tolist(),
-            "estimate_sigma_m": (np.sqrt(np.diag(self.left)) * self.sigma).tolist(),
-        }  # fmt: skip

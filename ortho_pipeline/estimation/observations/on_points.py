@@ -6,7 +6,8 @@ three axes of each point, how far what was observed is from where the point is, 
 - Known ground has the axes east, north and up. Of ground without a known height nothing is observed along the third.
 - A height of a surface is observed along the normal of its plane at the point (`Planes`).
 
-A further type gives its apart, axes and sigmas for its points in `block.equations.problem.BlockProblem.on_points`.
+A further type gives its apart, axes and sigmas for its points in `block.equations.problem.BlockProblem.on_points`. The
+sigmas of a block (`block.variances`) give covariances of these points along the axes.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
-from ortho_pipeline.estimation.statistics import student_of
+from ortho_pipeline.estimation.statistics import basis_of, student_of
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
@@ -83,7 +83,7 @@ class CovarianceFunction(Record):
 
 
 class Covariance(Record):
-    """Covariance analysis of residuals on the ground, per axis (x, y); docs/accuracy.md says what each number is."""
+    """Covariance analysis of residuals on the ground, per axis (x, y); see docs/engineering/accuracy.md."""
 
     # Pairs of numbers are per axis, in the unit of the residuals. Relative and correlation are those of pairs closer
     # than near_m, None where there is none; functions are None for an axis without a covariance that falls with
@@ -106,6 +106,25 @@ class Covariance(Record):
     critical: float | None
     verdict: Verdict
     statement: str
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether there were points enough for a test, and classes of distance."""
+        return self.p_joint is not None and len(self.classes) > 1
+
+
+class Covariances(Record):
+    """Of control and of check points, never of both together."""
+
+    control: Covariance | None = None
+    check: Covariance | None = None
+
+    @property
+    def drawn(self) -> tuple[Literal["control", "check"], Covariance] | None:
+        """The points whose analysis is drawn, and it: check points where they could be tested, else control."""
+        if self.check is not None and self.check.is_tested:
+            return "check", self.check
+        return None if self.control is None or not self.control.is_tested else ("control", self.control)
 
 
 def analyse(
@@ -174,25 +193,17 @@ def analyse(
     return found.replaced(statement=" ".join(_sentences(found)))
 
 
-def analyse_fit(fit: Fit, *, near: float | None = None) -> dict[str, Covariance | None]:
-    """Analyse the residuals of a fit on the ground (m, true east and north), control and check apart.
-
-    Returns
-    -------
-    dict
-        ``control`` (points that were used) and ``check``, each None where there is no such point.
-    """
+def analyse_fit(fit: Fit, *, near: float | None = None) -> Covariances:
+    """Analyse the residuals of a fit on the ground (m, true east and north), control (used) and check points apart."""
     points = fit.points
     if not len(points):
-        return {"control": None, "check": None}
-    shifts = in_metres(fit, fit.residuals)
-    where = _on_the_ground(fit)
-    return {
-        "control": analyse(where[fit.used], shifts[fit.used], near=near, design=_design(fit)[fit.used])
-        if fit.used.any()
-        else None,
-        "check": analyse(where[points.tests], shifts[points.tests], near=near) if points.check.any() else None,
-    }
+        return Covariances()
+    shifts, where, control, check = in_metres(fit, fit.residuals), _on_the_ground(fit), None, None
+    if fit.used.any():
+        control = analyse(where[fit.used], shifts[fit.used], near=near, design=_design(fit)[fit.used])
+    if points.check.any():
+        check = analyse(where[points.tests], shifts[points.tests], near=near)
+    return Covariances(control=control, check=check)
 
 
 def _on_the_ground(fit: Fit) -> Array:
@@ -398,8 +409,7 @@ def _basis(design: Array) -> Array:
         return np.zeros((2 * len(design), 0))
     rows = design.reshape(-1, design.shape[2])
     scale = np.linalg.norm(rows, axis=0)
-    left, singular, _ = np.linalg.svd(rows / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    return np.asarray(left[:, singular > 1e-10 * singular[0]])
+    return basis_of(rows / np.where(scale > 0, scale, 1.0))
 
 
 def _projected(values: Array, basis: Array) -> Array:

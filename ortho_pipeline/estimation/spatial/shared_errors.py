@@ -16,9 +16,9 @@ Beforehand families count alike, and ranges and ratios by their logarithms, beca
 known; but residuals show a part of the variance :math:`\sigma_n^2 + \sigma_s^2`, and each part from none to all is as
 likely as any other: else smooth functions of enormous variance, of which a fit leaves hardly anything, dominate.
 No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
-is right in the mean over scenes of all these kinds; it is not right for each kind alone (docs/accuracy.md). A constant
-part cannot be told from the shift: residuals do not show it at all. What matching itself adds of that kind is known
-(`MATCHED_ALIKE`), and the covariance has it.
+is right in the mean over scenes of all these kinds; it is not right for each kind alone
+(docs/engineering/accuracy.md). A constant part cannot be told from the shift: residuals do not show it at all. What
+matching itself adds of that kind is known (`MATCHED_ALIKE`), and the covariance has it.
 
 Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6;
 Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is likely).
@@ -34,6 +34,7 @@ import numpy as np
 
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.estimation.spatial.common_error import CommonError
+from ortho_pipeline.estimation.statistics import basis_of
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
 
@@ -67,7 +68,7 @@ NOT_KNOWN: dict[str, Any] = {"noise": None, "shared": None, "range_px": None}
 
 
 class SharedErrors(Record):
-    """Errors that neighbouring points share, in units of stated sigmas; docs/accuracy.md says what each number is."""
+    """Errors that neighbouring points share, in units of stated sigmas; see docs/engineering/accuracy.md."""
 
     # Of two axes, the first with the larger shared part: means over what is likely, None where the points are too few.
     # The range is the distance at which 1/e of the covariance is left. As many independent points as are effective
@@ -194,7 +195,7 @@ class Neighbours:
         image, residuals, design = image[order], residuals[order], design[order]
         extent = float(np.ptp(image, axis=0).max())
         columns = np.concatenate([design[:, 0], design[:, 1]], axis=1)
-        span = _basis(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
+        span = basis_of(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
         n, p = span.shape
         if n < FEWEST_POINTS or n - p < FEWEST_POINTS / 2 or not extent > 0:
             return None
@@ -203,7 +204,7 @@ class Neighbours:
         least = np.clip(np.median(np.partition(distance, 1, axis=1)[:, 1]), _HEAP * extent, extent / 2)
         ranges = np.geomspace(least, extent, _RANGES)
         means = _cell_means(image)
-        explained = _basis(means @ span)
+        explained = basis_of(means @ span)
         if len(means) - explained.shape[1] < FEWEST_POINTS / 2:
             means, explained = np.eye(n), span
         left = means @ residuals
@@ -249,12 +250,6 @@ class Neighbours:
         share = shared / np.maximum(shared.sum(axis=0), 1e-300)
         mean = np.exp(share.T @ np.log(np.tile(self.ranges, len(_FAMILIES))))
         return excess, {"noise": np.sqrt(noise), "shared": np.sqrt(shared.sum(axis=0)), "range_px": mean}
-
-
-def _basis(columns: Array) -> Array:
-    """Return an orthonormal basis of columns ``(n, K)``."""
-    span, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(span[:, singular > 1e-9 * singular[0]])
 
 
 def _cell_means(image: Array) -> Array:

@@ -46,6 +46,10 @@ class Record(pydantic.BaseModel):
         """Return the document of the record, as JSON values."""
         return self.model_dump(mode="json")
 
+    def given(self) -> dict[str, Any]:
+        """Return the document of the members that were given: no other has its default."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
     def replaced(self, **members: Any) -> Self:
         """Return this record with other members."""
         return self.model_copy(update=members)

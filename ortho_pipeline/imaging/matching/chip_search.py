@@ -9,7 +9,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.files.process_limits import side_by_side
 from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.imaging.matching.correlation import Peaks, orientation, peaks, surfaces
@@ -17,6 +16,7 @@ from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.targets import Reference, Target, View
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.runtime.process_limits import side_by_side
 
 #: Side of a chip (chip px); it is even, so that a chip of any factor has its centre between the same pixels.
 SIDE = 40

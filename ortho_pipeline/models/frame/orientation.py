@@ -96,7 +96,7 @@ def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:
         ]
     )
     camera_from_axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    return camera_from_axes @ platform_from_level
+    return np.asarray(camera_from_axes @ platform_from_level)
 
 
 def exterior_sigmas(position: float | None, angle: float | None) -> dict[str, float]:

@@ -25,6 +25,7 @@ from ortho_pipeline.geodesy.ellipsoid import (
 )
 from ortho_pipeline.models.base import Array
 
+#: The frames that a camera can have its orientation in: tangential to the ellipsoid below it, or a map projection.
 TOPOCENTRIC, MAP = "topocentric", "map"
 #: The ground of a topocentric frame.
 GEOGRAPHIC = "EPSG:4979"
@@ -70,11 +71,11 @@ class Topocentric:
 
     def from_ground(self, ground: Array) -> Array:
         """Return ground points in this frame ``(N, 3)``."""
-        return (geocentric(ground) - self.zero) @ self.axes.T
+        return np.asarray((geocentric(ground) - self.zero) @ self.axes.T)
 
     def to_ground(self, position: Array) -> Array:
         """Return the ground coordinates ``(3,)`` of a position ``(3,)``."""
-        return geodetic((self.zero + position @ self.axes)[None])[0]
+        return np.asarray(geodetic((self.zero + position @ self.axes)[None])[0])
 
     def partials(self, ground: Array) -> Array:
         """Return d(this frame)/d(ground) as ``(N, 3, 3)``."""
@@ -82,7 +83,7 @@ class Topocentric:
 
     def verticals(self, ground: Array) -> Array:
         """Return the upward directions at ground points in this frame ``(N, 3)``."""
-        return enu_from_ecef(ground)[:, 2] @ self.axes.T
+        return np.asarray(enu_from_ecef(ground)[:, 2] @ self.axes.T)
 
     def behind_the_earth(self, ground: Array, place: Array, line: Array) -> np.ndarray:
         """Tell which lines of sight go through the Earth before they reach the point."""
@@ -92,7 +93,7 @@ class Topocentric:
         back = (radial * line).sum(axis=1)
         nearest2 = (radial**2).sum(axis=1) - back**2 / length2
         sea_level = np.linalg.norm(radial, axis=1) - ground[:, 2]
-        return (back > 0) & (back < length2) & (nearest2 < sea_level**2)
+        return np.asarray((back > 0) & (back < length2) & (nearest2 < sea_level**2))
 
     def meet(self, position: Array, direction: Array, height: Array) -> Array:
         """Follow rays from a position to ellipsoidal heights; NaN where they miss."""
@@ -104,7 +105,7 @@ class Topocentric:
 
     def metres_per_unit(self, position: Array) -> Array:
         """Return the lengths ``(2,)`` of a degree of longitude and of latitude at a position."""
-        return metres_per_degree(np.array([[*position[:2], 0.0]]))[0]
+        return np.asarray(metres_per_degree(np.array([[*position[:2], 0.0]]))[0])
 
 
 class MapPlane:

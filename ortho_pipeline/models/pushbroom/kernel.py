@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
 from ortho_pipeline.models.light.refraction import FLATTEST, SCALE_HEIGHT
+from ortho_pipeline.runtime.compiled import compiled, inlined
 
 
 class Trajectory(NamedTuple):

@@ -48,7 +48,7 @@ class SoftSigmas:
     """How well a start from metadata is believed: the sigmas of its pseudo-observations; None leaves one out.
 
     Willneff et al. have the first two. Those of the flying height and of the attitude are ours: without them nine
-    control points do not determine the eighteen coefficients of a scene (docs/models.md).
+    control points do not determine the eighteen coefficients of a scene (docs/engineering/accuracy.md).
 
     Parameters
     ----------

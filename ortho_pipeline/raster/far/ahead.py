@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.process_limits import thread_pool
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.runtime.process_limits import thread_pool
 
 #: Windows that are read at a time; GDAL asks for the parts of each at once.
 _AT_ONCE = 6
@@ -36,7 +36,7 @@ def read_ahead(source: RasterSource, memory: int) -> Iterator[RasterSource]:
     memory : int
         Bytes for pixels that were read and may be needed again.
     """
-    if not any(is_far(path) for path in source.paths):
+    if not any(Location(path).is_far for path in source.paths):
         yield source
         return
     pool = thread_pool(_AT_ONCE, "ahead")

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.numbers import px
+from ortho_pipeline.estimation.records import Pair
 from ortho_pipeline.raster.output import png_bytes
-from ortho_pipeline.report.adjustment_records import Pair
-from ortho_pipeline.report.gallery.matches import Shown, in_words, shown
+from ortho_pipeline.report.gallery.matches import MatchPoint, in_words, shown
 from ortho_pipeline.report.records import SceneReport
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def gallery(report: SceneReport, matches: Matches) -> Gallery | None:
     )  # fmt: skip
 
 
-def _score(one: Shown) -> float:
+def _score(one: MatchPoint) -> float:
     return -1.0 if one.candidate.score is None else one.candidate.score
 
 
@@ -111,7 +111,7 @@ def _corners(place: int, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
     return (left, top), (left + side + 1, top)
 
 
-def _tile(matches: Matches, index: int, one: Shown, place: int) -> Tile:
+def _tile(matches: Matches, index: int, one: MatchPoint, place: int) -> Tile:
     side = matches.scene.shape[1]
     scene, reference = _corners(place, side)
     column, row = (float(value) for value in side / 2 + matches.found[index])

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
+from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.report.matching import Candidate
 from ortho_pipeline.report.records import SceneReport
 
-#: What is said of a match that the matcher kept and the adjustment did not.
-LEFT_OUT = "left out"
-
 
 @dataclass(frozen=True)
-class Shown:
+class MatchPoint:
     """A candidate and the point it became: None where the matcher rejected it, or the report has no such point."""
 
     candidate: Candidate
@@ -38,13 +35,13 @@ class Shown:
         return -1.0 if self.residual is None else math.hypot(*self.residual)
 
 
-def shown(report: SceneReport) -> list[Shown]:
+def shown(report: SceneReport) -> list[MatchPoint]:
     """Return all candidates of a report, in their order; none where nothing was matched."""
     if report.matching is None:
         return []
     # Beside points of a file of the same name a match is renamed; it stays where it is.
     points = {point.image: point for point in report.adjustment.points}
-    return [Shown(one, points.get(one.image)) for one in report.matching.candidates]
+    return [MatchPoint(one, points.get(one.image)) for one in report.matching.candidates]
 
 
 def in_words(reason: str) -> str:

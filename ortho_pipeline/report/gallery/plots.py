@@ -10,9 +10,9 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, round_down
 from ortho_pipeline.display.numbers import signed
+from ortho_pipeline.estimation.records import Pair, is_known
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.report.adjustment_records import Pair, is_known
-from ortho_pipeline.report.gallery.matches import Shown, in_words, shown
+from ortho_pipeline.report.gallery.matches import MatchPoint, in_words, shown
 from ortho_pipeline.report.records import SceneReport
 
 #: Drawing area of the map, the space around it, and the narrowest drawing, CSS px.
@@ -56,7 +56,7 @@ def plot_matches(report: SceneReport) -> Drawing | None:
     drawing.text(left, top - 5, "0, 0", quiet=True)
     drawing.text(left + wide, top + tall + 14, f"{width}, {height}", quiet=True, anchor="end")
 
-    def at(one: Shown) -> Pair:
+    def at(one: MatchPoint) -> Pair:
         return left + one.candidate.image[0] * scale, top + one.candidate.image[1] * scale
 
     for kind, some in _by_kind(found).items():
@@ -75,7 +75,7 @@ def plot_matches(report: SceneReport) -> Drawing | None:
     return drawing
 
 
-def _by_kind(found: Sequence[Shown]) -> dict[str, list[Shown]]:
+def _by_kind(found: Sequence[MatchPoint]) -> dict[str, list[MatchPoint]]:
     """Return matches by what they are drawn as: control, check, left out, then the reasons."""
     order = ["control", "check", "out", *_MARKS]
     kinds = sorted({one.kind for one in found}, key=lambda kind: (order.index(kind) if kind in order else 99, kind))
@@ -112,7 +112,7 @@ def _vectors(drawing: Drawing, kind: str, line: str, found: Sequence[tuple[Pair,
             drawing.circle("control-head", x, y, 2.2)
 
 
-def _legend_rows(found: Sequence[Shown], room: float) -> list[list[tuple[str, str, float]]]:
+def _legend_rows(found: Sequence[MatchPoint], room: float) -> list[list[tuple[str, str, float]]]:
     """Return the legend as rows of kind, text and how far to the right, px."""
     names = {"control": "control", "check": "check (held out)", "out": "left out by the adjustment"}
     rows: list[list[tuple[str, str, float]]] = []

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.raster.output import png_bytes
-from ortho_pipeline.report.adjustment_records import Pair, Point, is_known
 from ortho_pipeline.report.gallery.chips import stretched
 from ortho_pipeline.report.records import SceneReport
 
@@ -39,11 +39,6 @@ class Chip:
     measured: Pair
     predicted: Pair | None
 
-    @property
-    def length(self) -> float | None:
-        """Length of the residual, px of the scene."""
-        return math.hypot(*self.point.residual) if is_known(self.point.residual) else None
-
 
 @dataclass(frozen=True)
 class PointChips:
@@ -61,13 +56,13 @@ def point_chips(report: SceneReport, source: RasterSource) -> PointChips | None:
 
     Matches have chips of their own, beside those of the reference; points outside of the image have none.
     """
-    matched = set() if report.matching is None else {one.image for one in report.matching.candidates}
+    matched = report.matched_places
     known = [
         (k, point, point.image)
         for k, point in enumerate(report.adjustment.points)
         if point.role != "tie" and is_known(point.image) and point.image not in matched and _in(point.image, source)
     ]
-    known = sorted(known, key=lambda one: -_length(one[1]))[:_MOST]
+    known = sorted(known, key=lambda one: -(one[1].length or 0.0))[:_MOST]
     rows = math.ceil(len(known) / _COLUMNS)
     step = SIDE + 1
     sheet = np.zeros((2, max(rows, 1) * step, min(max(len(known), 1), _COLUMNS) * step), dtype=np.uint8)
@@ -94,10 +89,6 @@ def point_chips(report: SceneReport, source: RasterSource) -> PointChips | None:
 
 def _in(image: Pair, source: RasterSource) -> bool:
     return 0 <= image[0] <= source.width and 0 <= image[1] <= source.height
-
-
-def _length(point: Point) -> float:
-    return math.hypot(*point.residual) if is_known(point.residual) else -1.0
 
 
 def _factor(point: Point) -> int:

@@ -24,7 +24,7 @@ Share = Annotated[float, pydantic.Field(ge=0)]
 
 
 class AccuracyLayer(Record):
-    """How accurate the pixels of the ortho are; docs/accuracy.md says what each number is.
+    """How accurate the pixels of the ortho are; docs/engineering/accuracy.md says what each number is.
 
     `ce90_m` holds 90 % of the errors of all pixels together, `range_m` is 5, 50 and 95 % of the pixels' own, `sigma_m`
     the root mean square east and north. `shares` are parts of the mean variance, `unknown` is what nobody said anything

@@ -21,7 +21,7 @@ def mosaic_document(
     owners: Owners | None = None,
     clamped: float = 0.0,
 ) -> dict[str, Any]:
-    """Return what there is to say of a mosaic as JSON values; docs/run.md says what each is."""
+    """Return what there is to say of a mosaic as JSON values; docs/mosaic.md says what each is."""
     measured = [seam for seam in seams if seam["patches"]]
     lengths = [math.hypot(*seam["median_px"]) for seam in measured]
     worst = max(zip(lengths, measured, strict=True), key=lambda pair: pair[0], default=None)

@@ -7,11 +7,12 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from ortho_pipeline.block.fit import Ray
 from ortho_pipeline.display.numbers import px
+from ortho_pipeline.estimation.records import is_known
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import ROLES
-from ortho_pipeline.report.adjustment_records import is_known
-from ortho_pipeline.report.block_records import BlockReport, Ray
+from ortho_pipeline.report.block_records import BlockReport
 
 #: Images that have a picture, and the longer side of one, px.
 PICTURES, SIDE = 12, 420

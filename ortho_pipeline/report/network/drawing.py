@@ -89,7 +89,7 @@ def _draw_pairs(drawing: Drawing, report: BlockReport, middles: dict[str, Array]
             continue
         text = f"{one.first} – {one.second}: {counted(one.points, 'point')} in common, rays {one.angle_deg:.1f}° apart"
         if one.sigma_px is not None:
-            text += f"\nplaced to each other within {one.sigma_px:.2g} px (sigma)"
+            text += f"\nrelative position: sigma {one.sigma_px:.2g} px"
         look = "weak" if one.weak else "link-wide" if one.points > most / 2 else "link"
         with drawing.titled(text):
             drawing.line(look, x1, y1, x2, y2)

@@ -2,57 +2,36 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC
-from ortho_pipeline.block.network import Network, network_of
-from ortho_pipeline.block.relative.joins import Join
+from ortho_pipeline.block.network import NetworkRecord, network_of
+from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.ground_residuals import viewing
-from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.control_hull import COVERED, empty_parts
-from ortho_pipeline.report.block_records import Angles, ImagePairRecord, NetworkRecord
 from ortho_pipeline.report.map_scale import MapScaleRecord, judge
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
 
 
-def network_record(network: Network, joins: Sequence[Join] = (), limit: float = math.inf) -> NetworkRecord:
-    """Return the network as the report has it; joins beyond a limit (px) are weak."""
-    known = network.angles_deg[np.isfinite(network.angles_deg)]
-    angles = None
-    if len(known):
-        low, high = float(known.min()), float(known.max())
-        angles = Angles(points=len(known), least=low, median=float(np.median(known)), greatest=high)
-    known_joins = {(join.first, join.second): join for join in joins}
-    pairs = []
-    for one in network.pairs:
-        join = known_joins.get((one.first, one.second))
-        found = {} if join is None else {**join.figures(), "weak": join.sigma > limit}
-        pairs.append(
-            ImagePairRecord(first=one.first, second=one.second, points=one.points, angle_deg=one.angle_deg, **found)
-        )
-    return NetworkRecord(
-        pairs=tuple(pairs), angles=angles, parts=network.parts, largest_deg=tuple(json_value(network.angles_deg))
-    )
-
-
-def found_network(fit: BlockFit) -> tuple[Network, tuple[Notice, ...]]:
-    """Return the network of a block, and a notice if it falls into parts."""
-    network = network_of(fit)
+def found_network(fit: BlockFit, join_limit: float) -> tuple[NetworkRecord, tuple[Notice, ...]]:
+    """Return the network of a block, and notices if joins are weaker than a limit (px) or it falls into parts."""
+    joins = joins_of(fit)
+    network = network_of(fit, joins, join_limit)
+    weak = weak_joins(joins, join_limit, with_heights=fit.heights is not None)
     if len(network.parts) < 2:
-        return network, ()
+        return network, weak
     said = " and ".join(", ".join(part[:4]) + (" ..." if len(part) > 4 else "") for part in network.parts[:3])
     text = f"the images fall into {len(network.parts)} parts without points in common: {said}"
-    return network, (Notice("block-in-parts", text, parts=[list(part) for part in network.parts]),)
+    return network, (*weak, Notice("block-in-parts", text, parts=[list(part) for part in network.parts]))
 
 
 def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.comparison import Comparison
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 
 #: Kind of point or figure -> mark and colour.
@@ -56,11 +56,9 @@ def _(fit: Fit, axes: Any = None) -> Any:
 
 
 @plot.register
-def _(comparison: Comparison, axes: Any = None) -> Any:
+def _(comparison: ComparisonRecord, axes: Any = None) -> Any:
     rmses = {
-        row.model: {kind: float(found["total"]) for kind, found in row.fit.rmses.items() if found}
-        for row in comparison.rows
-        if row.fit is not None
+        row.model: {kind: found.total for kind, found in row.rmse if found} for row in comparison.rows if not row.error
     }
     return rmse_axes(rmses, comparison.recommended, axes)
 

@@ -9,14 +9,15 @@ import base64
 import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.estimation.comparison import Comparison
+from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
+from ortho_pipeline.estimation.records import Rmse, Rmses
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
@@ -46,23 +47,21 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> di
 
 @html.register
 def _(fit: Fit) -> str:
-    return fit_html(fit.to_json())
-
-
-def fit_html(document: Mapping[str, Any]) -> str:
-    """Return the document of a fit (`Fit.to_json`) as HTML: RMSE, parameters, warnings, and what was left out."""
     names = {"control": "control points", "check": "check points", "loo": "control points, each left out in turn"}
-    rmse = [
-        (names[role], str(found["n"]), *(f"{found[key]:.3f}" for key in ("col", "row", "total")))
-        for role, found in document["rmse"].items()
-        if role in names and found
+    rmse = [_rms_row(names[role], found) for role, found in fit.rmses if role in names and found]
+    tables = [_table(f"{fit.model_name}: RMSE, pixels", ("", "points", "column", "row", "both"), rmse)]
+    values = [
+        (name, f"{value:.6g}", f"{sigma:.2g}")
+        for name, value, sigma in zip(fit.param_names, fit.values, fit.sigmas, strict=True)
     ]
-    tables = [_table(f"{document['model']}: RMSE, pixels", ("", "points", "column", "row", "both"), rmse)]
-    values = [(name, f"{one['value']:.6g}", f"{one['sigma']:.2g}") for name, one in document["parameters"].items()]
     if values:
         tables.append(_table("Parameters", ("", "value", "sigma"), values))
-    said = [f"left out: point {one['id']} ({one['reason']})" for one in document["rejected"]] + document["warnings"]
+    said = [f"left out: point {name} ({reason})" for name, reason in fit.rejected] + list(fit.warnings)
     return render("report/notebook.html.j2", tables=tables, notes=said)
+
+
+def _rms_row(name: str, rms: Rmse) -> tuple[str, ...]:
+    return name, str(rms.n), f"{rms.col:.3f}", f"{rms.row:.3f}", f"{rms.total:.3f}"
 
 
 @html.register
@@ -78,26 +77,25 @@ def _(scene: Scene) -> str:
 
 @html.register
 def _(block: BlockFit) -> str:
-    document = block.to_json()
+    record = block.record
     ground = [
-        (f"{role} points", str(found["n"]), *(f"{found[axis]:.3f}" for axis in "xyh"))
-        for role, found in document["object_rms"].items()
+        (f"{role} points", str(found.n), f"{found.x:.3f}", f"{found.y:.3f}", f"{found.h:.3f}")
+        for role, found in record.object_rms
         if found
     ]
     tables = [_table("Known minus adjusted ground: RMSE, metres", ("", "points", "east", "north", "height"), ground)]
     images = [
-        (f"{name}, {role} points", str(found["n"]), *(f"{found[axis]:.3f}" for axis in ("col", "row", "total")))
-        for name, image in list(document["images"].items())[:_LISTED]
-        for role, found in image["rms"]["residuals" if not ground else "back_projected"].items()
+        _rms_row(f"{name}, {role} points", found)
+        for name, image in list(record.images.items())[:_LISTED]
+        for role, found in (image.rms.back_projected if ground else image.rms.residuals)
         if found
     ]
     what = "Known ground in the images" if ground else "Rays at the adjusted ground"
     tables.append(_table(f"{what}: RMSE, pixels", ("", "points", "column", "row", "both"), images))
-    rejected = document["rejected"]
-    said = [document["gauge"], *document["warnings"]]
-    said += [f"left out: point {one['point']} ({one['reason']})" for one in rejected[:_LISTED]]
-    if len(rejected) > _LISTED:
-        said.append(f"and {counted(len(rejected) - _LISTED, 'more gross error')}")
+    said = [record.gauge, *record.warnings]
+    said += [f"left out: point {one.point} ({one.reason})" for one in record.rejected[:_LISTED]]
+    if len(record.rejected) > _LISTED:
+        said.append(f"and {counted(len(record.rejected) - _LISTED, 'more gross error')}")
     return render("report/notebook.html.j2", tables=tables, notes=said)
 
 
@@ -117,19 +115,13 @@ def _(points: Points) -> str:
 
 
 @html.register
-def _(comparison: Comparison) -> str:
-    document = comparison.to_json()
+def _(comparison: ComparisonRecord) -> str:
+    def totals(rmse: Rmses) -> list[str]:
+        return [f"{one.total:.3f}" if one else "–" for one in (rmse.check, rmse.loo, rmse.control)]
 
-    def total(rmse: Mapping[str, float] | None) -> str:
-        return f"{rmse['total']:.3f}" if rmse else "–"
-
-    rows = [
-        (row["model"], str(row["parameters"]), *(total(row["rmse"].get(kind)) for kind in ("check", "loo", "control")))
-        for row in document["rows"]
-    ]
-    advice = document["recommendation"]
-    said = [f"recommended: {advice['model'] or 'none'} ({advice['reason']})"]
-    said += [f"left out: point {one['id']} ({one['reason']})" for one in document["left_out"]] + document["warnings"]
+    rows = [(row.model, str(row.parameters), *totals(row.rmse)) for row in comparison.rows]
+    said = [f"recommended: {comparison.recommended or 'none'} ({comparison.recommendation.reason})"]
+    said += [f"left out: point {one.id} ({one.reason})" for one in comparison.left_out] + list(comparison.warnings)
     head = ("", "parameters", "check points", "each left out in turn", "control points")
     return render("report/notebook.html.j2", tables=[_table("RMSE, pixels", head, rows)], notes=said)
 

@@ -53,7 +53,7 @@ _LOOK: dict[str, str] = {
     "few-check-points": "Keep more points apart as check points before accuracy is claimed to others.",
     "no-redundancy": "Add points: so far the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not rely on the ortho there.",
-    "weak-join": "Give a DEM with its accuracy, control points, or another view of the place.",
+    "weak-join": "Give a more accurate DEM, control points, or another view of the place.",
     "uncertain-at-edge": "Add control points near the corners, or take a correction with fewer parameters.",
     "inseparable-parameters": "Take a correction with fewer parameters, or let prune remove them.",
     "unsuited-model": "Take a model that the sensor suggests, unless you know better.",

@@ -13,7 +13,7 @@ from importlib import resources
 import numpy as np
 
 from ortho_pipeline.display.drawing import Drawing
-from ortho_pipeline.report.adjustment_records import Pair, is_known
+from ortho_pipeline.estimation.records import Pair, is_known
 from ortho_pipeline.report.page.ortho_map import Paper, degrees
 from ortho_pipeline.report.records import SceneReport
 

@@ -40,7 +40,7 @@ STATES = {"failed": "failed", "stop": "to settle first", "untested": "not tested
 
 
 @dataclass(frozen=True)
-class Row:
+class SceneRow:
     """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is.
 
     `signal` is the gravest of its notices, if it is to be looked at; `state` is ``failed``, ``stop`` (something is to
@@ -113,7 +113,7 @@ def _headline(states: Mapping[str, int], count: int) -> str:
     return f"{ready}; {', '.join(others)}" if others else f"{counted(count, 'scene')}, all ready"
 
 
-def _summary(rows: Sequence[Row]) -> str:
+def _summary(rows: Sequence[SceneRow]) -> str:
     """Say how accurate the scenes are that are ready, by what evidence."""
     ready = [row for row in rows if row.state == "ready"]
     parts = []
@@ -133,7 +133,7 @@ def _is_of(path: Path, key: str) -> bool:
         return False
 
 
-def _row(scene: Mapping[str, Any], folder: Path) -> Row:
+def _row(scene: Mapping[str, Any], folder: Path) -> SceneRow:
     facts, error, found = scene["facts"], scene["error"], None
     if not error and not facts:
         error = _NOT_MADE
@@ -143,7 +143,7 @@ def _row(scene: Mapping[str, Any], folder: Path) -> Row:
     if not error and not untrue:
         found = next((kind for kind in EVIDENCE if rmses.get(kind) is not None), None)
     page = scene["files"].get("html")
-    return Row(
+    return SceneRow(
         name=scene["name"],
         error=error,
         facts={} if error else facts,
@@ -161,16 +161,16 @@ def _gravest(facts: Mapping[str, Any], *, tested: bool) -> Signal | None:
     return next((one for one in said if one.level != "know"), None)
 
 
-def _order(row: Row) -> tuple[Any, ...]:
+def _order(row: SceneRow) -> tuple[Any, ...]:
     """Failed scenes first, then what is to be settled, then those of unknown accuracy, then the largest RMSE."""
     return [*STATES, "ready"].index(row.state), -(row.rmse or 0.0), row.name
 
 
-def _with_thumbnail(row: Row, ortho: str | None) -> Row:
+def _with_thumbnail(row: SceneRow, ortho: str | None) -> SceneRow:
     if ortho is None or row.error is not None:
         return row
     try:
         picture = base64.b64encode(preview_png(ortho, side=_SIDE)).decode()
     except OrthoError:
         return row
-    return Row(**{**vars(row), "thumbnail": picture})
+    return SceneRow(**{**vars(row), "thumbnail": picture})

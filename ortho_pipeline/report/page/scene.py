@@ -11,9 +11,9 @@ from ortho_pipeline.display.drawing import style_sheet
 from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.display.numbers import flat
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.estimation.records import is_known
 from ortho_pipeline.files import write_text
 from ortho_pipeline.raster.quicklook import preview_png
-from ortho_pipeline.report.adjustment_records import is_known
 from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.gallery.points import point_chips
@@ -79,7 +79,7 @@ def write_report_html(
         provenance=list(flat({**report.scene.facts, **_brief(report.provenance)})),
         inputs=report.provenance.inputs,
         plots={name: drawing.svg() for name, drawing in plots(report).items()},
-        plotted_role=report.covariance.drawn_role,
+        plotted_role=report.covariance.drawn and report.covariance.drawn[0],
         plot_style=style_sheet(),
         preview=base64.b64encode(png).decode() if png else None,
         over_ortho=None if over_ortho is None else over_ortho.svg(),

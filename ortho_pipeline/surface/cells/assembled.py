@@ -76,7 +76,7 @@ def open_cells(
     vertical : Vertical or str, optional
         A geoid grid file of EGM2008, where that of PROJ is not installed; another datum only with `override`.
     fill : 'error', 'mask', 'nearest' or float
-        As for `Surface.open`; with anything but 'error', land whose cell is missing is a void.
+        As for `open_dem`; with anything but 'error', land whose cell is missing is a void.
 
     Raises
     ------

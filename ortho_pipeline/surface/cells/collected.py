@@ -11,13 +11,13 @@ import pyproj
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import CoverageError, CrsError, DatumError, completed
-from ortho_pipeline.files.beside import ask_beside
-from ortho_pipeline.files.locations import is_far
-from ortho_pipeline.files.stac.collection import Collection
-from ortho_pipeline.files.stac.item import Asset, split
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.options.texts import Setting, Text, counted
+from ortho_pipeline.stores.beside import ask_beside
+from ortho_pipeline.stores.stac.collection import Collection
+from ortho_pipeline.stores.stac.item import Asset
 from ortho_pipeline.surface.base import parse_fill
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, dem_of
@@ -51,7 +51,7 @@ def open_collected(
     address : path or address
         With the key of the asset, or a pattern of it, after a ``#``, where its role does not tell.
     vertical, override, fill, memory
-        As for `Surface.open`.
+        As for `open_dem`.
     access : mapping
         What `raster.open_pixels` may do for its files.
 
@@ -66,9 +66,8 @@ def open_collected(
     """
     access = access or {}
     network, roots = bool(access.get("allow_network")), tuple(access.get("roots", ()))
-    place, key = split(address)
-    name = os.fspath(address)
-    items, documents = Collection(place, allow_network=network, roots=roots).under(
+    name = Location(address)
+    items, documents = Collection(name.document, allow_network=network, roots=roots).under(
         [extent.widened() for extent in extents]
     )
     if not 0 < len(items) <= _MOST_ITEMS:
@@ -76,8 +75,8 @@ def open_collected(
             f"{counted(len(items), 'item')} of this collection {'lies' if len(items) == 1 else 'lie'} under the scene",
             file=name, field="surface.dem", remedy="give a DEM of this place" if not items else _CHOOSE,
         )  # fmt: skip
-    chosen = [item.heights(key) for item in items]
-    ask_beside(*(asset.href for asset in chosen if is_far(asset.href)), allow_network=network)
+    chosen = [item.heights(name.asset) for item in items]
+    ask_beside(*(asset.href for asset in chosen if Location(asset.href).is_far), allow_network=network)
     opened = [_placed(asset, access, override) for asset in chosen]
     try:
         mosaic = laid_out(name, [placed for placed, _ in opened])

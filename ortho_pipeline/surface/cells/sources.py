@@ -11,12 +11,12 @@ import numpy as np
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import read_bounded
-from ortho_pipeline.files.locations import is_address
-from ortho_pipeline.files.process_limits import thread_pool
-from ortho_pipeline.files.stac.collection import Collection, is_collection
-from ortho_pipeline.files.storage.kept import kept
-from ortho_pipeline.files.storage.objects import Objects
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.raster.source import open_pixels
+from ortho_pipeline.runtime.process_limits import thread_pool
+from ortho_pipeline.stores.kept import kept
+from ortho_pipeline.stores.objects import Objects
+from ortho_pipeline.stores.stac.collection import Collection
 from ortho_pipeline.surface.cells.copernicus import LARGEST, LIST, PUBLIC, PUBLIC_LAND, Cell, cells_of_list
 from ortho_pipeline.surface.dem_file import Affine
 
@@ -52,9 +52,9 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
         If there is no such folder, or the network is not allowed.
     """
     text = os.fspath(given or os.environ.get(VARIABLE) or PUBLIC)
-    if is_collection(text):
+    if Location(text).is_collection:
         return _Catalogue(text, allow_network)
-    if is_address(text):
+    if Location(text).is_address:
         return _Bucket(text, allow_network)
     if not Path(text).is_dir():
         raise InputError(
@@ -132,7 +132,7 @@ class _Catalogue(Source):
 
     def land(self) -> frozenset[Cell] | None:
         # A collection may hold some cells only, and says nothing of the others: the list of the public bucket does.
-        if not is_address(self.address):
+        if not Location(self.address).is_address:
             return None
         try:
             return _Bucket(PUBLIC, self._allow_network).land()
@@ -149,7 +149,7 @@ class _Catalogue(Source):
 
     def _kept(self, cell: Cell, href: str | None) -> str:
         assert href is not None
-        if not is_address(href):
+        if not Location(href).is_address:
             return href
         folder, _, name = href.rpartition("/")
         if "?" in name:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files.process_limits import Resources
 from ortho_pipeline.geodesy.distortion import inverse_2x2
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, classes_profile
+from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp.layers.accuracy import layer_grid, overviews, tiles

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled, inlined
+from ortho_pipeline.runtime.compiled import compiled, inlined
 from ortho_pipeline.surface.ray_kernel import SQUARE_BITS, climbs
 
 #: Classes of `look`.

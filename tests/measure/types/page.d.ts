@@ -1,5 +1,5 @@
 // What server and page say to each other, for `tsc`, which checks the page by its JSDoc comments (`make page-types`).
-// The server's side: `measure/project.py`, `session.py`, `block/` and `serving/server.py`.
+// The server's side: `ortho_measure/project.py`, `session.py`, `block/` and `serving/server.py`.
 
 declare const ol: any; // OpenLayers, vendored as one file; its classes are not checked
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled
+from ortho_pipeline.runtime.compiled import compiled
 
 #: Pixels in a row that a value is interpolated from, and how many of them stand before the one at or before its place.
 TAPS = 8

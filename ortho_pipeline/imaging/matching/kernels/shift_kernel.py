@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ortho_pipeline.files.compiled import compiled
 from ortho_pipeline.imaging.matching.kernels.chip_kernel import BEFORE, TAPS, weights_at
+from ortho_pipeline.runtime.compiled import compiled
 
 
 @compiled

@@ -1,0 +1,20 @@
+"""All that the host calls: find the plugins, recognise a product, open it.
+
+See `ortho_pipeline.hookspecs` for the other side. Host and GDAL are loaded when they are first asked for: the commands
+that packages add are found without them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ortho_pipeline import _lazily
+
+if TYPE_CHECKING:
+    from ortho_pipeline.host.discovery import Host as Host
+    from ortho_pipeline.host.discovery import open_scene as open_scene
+
+__all__ = ["Host", "open_scene"]
+
+if not TYPE_CHECKING:  # a checker knows the names from above, and no others
+    __getattr__ = _lazily(__name__, dict.fromkeys(__all__, "host.discovery"))

@@ -1,0 +1,173 @@
+"""What is kept on this machine of files that lie elsewhere: whole or not there, and checked whenever it is used.
+
+Beside each file stands a record (its name and ``.json``) of where it came from, its size and its SHA-256. A file that
+does not agree with its record, or has none, counts as not there and is fetched again. Several processes share the
+folder; who needs a file that another one is fetching waits for it. A file and its record are written as the outputs of
+a command are (`files.together`), but in a context of their own: they are no part of the outputs that are under way, nor
+confined to their folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import hashlib
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.folders import cache_folder
+from ortho_pipeline.files.reading import parse_json, read_bounded, sha256, states
+from ortho_pipeline.files.whole import Outputs, together, whole_or_nothing, write_json
+from ortho_pipeline.stores.objects import Content
+
+#: Environment variable: the folder of what is kept.
+FOLDER = "ORTHO_CACHE"
+_RECORD = ".json"
+_REMEDY = f"name a folder that you may write to and that has room in the environment variable {FOLDER}"
+_RECORD_BYTES = 100_000
+#: Members of a record, and of which types they are.
+_FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
+#: The states in which files agreed with their records in this process.
+_agreed: dict[str, tuple[int, int, int]] = {}
+
+
+@dataclass(frozen=True)
+class Record:
+    """A file that is kept: where, where it came from, and what it was when it came."""
+
+    path: Path
+    address: str
+    bytes: int
+    sha256: str
+    fetched: float
+
+    def state(self) -> str:
+        """Return ``sound``, or what is wrong with the file."""
+        try:
+            if self.path.stat().st_size != self.bytes:
+                return "of another size"
+            return "sound" if sha256(self.path) == self.sha256 else "damaged"
+        except OSError:
+            return "missing"
+
+
+def folder() -> Path:
+    """Return the folder of what is kept: ``$ORTHO_CACHE``, or one of the user's folder of caches.
+
+    Raises
+    ------
+    InputError
+        If there is none, or its path is relative: it would be a folder in the working folder.
+    """
+    given = os.environ.get(FOLDER)
+    found = Path(given) if given else cache_folder()
+    if found is None or not found.is_absolute():
+        wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
+        raise InputError(
+            f"files of the network cannot be kept ({wrong})", field=FOLDER,
+            remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
+        )  # fmt: skip
+    return found
+
+
+def kept(
+    kind: str, address: str, fetch: Callable[[Path], Content], *, fault: Callable[[Path], str] | None = None
+) -> Path:
+    """Return the file that is kept of an address, fetched if it is not there or not what it was.
+
+    Parameters
+    ----------
+    kind : str
+        The folder that it lies in, such as ``dem``.
+    fetch : callable (path) -> Content
+        Writes the file under a temporary name. What it raises, this raises, and nothing is kept.
+    fault : callable (path) -> str, optional
+        What is wrong with a file that was fetched; empty if nothing is.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or there is a fault in what was fetched.
+    """
+    path = folder() / kind / _name_of(address)
+    if not _agrees(path, address):
+        contextvars.Context().run(_fill, path, address, fetch, fault)
+    return path
+
+
+def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Callable[[Path], str] | None) -> None:
+    with _alone(path):
+        if _agrees(path, address):
+            return
+        with whole_or_nothing(path, side_cars=False) as part:
+            content = fetch(part)
+            wrong = fault(part) if fault is not None else ""
+            if wrong:
+                raise InputError(f"what was fetched is not sound: {wrong}", file=address, remedy="check the address")
+            _agreed[os.fspath(path)] = states([part])[os.fspath(part)]
+        record = {"address": address, "bytes": content.size, "sha256": content.sha256, "fetched": time.time()}
+        write_json(_record_of(path), record)
+
+
+def records() -> Iterator[Record]:
+    """Yield what is kept, by name."""
+    for path in sorted(folder().glob(f"*/[!.]*{_RECORD}")):
+        found = _read(path)
+        if found is not None:
+            yield found
+
+
+def clear() -> tuple[int, int]:
+    """Remove all that is kept; return the number of files and their bytes."""
+    count = size = 0
+    for record in list(records()):
+        with _alone(record.path) as files:
+            with contextlib.suppress(FileNotFoundError):
+                size += record.path.stat().st_size
+                count += 1
+            files.obsolete += [record.path, _record_of(record.path)]
+        _agreed.pop(os.fspath(record.path), None)
+    return count, size
+
+
+def _agrees(path: Path, address: str) -> bool:
+    """Tell whether a file is there as it was fetched from this address."""
+    record = _read(_record_of(path))
+    if record is None or record.address != address:
+        return False
+    now = states([path]).get(os.fspath(path))
+    if now is None or (_agreed.get(os.fspath(path)) != now and record.state() != "sound"):
+        return False
+    _agreed[os.fspath(path)] = now
+    return True
+
+
+def _read(path: Path) -> Record | None:
+    """Return the record of a kept file; None where it is none, so that the file is fetched again."""
+    try:
+        given = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
+        record = Record(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
+    except (InputError, KeyError, TypeError):
+        return None
+    kinds = all(type(getattr(record, name)) in kinds for name, kinds in _FIELDS.items())
+    return record if kinds and record.bytes >= 0 else None
+
+
+def _alone(path: Path) -> contextlib.AbstractContextManager[Outputs]:
+    """Wait for others who are at this file, and let what is done with it and its record appear at once."""
+    return together(path.parent, path.name, wait=True, remedy=_REMEDY)
+
+
+def _record_of(path: Path) -> Path:
+    return path.with_name(path.name + _RECORD)
+
+
+def _name_of(address: str) -> str:
+    """Return a name of a file that is told from those of other addresses, and ends as this one does."""
+    last = re.sub(r"[^A-Za-z0-9._-]", "_", address.rpartition("/")[2])[-120:]
+    return f"{hashlib.sha256(address.rpartition('/')[0].encode()).hexdigest()[:12]}_{last}"

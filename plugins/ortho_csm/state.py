@@ -1,0 +1,73 @@
+"""The fields of a CSM state, read with errors that name them."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.plugin import SEMI_MAJOR, Array, InputError
+
+MOST_VALUES = 2_000_000
+REMEDY = "write the state again with the program that it is of"
+
+
+class State:
+    """The fields of a state, each with an error that names file and field."""
+
+    def __init__(self, fields: dict[str, Any], path: str | PathLike[str]) -> None:
+        self.fields, self.path = fields, path
+
+    def error(self, message: str, field: str) -> InputError:
+        """Return the error that a field is."""
+        return InputError(message, file=self.path, field=field, remedy=REMEDY)
+
+    def numbers(self, field: str, count: int | None = None) -> Array:
+        """Return the numbers of a list."""
+        value = self.fields.get(field)
+        if not isinstance(value, list) or len(value) > MOST_VALUES or (count is not None and len(value) != count):
+            raise self.error(f"{count or 'a list of'} numbers belong here", field)
+        if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
+            raise self.error("this is not a list of numbers", field)
+        found = np.array(value, dtype=np.float64)
+        if not (np.abs(found) < 1e15).all():
+            raise self.error("a number is too large", field)
+        return found
+
+    def number(self, field: str, default: float | None = None) -> float:
+        """Return a number."""
+        value = self.fields.get(field, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
+            raise self.error("a number belongs here", field)
+        return float(value)
+
+    def size(self) -> tuple[int, int]:
+        """Return columns and rows."""
+        found = []
+        for field in ("m_nSamples", "m_nLines"):
+            value = self.number(field)
+            if value != int(value) or not 1 <= value <= 10_000_000:
+                raise self.error("this is not a size of an image", field)
+            found.append(int(value))
+        return found[0], found[1]
+
+    def heights(self, default: tuple[float, float]) -> tuple[float, float]:
+        """Return lowest and highest ellipsoidal height of the ground, within those of mountains."""
+        low = max(self.number("m_minElevation", default[0]), default[0])
+        high = min(self.number("m_maxElevation", default[1]), default[1])
+        return (low, high) if low < high else default
+
+    def radial(self) -> tuple[float, float, float]:
+        """Return the terms of a radial distortion; refuse a lens of another kind."""
+        terms = self.numbers("m_opticalDistCoeffs")
+        if not terms.any():
+            return 0.0, 0.0, 0.0
+        if self.number("m_distortionType", 0.0) != 0 or len(terms) != 3:
+            raise self.error("a distortion that is not radial is not read", "m_distortionType")
+        return float(terms[0]), float(terms[1]), float(terms[2])
+
+    def require_earth(self) -> None:
+        """Refuse other planets."""
+        if abs(self.number("m_majorAxis") - SEMI_MAJOR) > 1.0:
+            raise self.error("this is another ellipsoid than that of the Earth", "m_majorAxis")

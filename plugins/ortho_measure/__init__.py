@@ -1,0 +1,26 @@
+"""Measuring by hand: a local page on which points are clicked in a scene and its reference, with the fit live.
+
+The page shows the reference rendered into the scene's own pixels, so that a click in one predicts itself in the other.
+This module declares the command `ortho measure`, and imports no more: ``ortho --help`` imports it. starlette and
+uvicorn, an extra, are loaded when a page is served.
+"""
+
+from collections.abc import Iterable
+
+from ortho_pipeline.plugin import Subcommand, hookimpl
+
+
+@hookimpl
+def ortho_commands() -> Iterable[Subcommand]:
+    """Add `ortho measure`."""
+    yield Subcommand(
+        "measure",
+        "Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.",
+        "ortho_measure.cli:measure",
+        (
+            (
+                "Points by hand, beside the reference, in the browser:",
+                "ortho measure scene.tif --reference reference.tif --dem dem.tif -o points.geojson",
+            ),
+        ),
+    )

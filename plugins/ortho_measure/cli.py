@@ -1,0 +1,117 @@
+"""The command `ortho measure`: points of one image or several by hand in the browser."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ortho_pipeline.cli.machine.terminal import say
+from ortho_pipeline.cli.options import (
+    images_argument,
+    json_option,
+    point_options,
+    reference_options,
+    scenes_options,
+    surface_options,
+)
+from ortho_pipeline.cli.parsing import Command
+from ortho_pipeline.cli.printing import print_json
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+
+if TYPE_CHECKING:
+    from ortho_measure.project import Project
+
+
+@click.command(cls=Command)
+@images_argument
+@reference_options
+@point_options
+@surface_options
+@click.option(
+    "--output", "-o", type=click.Path(dir_okay=False), metavar="FILE.geojson",
+    help="Points, with their journal beside them.  [default: <stems>_points.geojson]",
+)  # fmt: skip
+@click.option("--no-browser", is_flag=True, help="Print the address, and open nothing.")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="On this machine.  [default: any that is free]")
+@scenes_options
+@json_option
+def measure(
+    images: tuple[str, ...], match: MatchOptions, points: PointOptions, surface: SurfaceOptions, output: str | None,
+    no_browser: bool, port: int, scene: SceneOptions | list[SceneOptions], as_json: bool,
+) -> None:  # fmt: skip
+    """Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.
+
+    A click is matched to a part of a pixel, the fit is solved after every point, and the page says where the next one
+    tells most. Everything stays on this machine; Ctrl-C ends. The file of points is for --gcps of 'ortho fit',
+    'rectify', 'compare' and 'export'; of several images, such as a stereo pair, for --points of 'ortho adjust'.
+    """
+    if not match.reference and len(images) == 1:
+        raise InputError("there is nothing to measure against", field="match.reference",
+                         remedy="give an orthoimage of the same place")  # fmt: skip
+    missing = [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(f"measuring in the browser needs {' and '.join(missing)}",
+                         remedy='pip install "ortho-pipeline[measure]"')  # fmt: skip
+    from ortho_measure.serving.server import serve
+
+    session = _session(images, output, scene, points, surface, match)
+    with contextlib.ExitStack() as until_end:
+
+        def ready(address: str) -> None:
+            if as_json:
+                print_json({"address": address, "points": str(session.output)})
+            else:
+                say(f"Measuring at {address}")
+                say(f"Points: {session.output}. The address works once. Ctrl-C ends.")
+            if not no_browser:
+                _open_browser(address, session.output, until_end)
+
+        serve(session, _first(scene), ready, port)
+
+
+def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -> None:
+    """Open the address by way of a file: everybody on this machine can read the command line of a browser."""
+    import webbrowser
+
+    from ortho_measure.serving.entry import private_file
+
+    path = until_end.enter_context(private_file(address, points))
+    if path is None:
+        say("Note: no private file can be written beside the points. Open the address yourself.", err=True)
+    else:
+        webbrowser.open(path.as_uri())
+
+
+def _first(scene: SceneOptions | list[SceneOptions]) -> SceneOptions:
+    """Return the options of the first image; what may be opened is the same for all."""
+    return scene if isinstance(scene, SceneOptions) else scene[0]
+
+
+def _session(
+    images: tuple[str, ...], output: str | None, scene: SceneOptions | list[SceneOptions], points: PointOptions,
+    surface: SurfaceOptions, match: MatchOptions,
+) -> Project:  # fmt: skip
+    """Open the session of one image, or of several."""
+    name = output or "_".join([*(Path(image).stem for image in images[:2]), "points.geojson"])
+    if len(images) == 1:
+        from ortho_measure.session import open_session
+
+        return open_session(images[0], name, scene=_first(scene), points=points, surface=surface, match=match)
+    from ortho_measure.block.session import open_block_session
+
+    for field in ("select", "fit_model", "model_crs", "prune", "params", "significance", "ridge", "near"):
+        if getattr(points, field) != getattr(PointOptions, field):
+            raise InputError("this is said of one image, and there are several", field=f"points.{field}",
+                             remedy="leave it out")  # fmt: skip
+    if points.gcps is not None and not isinstance(points.gcps, str):
+        raise InputError("several images begin with a file of points", field="points.gcps", remedy="give a file")
+    asked = BlockOptions(
+        points=points.gcps, crs=points.crs, vertical=points.vertical, pixel_origin=points.pixel_origin,
+        check=points.check, correction=points.correction,
+    )  # fmt: skip
+    return open_block_session(images, name, scene=scene, points=asked, surface=surface, match=match)

@@ -1,0 +1,186 @@
+"""Places: where ground lies in an image or a map and these on the ground, by models as they are adjusted now."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ortho_measure.marks import GROUND_CRS
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
+from ortho_pipeline.imaging.matching import Reference, Target, View
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.rays import meet_surface
+
+#: What a person may type for a CRS or a height datum: names and codes.
+_NAMED = r"[a-z]{2,12}:[0-9]{1,9}(\+[0-9]{1,9})?|ellipsoid|egm96|egm2008"
+
+#: So often a height is read where the last one puts a place: each is some ten times as near.
+_ROUNDS = 2
+#: Pixels to either side by which it is asked how one geometry lies in another.
+_STEP = 8.0
+
+
+class Geometry(Protocol):
+    """What ground is shown in: pixels of an image by a model, or of a map."""
+
+    def image_of(self, ground: ArrayLike) -> Array:
+        """Return the pixels ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN where there are none."""
+        ...
+
+    def ground_of(self, image: ArrayLike) -> Array:
+        """Return the ground ``(N, 3)`` in `GROUND_CRS` that pixels ``(N, 2)`` show; NaN where they show none."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A reference in its own pixels: a map, north up where the file is.
+
+    Parameters
+    ----------
+    reference : Reference
+    surface : Surface
+        The heights of what the map shows.
+    """
+
+    reference: Reference
+    surface: Surface
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return self.reference.intensity.width, self.reference.intensity.height
+
+    def image_of(self, ground: ArrayLike) -> Array:
+        """Return the pixels ``(N, 2)`` of ground ``(N, 3)``; NaN where the map does not reach."""
+        found = self.reference.project(np.asarray(ground, dtype=float).reshape(-1, 3), GROUND_CRS)
+        with np.errstate(invalid="ignore"):
+            found[~((found >= 0) & (found <= self.size)).all(axis=1)] = np.nan
+        return found
+
+    def ground_of(self, image: ArrayLike) -> Array:
+        """Return the ground ``(N, 3)`` of pixels ``(N, 2)``, with the heights of the surface."""
+        given = np.asarray(image, dtype=float).reshape(-1, 2)
+        linear, offset = self.reference.pixel_from_map[:, :2], self.reference.pixel_from_map[:, 2]
+        plan = (given - offset) @ np.linalg.inv(linear).T
+        heights = self.surface.heights(plan, self.reference.crs)
+        return ground_transform(self.reference.crs, GROUND_CRS)(np.column_stack([plan, heights]))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """A scene, and what shows the same ground, as one geometry.
+
+    Parameters
+    ----------
+    view : View
+        The scene by the model that the reference is rendered with.
+    references : tuple of Target
+        Orthoimages, or other scenes.
+    """
+
+    view: View
+    references: tuple[Target, ...]
+
+    @property
+    def model(self) -> SensorModel:
+        """The model that puts ground into the image."""
+        return self.view.model
+
+    @property
+    def surface(self) -> Surface:
+        """The heights."""
+        return self.view.surface
+
+    def by(self, model: SensorModel) -> Places:
+        """Return the same by another model."""
+        return replace(self, view=replace(self.view, model=model))
+
+    def image_of(self, ground: ArrayLike) -> Array:
+        """Return the image ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN where there is none."""
+        given = np.asarray(ground, dtype=float).reshape(-1, 3)
+        return self.model.ground_to_image(ground_transform(GROUND_CRS, self.model.crs)(given))
+
+    def ground_of(self, image: ArrayLike) -> Array:
+        """Return the ground ``(N, 3)`` in `GROUND_CRS` that image points ``(N, 2)`` see; NaN where they see none."""
+        met = meet_surface(self.model, np.asarray(image, dtype=float).reshape(-1, 2), self.surface)
+        found = np.full(met.shape, np.nan)
+        good = np.isfinite(met).all(axis=1)
+        found[good] = ground_transform(self.model.crs, GROUND_CRS)(met[good])
+        return found
+
+    def ground_about(self, image: ArrayLike, heights: ArrayLike) -> Array:
+        """Return the ground that image points ``(N, 2)`` see as `ground_of`, where its height ``(N,)`` is about known.
+
+        On slopes so steep that a ray meets the surface more than once this is one of these places.
+        """
+        given, height = np.asarray(image, dtype=float), np.asarray(heights, dtype=float)
+        to_ground = ground_transform(self.model.crs, GROUND_CRS)
+        for _ in range(_ROUNDS):
+            found = to_ground(self.model.image_to_ground(given, height))
+            there = self.surface.heights(found[:, :2], horizontal(parse_crs(GROUND_CRS)))
+            height = np.where(np.isfinite(there), there, height)
+        return to_ground(self.model.image_to_ground(given, height))
+
+    def moved(self, shift: ArrayLike) -> Places:
+        """Return the same where the model puts everything `shift` (column, row; px) farther."""
+        step = np.zeros(6)
+        step[[0, 3]] = np.asarray(shift, dtype=float)
+        return self.by(ImageCorrection(self.model, "shift", (0.0, 0.0), step))
+
+
+def linked(one: Geometry, other: Geometry, place: ArrayLike) -> dict[str, Any]:
+    """Return how a geometry lies in another one about a place: its `place` there and the partial derivatives.
+
+    Both are null where the place is not seen there.
+    """
+    steps = np.array([(0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)]) * _STEP
+    there = other.image_of(one.ground_of(np.asarray(place, dtype=float) + steps))
+    matrix = np.column_stack([there[2] - there[1], there[4] - there[3]]) / (2 * _STEP)
+    if not (np.isfinite(there).all() and abs(np.linalg.det(matrix)) > 1e-9):
+        return {"place": None, "matrix": None}
+    return {"place": there[0].tolist(), "matrix": matrix.tolist()}
+
+
+def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None, surface: Surface) -> Array:
+    """Return typed coordinates x, y and height as ground ``(3,)`` in `GROUND_CRS`; a height of None is the surface's.
+
+    Parameters
+    ----------
+    crs : str
+        Of x and y.
+    vertical : str, optional
+        What the height is measured above; the ellipsoid without one.
+
+    Raises
+    ------
+    InputError, CrsError, DatumError
+        If a value is missing, or what it is in is not known.
+    """
+    for field, text in (("crs", crs), ("vertical", vertical or "ellipsoid")):
+        # What else PROJ understands may name files, and a page opens none.
+        if not re.fullmatch(_NAMED, text.strip(), re.ASCII | re.IGNORECASE):
+            raise InputError("this is not known by that name", field=field,
+                             remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008")  # fmt: skip
+    if len(values) != 3 or values[0] is None or values[1] is None:
+        raise InputError("ground has x and y, and a height or none", field="ground")
+    plane = horizontal(parse_crs(crs))
+    plan = np.array([[values[0], values[1]]], dtype=float)
+    lonlat = ground_transform(plane, "EPSG:4326")(np.column_stack([plan, [0.0]]))[0, :2]
+    if values[2] is None:
+        height = float(surface.heights(plan, plane)[0])
+        if not np.isfinite(height):
+            raise InputError("the DEM has no height here", field="ground", remedy="type the height")
+    else:
+        datum = Vertical.parse(vertical or "ellipsoid")
+        undulation = 0.0 if datum.is_ellipsoid else float(datum.undulation(lonlat[:1], lonlat[1:])[0])
+        height = values[2] + undulation
+    return np.array([lonlat[0], lonlat[1], height])

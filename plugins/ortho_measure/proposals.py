@@ -1,0 +1,177 @@
+"""Proposals: the sub-pixel place of one click, with its score and covariance, by the matcher's own functions.
+
+The chip of the scene about the click is looked for in the reference, which is rendered into the scene's pixels where
+the click says that it belongs; two rounds of least-squares matching measure the shift, the second from where the first
+led. What least-squares matching states for its covariance is too small by a factor that only a scatter tells: so the
+neighbours of the chip are measured too, and the scatter of their shifts gives the factor. What is alike in all of them
+(an error of the reference or of the heights) is not in it; it shows in the residuals of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ortho_measure.places import Places
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.statistics import squared_distances
+from ortho_pipeline.files.json.values import json_position, json_value
+from ortho_pipeline.imaging.matching import REASONS
+from ortho_pipeline.imaging.matching.chip_search import MEASURED, SIDE, doubts, found_again
+from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
+from ortho_pipeline.imaging.matching.least_squares import Measured, measure
+from ortho_pipeline.imaging.matching.targets import chip_factor
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
+
+#: Chip px about where it should be: of the search where both places are clicked, and the farthest of all.
+NEAR, FARTHEST = 6, 48
+#: Neighbours whose scatter tells how good a match is: fewer than this tell nothing.
+_FEWEST = 4
+#: No match by hand is claimed to be better than this (px per axis).
+_LEAST = 0.02
+_ROUNDS = 3
+#: Neighbours of a chip, in sides of it, the nearest first; so many of them are measured.
+_AROUND = np.array(
+    sorted(((x, y) for y in range(-2, 3) for x in range(-2, 3) if x or y), key=lambda step: step[0] ** 2 + step[1] ** 2)
+)
+_NEIGHBOURS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A match of one place.
+
+    Parameters
+    ----------
+    shift : (2,)
+        Where the reference shows what the scene has at the click, minus the click: px. NaN if it was not found.
+    covariance : (2, 2)
+        px^2.
+    score : float
+        Correlation of the chips, -1 to 1.
+    reason : str
+        Why it is not to be believed, in words; empty if it is.
+    scattered : int
+        So many neighbours told the size of the covariance; 0 where none did, and it is that of a measurement by hand.
+    """
+
+    shift: Array
+    covariance: Array
+    score: float
+    reason: str
+    scattered: int
+
+
+def propose(places: Places, image: Sequence[float], radius: float) -> Proposal:
+    """Match the scene about an image point with the references, which are looked through so many px about it.
+
+    Parameters
+    ----------
+    places : Places
+        With a model that puts the wanted ground at the click, as well as is known.
+    """
+    factor = chip_factor(places.view, places.references, np.asarray(image, dtype=float)[None])
+    reach = int(np.clip(np.ceil(radius / factor), NEAR, FARTHEST))
+    origin = np.round(np.asarray(image, dtype=float) - SIDE * factor / 2).astype(int)[None]
+    scene = scene_chips(places.view, origin, SIDE, factor)
+    wide = _rendered(places, origin, 2 * reach, factor)
+    found = found_again(scene, wide, reach)
+    around = scene_chips(places.view, origin - reach * factor, SIDE + 2 * reach, factor)
+    doubt = str(doubts(found, wide, around, reach)[0])
+    if not np.isfinite(wide).any():
+        return _nothing("the reference shows nothing here")
+    shift, measured = found.shift[0] * factor, None
+    for _ in range(_ROUNDS):
+        measured = _measured(places, origin, shift, factor, scene)
+        if not np.isfinite(measured.shift).all():
+            return _nothing(REASONS[doubt or "not measured"], float(found.score[0]))
+        shift = shift + measured.shift[0] * factor
+        if np.abs(measured.shift).max() < 0.02:
+            break
+    assert measured is not None
+    covariance, scattered = _covariance(places, origin, shift, factor, measured)
+    return Proposal(shift, covariance, float(measured.correlation[0]), REASONS.get(doubt, ""), scattered)
+
+
+def proposal_of(places: Places, click: Array | None, ground: Array | None, radius: float) -> dict[str, Any]:
+    """Return a match for a click, as JSON values: its `image` and `ground`, score and covariance, or the `reason`.
+
+    Parameters
+    ----------
+    click : (2,), optional
+        px of the scene.
+    ground : (3,), optional
+        Clicked or typed: its image is looked for about the click, within `NEAR`, or without a click about where the
+        model puts it, within `radius` px. Without a ground that of the click is looked for, within `radius` px.
+
+    Raises
+    ------
+    InputError
+        If there is neither.
+    """
+    if ground is not None:
+        expected = places.image_of([ground])[0]
+        if click is None and not np.isfinite(expected).all():
+            raise InputError("the model leads outside of the scene", field="ground", remedy="click it in the scene")
+        about = expected if click is None else click
+        found = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
+        place, on_ground = about - found.shift, ground
+    elif click is None:
+        raise InputError("there is no place to match", field="image")
+    else:
+        found = propose(places, click.tolist(), radius)
+        place, on_ground = click, np.full(3, np.nan)
+        if np.isfinite(found.shift).all():
+            on_ground = places.ground_of([click + found.shift])[0]
+    reason = found.reason or ("" if np.isfinite(on_ground).all() else "the heights do not reach here")
+    (column, both), (_, row) = found.covariance
+    told: dict[str, Any] = json_value({
+        "image": json_position(place), "ground": json_position(on_ground), "score": found.score,
+        "covariance": json_position([column, row, both]), "scattered": found.scattered, "reason": reason,
+    })  # fmt: skip
+    return told
+
+
+def _rendered(places: Places, origins: NDArray[np.int_], radius: int, factor: int) -> NDArray[np.float32]:
+    renderer = Renderer(places.view, places.references, origins - radius * factor, SIDE + 2 * radius, factor)
+    return renderer.render(np.arange(len(origins)))
+
+
+def _measured(
+    places: Places, origins: NDArray[np.int_], shift: Array, factor: int, scene: NDArray[np.float32]
+) -> Measured:
+    """Measure what is left of a shift (px) where the reference is rendered with it taken out."""
+    wide = _rendered(places.moved(-shift), origins, MEASURED, factor)
+    return measure(scene, wide, np.zeros((len(origins), 2)))
+
+
+def _covariance(
+    places: Places, origin: NDArray[np.int_], shift: Array, factor: int, measured: Measured
+) -> tuple[Array, int]:
+    """Return the covariance ``(2, 2)`` px^2 of a match, and how many neighbours it is from."""
+    own = measured.covariance[0] * factor**2
+    origins = origin + _AROUND * SIDE * factor
+    inside = ((origins >= 0) & (origins + SIDE * factor <= places.view.size)).all(axis=1)
+    origins = origins[inside][:_NEIGHBOURS]
+    scene = scene_chips(places.view, origins, SIDE, factor)
+    full = np.flatnonzero(np.isfinite(scene).all(axis=(1, 2)))
+    found = _measured(places, origins[full], shift, factor, scene[full]) if len(full) else None
+    good = np.zeros(0, dtype=int) if found is None else np.flatnonzero(np.isfinite(found.shift).all(axis=1))
+    if found is None or len(good) < _FEWEST:
+        return np.eye(2) * DEFAULT_SIGMA_IMAGE**2, 0
+    offsets, stated = found.shift[good] * factor, found.covariance[good] * factor**2
+    # About their median, as neighbours on other ground (a roof, a tree that moved) may be far off.
+    distance = squared_distances(offsets - np.median(offsets, axis=0), stated)
+    # The median of a chi-squared of two degrees of freedom is 2 log 2; the mean of few takes part of the scatter away.
+    size = float(np.median(distance)) / (2 * np.log(2)) * len(good) / (len(good) - 1)
+    grown = own * max(size, 1.0)
+    return grown + np.eye(2) * max(0.0, _LEAST**2 - float(np.linalg.eigvalsh(grown)[0])), len(good)
+
+
+def _nothing(reason: str, score: float = 0.0) -> Proposal:
+    return Proposal(np.full(2, np.nan), np.full((2, 2), np.nan), score, reason, 0)

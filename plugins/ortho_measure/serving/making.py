@@ -1,0 +1,104 @@
+"""The ortho of the points as they are, made while one goes on measuring: one at a time."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_measure.project import Project
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.raster.quicklook import preview_png, reduced_grid, shaded_png
+from ortho_pipeline.raster.regridded import Regridded, grid_of
+
+#: Longer side (px) of the pictures.
+_SIDE = 1400
+PICTURES = ("ortho", "reference")
+
+
+class Making:
+    """Makes orthos of the images of a project."""
+
+    def __init__(self, session: Project) -> None:
+        self._session, self._lock = session, threading.Lock()
+        self._told: dict[str, Any] = {"state": "none", "share": 0.0, "number": 0}
+        self._files: dict[str, Path] = {}
+        self._thread: threading.Thread | None = None
+
+    def begin(self, number: int = 0) -> dict[str, Any]:
+        """Begin with an image, unless an ortho is being made already, and say how far it is.
+
+        Raises
+        ------
+        InputError
+            If there is no such image.
+        """
+        if number >= len(self._session.views):
+            raise InputError("there is no such image", field="number")
+        with self._lock:
+            if self._told["state"] != "running":
+                self._told = {"state": "running", "share": 0.0, "number": number}
+                self._thread = threading.Thread(target=self._make, args=(number,), name="ortho", daemon=True)
+                self._thread.start()
+            return self._told
+
+    def told(self) -> dict[str, Any]:
+        """Say how far it is: `state` is none, running, done or failed, `share` the finished part of its `stage`.
+
+        `number` is the image that it is of.
+        """
+        with self._lock:
+            return self._told
+
+    def report(self) -> bytes:
+        """Return the report of the last ortho, a page of HTML."""
+        return self._file("html").read_bytes()
+
+    def picture(self, which: str) -> bytes:
+        """Return the last ortho as PNG, or the reference on its grid; both have the same size."""
+        grid = reduced_grid(grid_of(self._file("ortho")), _SIDE)
+        if which == "ortho":
+            return preview_png(self._file("ortho"), side=_SIDE)
+        pixels = np.zeros((1, grid.height, grid.width), dtype=np.float32)
+        valid = np.zeros(pixels.shape, dtype=bool)
+        for reference in [sheet.reference for sheet in self._session.sheets]:
+            # GDAL takes a lower resolution from overviews and averages the rest.
+            part, good = Regridded(reference.path, grid, resampling="average").read(0, 0, grid.width, grid.height)
+            fresh = good.all(axis=0) & ~valid[0]
+            pixels[0, fresh] = part.mean(axis=0)[fresh]
+            valid[0] |= fresh
+        return shaded_png(pixels, valid[0])
+
+    # -- the work ----------------------------------------------------------------------------------------------------
+
+    def _make(self, number: int) -> None:
+        try:
+            made = self._session.ortho(self._advance, number)
+        except OrthoError as error:
+            self._tell({"state": "failed", "share": 0.0, "error": f"{error.message} ({error.remedy})"})
+        except Exception as error:  # the page would wait for ever
+            self._tell({"state": "failed", "share": 0.0, "error": f"{type(error).__name__}: {error}"})
+            raise
+        else:
+            headline = made.document["report"]["headline"]
+            with self._lock:
+                self._files = dict(made.files)
+            self._tell({
+                "state": "done", "share": 1.0, "figure": headline["figure"], "what": headline["what"],
+                "files": [str(path) for path in made.files.values()],
+            })  # fmt: skip
+
+    def _advance(self, stage: str, share: float) -> None:
+        self._tell({"state": "running", "stage": stage, "share": float(share)})
+
+    def _tell(self, told: dict[str, Any]) -> None:
+        with self._lock:
+            self._told = {"number": self._told["number"], **told}
+
+    def _file(self, name: str) -> Path:
+        with self._lock:
+            if name not in self._files:
+                raise InputError("there is no ortho yet", field="ortho", remedy="make it first")
+            return self._files[name]

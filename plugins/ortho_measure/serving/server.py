@@ -1,0 +1,406 @@
+"""The server of the page: starlette behind the guard, on this machine alone.
+
+What the page may load is a fixed table, read when the server begins: no path of a request is ever opened.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import threading
+from collections.abc import Callable, Sequence
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+from ortho_measure.block.session import BlockSession
+from ortho_measure.project import Project
+from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.guard import REPORT_POLICY, Admit, App, Guard
+from ortho_measure.serving.listener import LOOPBACK, QUEUE, Listener
+from ortho_measure.serving.log import repetitions_counted
+from ortho_measure.serving.making import PICTURES, Making
+from ortho_measure.serving.tiles import MOST, SIDE, Tiles
+from ortho_measure.session import Session
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.files import parse_json
+from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
+from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.runtime.process_limits import thread_pool
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+#: What the page is made of: name -> media type.
+PAGE = {
+    "index.html": "text/html; charset=utf-8",
+    "style.css": "text/css; charset=utf-8",
+    "app.js": "text/javascript; charset=utf-8",
+    "views.js": "text/javascript; charset=utf-8",
+    "table.js": "text/javascript; charset=utf-8",
+    "ol.js": "text/javascript; charset=utf-8",
+    "ol.css": "text/css; charset=utf-8",
+    "ol-LICENSE.md": "text/plain; charset=utf-8",
+}
+_REMEDY = "load the page anew"
+
+
+class Windows:
+    """Which window of the browser writes: the first one, until another takes over."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._writer: str | None = None
+
+    def claim(self, window: str, *, take: bool = False) -> bool:
+        """Return whether a window writes now; `take` makes it so."""
+        with self._lock:
+            if self._writer is None or take:
+                self._writer = window
+            return self._writer == window
+
+    def leave(self, window: str) -> None:
+        """Let the next window write, if it was this one."""
+        with self._lock:
+            if self._writer == window:
+                self._writer = None
+
+
+class _Answers:
+    """What is answered to each request; methods of the same names as paths."""
+
+    def __init__(self, session: Project, tiles: Tiles) -> None:
+        self._session, self._tiles, self._windows = session, tiles, Windows()
+        self.making = Making(session)
+
+    @property
+    def scene(self) -> Session:
+        """The session of a single scene.
+
+        Raises
+        ------
+        InputError
+            If there are several.
+        """
+        if not isinstance(self._session, Session):
+            raise InputError("this is asked of one scene", field="request", remedy=_REMEDY)
+        return self._session
+
+    def begin(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say what does not change: sizes, names, bands."""
+        session = self._session
+        writes = not session.journal.read_only and self._windows.claim(_window(given), take=bool(given.get("take")))
+        return {
+            "images": [_facts(view.intensity.source.path, view.size) for view in session.views],
+            "maps": [_facts(sheet.reference.path, sheet.size) for sheet in session.sheets],
+            "labels": list(session.images.labels) if isinstance(session, BlockSession) else None,
+            "output": os.path.basename(session.output), "tile": SIDE, "bands": self._tiles.bands,
+            "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
+            "healed": session.journal.healed, "stopped": session.stopped, "state": session.state(),
+        }  # fmt: skip
+
+    def leave(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Take note that a window is closed."""
+        self._windows.leave(_window(given))
+        return {}
+
+    def act(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Do an action; a window that does not write is refused."""
+        self._require_writer(given)
+        action = given.get("action")
+        if not isinstance(action, dict):
+            raise InputError("there is no action", field="action")
+        return self._session.act(action)
+
+    def state(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return all that changes."""
+        return self._session.state()
+
+    def predict(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say where a place lies in all views."""
+        version = _whole(given.get("version", 0))
+        if given.get("ground") is not None:
+            return self._session.predict(version, ground=_numbers(given["ground"], 3))
+        return self._session.predict(version, str(given.get("at")), _numbers(given.get("place"), 2))
+
+    def link(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say how one view lies in another."""
+        version, place = _whole(given.get("version", 0)), _numbers(given.get("place"), 2)
+        return self._session.link(version, str(given.get("at")), place, str(given.get("to")))
+
+    def propose(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Match a click."""
+        image, ground = given.get("image"), given.get("ground")
+        if image is None and ground is None:
+            raise InputError("there is no place to match", field="image", remedy=_REMEDY)
+        return self.scene.proposal(
+            None if image is None else _numbers(image, 2), None if ground is None else _numbers(ground, 3)
+        )  # fmt: skip
+
+    def tie(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Match a click in one of several images, or a ground, in all of them."""
+        session, known = self._session, given.get("known") or {}
+        if not isinstance(session, BlockSession) or not isinstance(known, dict):
+            raise InputError("there is one image", field="request", remedy=_REMEDY)
+        if given.get("ground") is not None:
+            return session.of_ground(_numbers(given["ground"], 3))
+        number, labels = _whole(given.get("number")), session.images.labels
+        if number >= len(labels) or not set(known) <= set(labels):
+            raise InputError("there is no such image", field="number", remedy=_REMEDY)
+        places = {str(label): _numbers(place, 2) for label, place in known.items()}
+        return session.proposal(number, _numbers(given.get("image"), 2), places)
+
+    def typed(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Understand typed coordinates."""
+        values = given.get("values")
+        if not isinstance(values, list) or len(values) != 3:
+            raise InputError("ground has x, y and a height or none", field="values")
+        numbers = [None if value is None else _numbers([value], 1)[0] for value in values]
+        vertical = given.get("vertical")
+        return {
+            "ground": self._session.typed(numbers, str(given.get("crs") or ""), str(vertical) if vertical else None)
+        }
+
+    def stretch(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return what is black and white, for each band."""
+        pane, box = str(given.get("pane")), given.get("box")
+        if pane not in self._tiles.bands:
+            raise InputError("there is no such view", field="pane")
+        where = None if box is None else _numbers(box, 4)
+        bands, version = _bands(given.get("bands")), _whole(given.get("version", 0))
+        return {"limits": [self._tiles.limits(pane, version, where, self._band(pane, band)) for band in bands]}
+
+    def compare(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Compare the models that the points could be fitted with."""
+        return self._session.compared()
+
+    def save(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Write the points."""
+        self._session.save()
+        return {}
+
+    def make(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Begin to make the ortho of an image."""
+        self._require_writer(given)
+        return self.making.begin(_whole(given.get("number", 0)))
+
+    def made(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Say how far the ortho is."""
+        return self.making.told()
+
+    def _require_writer(self, given: dict[str, Any]) -> None:
+        if not self._windows.claim(_window(given)):
+            raise InputError("another window measures these points: this one only shows them", field="window",
+                             remedy="take over")  # fmt: skip
+
+    def _band(self, pane: str, band: int) -> int:
+        if not 0 <= band <= self._tiles.bands[pane]:
+            raise InputError("there is no such band", field="bands")
+        return band
+
+
+def application(
+    session: Project, entry: Entry, hosts: set[str], opened: SceneOptions = SceneOptions(), admit: Admit | None = None
+) -> App:
+    """Return the ASGI application of a session."""
+    from starlette.applications import Starlette
+    from starlette.routing import Route
+
+    given = _Given(session, Tiles(session, opened))
+    routes = [
+        Route("/", given.page),
+        Route("/api/{what}", given.answer, methods=["POST"]),
+        Route("/made/{which}", given.outcome),
+        Route("/tiles/{pane}/{version:int}/{factor:int}/{column:int}/{row:int}", given.tile),
+        Route("/{name}", given.page),
+    ]
+    return Guard(Starlette(routes=routes), hosts, entry, admit)
+
+
+class _Given:
+    """What a request is given: parts of the page, tiles, answers, and what was made; work is done by threads."""
+
+    def __init__(self, session: Project, tiles: Tiles) -> None:
+        self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
+        room = resources.files("ortho_measure")
+        self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
+        self._workers = thread_pool(max(2, os.cpu_count() or 1), "measure")
+
+    async def _run(self, work: Callable[..., Any], *given: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._workers, work, *given)
+
+    async def page(self, request: Request) -> Response:
+        """Give a part of the page."""
+        from starlette.responses import Response
+
+        name = request.path_params.get("name", "index.html")
+        if name not in self._files:
+            return Response("refused\n", 404)
+        return Response(self._files[name], media_type=PAGE[name], headers={"cache-control": "no-cache"})
+
+    async def tile(self, request: Request) -> Response:
+        """Give a tile."""
+        from starlette.responses import JSONResponse, Response
+
+        try:
+            given = _tile(request)
+            made = await self._run(lambda: self._tiles.png(*given))
+        except OrthoError as error:
+            return JSONResponse(_told(error), 400)
+        # The address names all that the pixels depend on.
+        return Response(made, media_type="image/png", headers={"cache-control": "private, max-age=86400, immutable"})
+
+    async def outcome(self, request: Request) -> Response:
+        """Give the report of the ortho that was made, or a picture of it."""
+        from starlette.responses import JSONResponse, Response
+
+        which, own = request.path_params["which"], {"cache-control": "no-store"}
+        try:
+            making = self._answers.making
+            if which == "report":
+                own["content-security-policy"] = REPORT_POLICY
+                return Response(await self._run(making.report), media_type="text/html; charset=utf-8", headers=own)
+            if which not in PICTURES:
+                return Response("refused\n", 404)
+            return Response(await self._run(making.picture, which), media_type="image/png", headers=own)
+        except OrthoError as error:
+            return JSONResponse(_told(error), 400)
+
+    async def answer(self, request: Request) -> Response:
+        """Answer what the page asks."""
+        from starlette.responses import JSONResponse, Response
+
+        what = request.path_params["what"]
+        work = getattr(self._answers, what) if what in ASKED else None
+        if work is None:
+            return Response("refused\n", 404)
+        try:
+            given = _asked(await request.body())
+            done = await self._run(work, given)
+        except OrthoError as error:
+            return JSONResponse(_told(error), 409 if error.field == "window" else 400)
+        if what == "act":
+            self._workers.submit(self._session.save)
+        return JSONResponse(done, headers={"cache-control": "no-store"})
+
+
+#: What the page may ask: methods of `_Answers`.
+ASKED = (
+    "begin", "leave", "act", "state", "predict", "link", "propose", "tie", "typed", "stretch", "compare", "save",
+    "make", "made",
+)  # fmt: skip
+
+
+def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
+    """Serve the page of a session until the process is asked to end.
+
+    Parameters
+    ----------
+    ready : callable
+        Gets the address once it is answered there. The address works once.
+    port : int
+        0 is any that is free.
+    """
+    import uvicorn
+
+    entry, listener = Entry(), Listener(port)
+    number = listener.getsockname()[1]
+    hosts = {f"{LOOPBACK}:{number}", f"localhost:{number}"}
+    limit_cache(OutputOptions.memory, os.cpu_count() or 1)
+    app = application(session, entry, hosts, opened, listener.admit)
+    # h11 limits the size of headers. The listener is told the true address of a client, whatever headers claim.
+    config = uvicorn.Config(
+        app, loop="asyncio", http="h11", ws="none", lifespan="off", proxy_headers=False, server_header=False,
+        date_header=False, access_log=False, log_config=None, timeout_graceful_shutdown=3, backlog=QUEUE,
+    )  # fmt: skip
+    try:
+        ready(f"http://{LOOPBACK}:{number}{entry.path}")
+        # Ctrl-C is how this command ends.
+        with contextlib.suppress(KeyboardInterrupt), repetitions_counted("uvicorn.error", "asyncio"):
+            uvicorn.Server(config).run([listener])
+    finally:
+        listener.close()
+        session.close()
+
+
+# -- what requests say -----------------------------------------------------------------------------------------------
+
+
+def _asked(body: bytes) -> dict[str, Any]:
+    given = parse_json(body or b"{}", "request", _REMEDY)
+    if not isinstance(given, dict):
+        raise InputError("a request is a JSON object", remedy=_REMEDY)
+    try:
+        json.dumps(given, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        # JSON can name halves of a character. They are in no file and in no answer.
+        raise InputError("a text of this request is not Unicode", field="request", remedy=_REMEDY) from error
+    return given
+
+
+def _tile(request: Request) -> tuple[Any, ...]:
+    given = request.path_params
+    query = request.query_params
+    numbered = [text.isascii() and text.isdigit() and len(text) < 10 for text in query.get("b", "0").split(",")]
+    if not all(numbered):
+        raise InputError("there is no such band", field="bands")
+    bands = _bands([int(text) for text in query.get("b", "0").split(",")])
+    values = query.get("l", "").split(",")
+    if len(values) != 2 * len(bands):
+        raise InputError("there is no such tile", field="tile")
+    try:
+        limits = _numbers([float(text) for text in values], len(values))
+    except ValueError:
+        raise InputError("there is no such tile", field="tile") from None
+    pairs = list(zip(limits[::2], limits[1::2], strict=True))
+    factor, column, row = given["factor"], given["column"], given["row"]
+    if factor > MOST or max(column, row) > 1 << 20:
+        raise InputError("there is no such tile", field="tile")
+    return given["pane"], given["version"], factor, column, row, bands, pairs
+
+
+def _bands(values: Any) -> list[int]:
+    found = [_whole(value) for value in values] if isinstance(values, list) else []
+    if len(found) not in (1, 3):
+        raise InputError("one band is shown in grey, or three in colours", field="bands")
+    return found
+
+
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
+        raise InputError("this is no whole number", field="request", remedy=_REMEDY)
+    return value
+
+
+def _numbers(values: Any, count: int) -> list[float]:
+    """Return so many finite numbers of a request."""
+    if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
+        raise InputError(f"{count} numbers are wanted", field="request", remedy=_REMEDY)
+    for value in values:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+            or abs(value) > 1e12
+        ):
+            raise InputError("this is no number", field="request", remedy=_REMEDY)
+    return [float(value) for value in values]
+
+
+def _facts(path: str, size: tuple[int, int]) -> dict[str, Any]:
+    return {"name": os.path.basename(path), "size": list(size)}
+
+
+def _window(given: dict[str, Any]) -> str:
+    name = given.get("window")
+    if not isinstance(name, str) or not 8 <= len(name) <= 64:
+        raise InputError("a window has a name", field="request", remedy=_REMEDY)
+    return name
+
+
+def _told(error: OrthoError) -> dict[str, Any]:
+    """Return what the page shows of an error: no path of this machine is in it."""
+    return {"error": {"message": error.message, "field": error.field, "remedy": error.remedy}}

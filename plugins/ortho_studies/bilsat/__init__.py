@@ -1,0 +1,1 @@
+"""BILSAT-1 frames over Ankara, as Ok and Turker had them."""

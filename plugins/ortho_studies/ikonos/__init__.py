@@ -1,0 +1,1 @@
+"""IKONOS Geo images over Tehran, as Amini and Hashemi had them."""

@@ -1,0 +1,244 @@
+"""How a reproduction is shown: tables as text for a terminal, and a page with figures, curves and reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.display.drawing import Axes, Drawing, round_down, style_sheet
+from ortho_pipeline.display.pages import render
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import counted
+from ortho_studies.simulation.tables import VERDICTS, is_covered, is_missed
+
+_SIDE, _MARGIN = 520.0, 18.0
+_UNITS = {"px": ("pixel", "pixels"), "m": ("metre", "metres")}
+_SOURCES = {
+    "paper": "this paper", "published": "published elsewhere, or customary", "chosen": "chosen", "fitted": "fitted to",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawing and what stands below it."""
+
+    drawing: Drawing
+    caption: str
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why rows differ from the paper: those (not yet explained) whose ``label quantity`` starts with `start`."""
+
+    start: str
+    why: str
+
+
+UNEXPLAINED = Reason("", "Beyond the factor without a cause that we know of.")
+
+
+def text(document: Mapping[str, Any]) -> str:
+    """Return the tables for a terminal; `!` marks what does not agree, `f` what a setting was fitted to."""
+    rows = [row for table in document["tables"] for row in table["rows"]]
+    wide, narrow = (max([least, *(len(row[key]) for row in rows)]) for least, key in ((24, "label"), (8, "quantity")))
+    lines = [document["paper"], document["settings_text"], ""]
+    for table in document["tables"]:
+        lines.append(f"Table {table['table']}: {table['title']}")
+        heads = "".join(f" {head:>7}" for head in ("paper", "ours", "5 %", "95 %", "naive"))
+        lines.append(f"   {'':<{wide}} {'':<{narrow}} {'':<2}{heads}")
+        for row in table["rows"]:
+            marks = f"{'!' if is_missed(row) else ' '}{'f' if row['role'] == 'fitted' else ' '}"
+            ours = "".join(f" {_number(row[key]):>7}" for key in ("paper", "median", "p5", "p95", "naive"))
+            lines.append(f"{marks} {row['label']:<{wide}} {row['quantity']:<{narrow}} {row['units']:<2}{ours}")
+        lines.append("")
+    for one in document["statements"]:
+        why = f" {one['why']}" if one["why"] else ""
+        lines.append(f"{'!' if one['verdict'] == VERDICTS[2] else ' '} {one['text']} {_capital(one['verdict'])}: "
+                     f"{one['detail']}.{why}")  # fmt: skip
+    return "\n".join([*lines, *([""] if document["statements"] else []), *verdict(document)])
+
+
+def verdict(document: Mapping[str, Any]) -> list[str]:
+    """Return what the document proves: predictions, beside the naive guesses, then the rest; one sentence each."""
+    found = document["summary"]
+    wide, tight = (f"{factor:g}" for factor in found["factors"])
+    predicted, fitted, draws = (found[role] for role in ("predicted", "fitted", "draw"))
+    said = []
+    if predicted["rows"]:
+        said += [
+            f"Of {counted(predicted['rows'], 'number')} that no setting was fitted to, "
+            f"{_share(predicted, 'within', wide)} are "
+            f"within a factor {wide} of the paper and {_share(predicted, 'within', tight)} within {tight}.",
+            f"A naive guess without any simulation has {_share(predicted, 'naive', wide)} and "
+            f"{_share(predicted, 'naive', tight)}: {document['naive_text']}",
+            f"{_of(predicted['covered'], predicted['rows'])} lie between our 5th and 95th percentile. Were the paper "
+            f"one of our realisations, {100 * found['single_realisation']['median']:.0f} % "
+            f"({100 * found['single_realisation']['p5']:.0f} to {100 * found['single_realisation']['p95']:.0f} %) "
+            f"would be within {wide} of our medians.",
+        ]
+    if fitted["rows"]:
+        said.append(
+            f"Not counted: {counted(fitted['rows'], 'number')} that settings were fitted to "
+            f"({_share(fitted, 'within', wide)} "
+            f"within {wide}, {_share(fitted, 'within', tight)} within {tight})."
+        )
+    if draws["rows"]:
+        said.append(
+            f"Nor are {draws['rows']} numbers that are single draws of an error whose spread alone is known "
+            f"({draws['covered']} lie between our 5th and 95th percentile)."
+        )
+    if document["statements"]:
+        numbers = [sum(one["verdict"] == which for one in document["statements"]) for which in VERDICTS]
+        said.append(
+            f"Of {sum(numbers)} statements of the paper {numbers[0]} are reproduced, {numbers[1]} hold by the settings "
+            f"and {numbers[2]} are not reproduced."
+        )
+    return said
+
+
+def _share(counted: Mapping[str, Any], what: str, factor: str) -> str:
+    return _of(counted[what][factor], counted["rows"])
+
+
+def _of(part: int, rows: int) -> str:
+    return f"{part} ({100 * part / rows:.0f} %)"
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def knob_text(knob: Mapping[str, Any]) -> str:
+    """Return value and units of a knob for people."""
+    return f"{_shown(knob['value'])} {knob['units']}".strip()
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{key}: {_shown(part)}" for key, part in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_shown(part) for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def page(
+    document: Mapping[str, Any],
+    *,
+    heading: str,
+    introduction: str,
+    figures: Sequence[Figure] = (),
+    reasons: Sequence[Reason] = (),
+) -> str:
+    """Return the page as HTML: verdict, introduction, figures, tables, statements, curves, and why some rows differ.
+
+    Parameters
+    ----------
+    heading : str
+        Title of the page.
+    introduction : str
+        What the scenes are; the document's settings follow it.
+    reasons : sequence of Reason
+        Tried in order; the rest is said to be unexplained.
+    """
+    curves = [Figure(draw_curve(curve), curve["title"]) for curve in document["curves"]]
+    return render(
+        "simulation/reproduction.html.j2",
+        package="ortho_studies",
+        document=document,
+        heading=heading,
+        verdict=verdict(document),
+        introduction=introduction,
+        figures=[{"svg": figure.drawing.svg(), "caption": figure.caption} for figure in figures],
+        curves=[{"svg": figure.drawing.svg(), "caption": figure.caption} for figure in curves],
+        plot_style=style_sheet(),
+        reasons=list(_reasons(document, [*reasons, UNEXPLAINED])),
+        is_missed=is_missed,
+        knob_text=knob_text,
+        sources=_SOURCES,
+        capital=_capital,
+        number=_number,
+    )
+
+
+def _reasons(document: Mapping[str, Any], reasons: Sequence[Reason]) -> Iterator[dict[str, Any]]:
+    """Yield the rows that do not agree, by their reason."""
+    missed = [row for table in document["tables"] for row in table["rows"] if is_missed(row)]
+    for reason in reasons:
+        rows = [row for row in missed if f"{row['label']} {row['quantity']}".startswith(reason.start)]
+        missed = [row for row in missed if row not in rows]
+        if rows:
+            chance = sum(is_covered(row) for row in rows)
+            yield {"why": reason.why, "rows": rows, "chance": chance}
+
+
+# -- drawings --------------------------------------------------------------------------------------------------------
+
+
+def draw_vectors(
+    label: str,
+    image: Array,
+    residuals: Array,
+    size: tuple[float, float],
+    *,
+    units: str = "px",
+    kind: str = "control",
+    bar: float | None = None,
+    side: float = _SIDE,
+) -> Drawing:
+    """Draw residuals ``(N, 2)``, enlarged, at their image points ``(N, 2)`` in a frame of `size` (columns, rows).
+
+    Parameters
+    ----------
+    bar : float, optional
+        Length of the scale bar, in units of the residuals; the scale of the arrows goes with it. Without it the
+        longest arrow is an eighth of the frame, and the bar a round length.
+    """
+    shrink = (side - 2 * _MARGIN) / max(size)
+    wide, tall = size[0] * shrink, size[1] * shrink
+    lengths = np.hypot(*np.asarray(residuals, dtype=np.float64).T)
+    longest = float(np.nanmax(lengths, initial=0.0)) or 1.0
+    unit = side / 8 / longest if bar is None else side / 8 / bar
+    bar = round_down(longest) if bar is None else bar
+    drawing = Drawing(wide + 2 * _MARGIN, tall + 2 * _MARGIN + 26, label, "vectors")
+    drawing.rect("frame", _MARGIN, _MARGIN, wide, tall)
+    for place, miss in zip(np.asarray(image).tolist(), np.asarray(residuals).tolist(), strict=True):
+        x, y = (_MARGIN + shrink * value for value in place)
+        title = f"column {place[0]:.0f}, row {place[1]:.0f}: {miss[0]:+.2f}, {miss[1]:+.2f} {units}"
+        with drawing.titled(title):
+            drawing.mark(kind, x, y)
+            drawing.arrow(kind, x, y, *(value * unit for value in miss))
+    y = tall + 2 * _MARGIN + 12
+    drawing.line("bar", _MARGIN, y, _MARGIN + bar * unit, y)
+    drawing.text(_MARGIN + bar * unit + 8, y + 4, f"{bar:g} {_UNITS[units][bar != 1]}")
+    return drawing
+
+
+def draw_curve(curve: Mapping[str, Any]) -> Drawing:
+    """Draw the series of a `Curve` (as JSON) as lines, each with its name at its end."""
+    drawing = Drawing(640, 380, curve["title"], "curve")
+    xs = [value for one in curve["series"] for value in one["x"]]
+    ys = [value for one in curve["series"] for value in one["y"] if value is not None]
+    low, high = min(ys, default=0.0), max(ys, default=1.0)
+    reach = (high - low) or 1.0
+    floor = 0.0 if low >= 0 else low - 0.05 * reach
+    axes = Axes(drawing, (58.0, 14.0, 430.0, 306.0), (min(xs), max(xs)), (floor, high + 0.05 * reach))
+    axes.draw(curve["x_label"], curve["y_label"])
+    ends: list[tuple[float, int, str]] = []
+    for k, one in enumerate(curve["series"]):
+        known = [(x, y) for x, y in zip(one["x"], one["y"], strict=True) if y is not None]
+        if known:
+            drawing.path(f"series-{k % 9}", [axes.at(x, y) for x, y in known])
+            ends.append((axes.at(*known[-1])[1], k, one["name"]))
+    level = -np.inf
+    for y, k, name in sorted(ends):
+        level = max(y, level + 15)
+        drawing.line(f"series-{k % 9}", 494, level, 516, level)
+        drawing.text(520, level + 4, name)
+    return drawing
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
