@@ -59,7 +59,7 @@ GDAL_MODULES = {
     "files.traffic",
     "raster.gate",
     "raster.references",
-    "raster.block_cache",
+    "raster.caching.block_cache",
     "raster.source",
     "raster.intensity",
     "raster.output",
@@ -76,7 +76,7 @@ GDAL_MODULES |= {
     "warp.mosaic.writing",
     "warp.gdal_engine",
 }
-NUMBA_MODULES = {"runtime.kernels.compiler"}
+NUMBA_MODULES = {"runtime.compilation.compiler"}
 MATPLOTLIB_MODULES = {"report.notebook.charts", "display.drawing"}
 MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 28, 12, 500, 250, 50, 12
 

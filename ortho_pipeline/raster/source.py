@@ -28,7 +28,7 @@ from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
 from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.block_cache import keep_blocks
+from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.gate import DRIVERS, DecodedUnit, open_seen
 from ortho_pipeline.runtime.process_limits import require_memory
 

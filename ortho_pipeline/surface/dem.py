@@ -25,7 +25,7 @@ from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_re
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.surface.base import Array, Excerpt, Surface, Window, parse_fill, positions
 from ortho_pipeline.surface.dem_file import Affine, DemFile, SampleGrid
-from ortho_pipeline.surface.mosaic import Samples, matching_files, open_mosaic
+from ortho_pipeline.surface.dem_mosaic import Samples, matching_files, open_mosaic
 from ortho_pipeline.surface.voids import nearest_heights
 
 #: ``fill='nearest'`` looks so far for a valid height: samples, and metres after which real terrain is another one.
@@ -57,7 +57,7 @@ def open_dem(
     Parameters
     ----------
     path : path
-        A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.mosaic`).
+        A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.dem_mosaic`).
     vertical : Vertical or str, optional
         What the heights are measured above. Needed where the DEM does not say it.
     override : bool

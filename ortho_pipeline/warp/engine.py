@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster.block_cache import limit_cache
-from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
+from ortho_pipeline.raster.caching.block_cache import limit_cache
+from ortho_pipeline.raster.caching.read_ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
     Profile,
     RasterWriter,
@@ -38,7 +38,7 @@ from ortho_pipeline.warp import kernels
 from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
 from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpResult
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
-from ortho_pipeline.warp.layers.hiding import Hiding, Looked
+from ortho_pipeline.warp.quality.hiding import Hiding, Looked
 
 #: Side of a tile, the piece of work of a thread, of few bands (`square_side`). What a tile is may not depend on memory
 #: or threads, which the order of blocks in a file would tell.

@@ -9,7 +9,7 @@ from typing import Protocol
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.warp import engine, gdal_engine
 from ortho_pipeline.warp.job import WarpJob, WarpResult
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 
 class Engine(Protocol):

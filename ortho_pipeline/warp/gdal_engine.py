@@ -36,13 +36,13 @@ from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.surface.base import Excerpt, Surface
 from ortho_pipeline.warp.job import WARPING, WarpJob, WarpResult
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3

@@ -167,7 +167,7 @@ def test_a_pattern_without_files_is_refused(tmp_path: Path) -> None:
 def test_few_files_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for lon in range(10):
         write_cell(tmp_path, lon, 0)
-    monkeypatch.setattr("ortho_pipeline.surface.mosaic._OPEN_FILES", 3)
+    monkeypatch.setattr("ortho_pipeline.surface.dem_mosaic._OPEN_FILES", 3)
     dem = open_dem(tmp_path / "*.tif", "ellipsoid", fill="mask")
     whole = dem.window(0, 0, *dem.shape[::-1])
     assert not np.isnan(whole).any()

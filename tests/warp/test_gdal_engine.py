@@ -35,7 +35,7 @@ from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
 from ortho_pipeline.warp.job import WarpJob, WarpResult
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0

@@ -27,7 +27,7 @@ from ortho_pipeline.measure.serving.making import PICTURES, Making
 from ortho_pipeline.measure.serving.tiles import MOST, SIDE, Tiles
 from ortho_pipeline.measure.session import Session
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.runtime.process_limits import thread_pool
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from ortho_pipeline.surface.cells.copernicus import LIST, Cell, Extent, crs_of_c
 from ortho_pipeline.surface.cells.sources import Source, misplaced
 from ortho_pipeline.surface.dem import DemSurface, dem_of
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
-from ortho_pipeline.surface.mosaic import Samples, laid_out
+from ortho_pipeline.surface.dem_mosaic import Samples, laid_out
 
 _SHOWN = 4
 

@@ -22,7 +22,7 @@ from ortho_pipeline.surface.base import parse_fill
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, dem_of
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
-from ortho_pipeline.surface.mosaic import DemMosaic, Samples, laid_out
+from ortho_pipeline.surface.dem_mosaic import DemMosaic, Samples, laid_out
 
 #: Items that one DEM may have.
 _MOST_ITEMS = 10_000

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.source import MEMORY, RasterSource
 from ortho_pipeline.warp.mosaic.layout import Box, Layer, Mosaic, box_of, intersection
 

@@ -23,11 +23,11 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter, classes_profile
 from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
-from ortho_pipeline.warp.layers.accuracy import layer_grid, overviews, tiles
-from ortho_pipeline.warp.layers.hiding import of_classes
-from ortho_pipeline.warp.layers.sight import Sight
-from ortho_pipeline.warp.layers.visibility import Visibility
-from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+from ortho_pipeline.warp.quality.accuracy import layer_grid, overviews, tiles
+from ortho_pipeline.warp.quality.hiding import of_classes
+from ortho_pipeline.warp.quality.sight import Sight
+from ortho_pipeline.warp.quality.visibility import Visibility
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Classes of the mask of shadows, by their values; 0 stands for nothing.
 LIT, SHADED, WITHOUT = 1, 2, 4

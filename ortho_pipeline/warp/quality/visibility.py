@@ -22,8 +22,8 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.base import Surface, Window
 from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.rays import levels, polynomials
-from ortho_pipeline.warp.layers import visibility_kernel as kernel
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality import visibility_kernel as kernel
+from ortho_pipeline.warp.quality.sight import Sight
 
 #: Pixels between nodes: of places in the DEM, and of directions.
 NEAR, FAR = 128, 256

@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numba
 from numba.core.caching import FunctionCache, NullCache
 
-from ortho_pipeline.runtime.kernels import places
-from ortho_pipeline.runtime.kernels.marked import Marked
+from ortho_pipeline.runtime.compilation import places
+from ortho_pipeline.runtime.compilation.marked import Marked
 
 log = logging.getLogger(__name__)
 

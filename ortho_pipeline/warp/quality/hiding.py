@@ -16,9 +16,9 @@ from ortho_pipeline.raster.ortho import RasterWriter, classes_profile
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.layers.sight import Sight
-from ortho_pipeline.warp.layers.visibility import Visibility
-from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+from ortho_pipeline.warp.quality.sight import Sight
+from ortho_pipeline.warp.quality.visibility import Visibility
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
 CLASSES = {
