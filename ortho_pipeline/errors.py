@@ -198,7 +198,12 @@ def error_document(error: BaseException) -> dict[str, Any]:
     """Return an error as JSON values: kind, message, file, field and remedy; of an unforeseen one the trace too."""
     kind = type(error).__name__
     if isinstance(error, OrthoError):
-        return {"kind": kind, "message": error.message, "file": error.file, "field": error.field,
-                "remedy": error.remedy}  # fmt: skip
+        return {
+            "kind": kind,
+            "message": error.message,
+            "file": error.file,
+            "field": error.field,
+            "remedy": error.remedy,
+        }
     trace = "".join(traceback.format_exception(error))
     return {"kind": kind, "message": str(error) or kind, "file": None, "field": None, "remedy": None, "trace": trace}

@@ -244,9 +244,14 @@ class VsiPath:
 
 #: What a closed process says to libcurl by way of GDAL: no file has this name, and nobody listens there.
 _CLOSED = {
-    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none", "GDAL_HTTP_PROXY": "127.0.0.1:1", "GDAL_HTTPS_PROXY": "127.0.0.1:1",
-    "GDAL_HTTP_MAX_RETRY": "0", "GDAL_HTTP_CONNECTTIMEOUT": "1", "NO_PROXY": "", "no_proxy": "",
-}  # fmt: skip
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
+    "GDAL_HTTP_PROXY": "127.0.0.1:1",
+    "GDAL_HTTPS_PROXY": "127.0.0.1:1",
+    "GDAL_HTTP_MAX_RETRY": "0",
+    "GDAL_HTTP_CONNECTTIMEOUT": "1",
+    "NO_PROXY": "",
+    "no_proxy": "",
+}
 _closed_with: dict[str, str | None] = {}
 #: A request that fails in passing (429, 502, 503, 504, no answer) is repeated by GDAL too, if nobody says otherwise.
 _PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10", **COUNTING}
@@ -436,14 +441,16 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
     if _NAMED.search(plain) or _SIGNED.search(_PAGE.sub("", plain) if paged else plain):
         raise InputError(
             "an address with credentials in it (a password, a signature) is not read, for what is read is named in all "
-            "outputs", file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
+            "outputs",
+            file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
             remedy="give it without them, as s3://, gs:// or az:// with the credentials in the environment",
-        )  # fmt: skip
+        )
     if not allowed:
         raise InputError(
-            "files of the network are not opened unasked", file=address,
+            "files of the network are not opened unasked",
+            file=address,
             remedy=Text("allow them with ", Setting("scene.allow_network")),
-        )  # fmt: skip
+        )
     _open_network()
 
 

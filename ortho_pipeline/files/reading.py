@@ -76,9 +76,12 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
         found = json.loads(
-            text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
+            text,
+            parse_constant=_finite,
+            parse_float=_finite,
+            parse_int=_whole,
             object_pairs_hook=_unique if unique else None,
-        )  # fmt: skip
+        )
         if _SURROGATE.search(text):
             # Half of a character is in no name of a file, and cannot be written to a report.
             json.dumps(found, ensure_ascii=False).encode()

@@ -108,9 +108,11 @@ class Outputs:
                 lock = Lock(path, wait=wait, needed=False)
             except BlockingIOError as error:
                 raise InputError(
-                    f"another command is writing {self.name!r} in this folder", file=self.folder, field="folder",
+                    f"another command is writing {self.name!r} in this folder",
+                    file=self.folder,
+                    field="folder",
                     remedy="wait for its end, or choose another output folder",
-                ) from error  # fmt: skip
+                ) from error
             if not lock.held:
                 # A file system without locks: two commands on one folder do not notice each other there.
                 return lock, False
@@ -157,9 +159,13 @@ class Outputs:
     def _clear(self, start: str) -> None:
         """Remove the files in the folder whose names begin so, but for the lock's."""
         with os.scandir(self.folder) as entries:
-            left = [entry.path for entry in entries
-                    if entry.name.startswith(start) and not entry.name.endswith(f"lock{_PART}")
-                    and not entry.is_dir(follow_symlinks=False)]  # fmt: skip
+            left = [
+                entry.path
+                for entry in entries
+                if entry.name.startswith(start)
+                and not entry.name.endswith(f"lock{_PART}")
+                and not entry.is_dir(follow_symlinks=False)
+            ]
         for path in left:
             Path(path).unlink(missing_ok=True)
 
@@ -263,9 +269,10 @@ def allowed(path: str | os.PathLike[str]) -> Path:
     for link in (place, *place.parents):
         if os.path.islink(link):
             raise InputError(
-                "a symbolic link is in the way: outputs are not written through links", file=link,
+                "a symbolic link is in the way: outputs are not written through links",
+                file=link,
                 remedy="remove the link, or choose the folder or file that it leads to as the output",
-            )  # fmt: skip
+            )
     return place
 
 

@@ -19,7 +19,6 @@ import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyproj
@@ -30,6 +29,7 @@ from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
+from ortho_pipeline.geodesy.missing_grids import grid_of_message, grid_remedy, unavailable_grids
 from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]
@@ -195,9 +195,10 @@ class Vertical:
             return cls.parse(name)
         if not _BARE_NAME.fullmatch(name):
             raise DatumError(
-                f"{name[:80]!r} is the path of a grid, which is not opened because a file names it", field="vertical",
+                f"{name[:80]!r} is the path of a grid, which is not opened because a file names it",
+                field="vertical",
                 remedy=Text("give the grid as ", Setting("points.vertical", "FILE")),
-            )  # fmt: skip
+            )
         vertical_transformer(name)
         return cls(name)
 
@@ -248,7 +249,7 @@ class Vertical:
         asked = np.isfinite(lon) & np.isfinite(lat)
         if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
             # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.
-            missing = _unavailable_grids(_compound(self.name), "EPSG:4979")
+            missing = unavailable_grids(_compound(self.name), "EPSG:4979")
             if missing:
                 raise _grid_error(self, f"Grid {missing[0]} is not available")
         return shift
@@ -309,38 +310,18 @@ def _grid_error(vertical: Vertical, message: str) -> DatumError:
             field="vertical",
             remedy="give a .gtx or GeoTIFF geoid grid, or its name if it lies in PROJ's search path",
         )
-    grid = _grid_of_message(message)
+    grid = grid_of_message(message)
     if grid is None:
         return DatumError(
-            f"there is no transformation from {vertical.label} to the ellipsoid", field="vertical",
+            f"there is no transformation from {vertical.label} to the ellipsoid",
+            field="vertical",
             remedy="give the geoid grid file of this datum instead",
-        )  # fmt: skip
+        )
     return DatumError(
         f"heights in {vertical.label} need the geoid grid {grid}, which is not installed",
         field="vertical",
-        remedy=_grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) in place of the datum's name"),
+        remedy=grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) in place of the datum's name"),
     )
-
-
-def _grid_of_message(message: str) -> str | None:
-    found = re.search(r"Grid (\S+) is not available", message)
-    return found.group(1) if found else None
-
-
-def _grid_remedy(grid: str, otherwise: str) -> str:
-    sync = f"`pyproj sync --file {grid}` (or `projsync --file {grid}`, both from PROJ's network)"
-    # Of the worldwide geoids Debian's package has this one alone.
-    debian = " or install Debian's proj-data," if "egm96" in grid else ""
-    return f"run {sync},{debian} {otherwise}"
-
-
-def _unavailable_grids(source: Any, target: Any) -> list[str]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
-    return [
-        grid.short_name for operation in group.unavailable_operations for grid in operation.grids if not grid.available
-    ]
 
 
 # -- ground to ground ------------------------------------------------------------------------------------------------
@@ -429,9 +410,9 @@ class GroundTransform:
         try:
             self._leg(transformer, spatial, sample, errcheck=True)
         except ProjError as error:
-            grid = _grid_of_message(str(error))
+            grid = grid_of_message(str(error))
             if grid is None and "No operation" in str(error):
-                grid = next(iter(_unavailable_grids(self.source, self.target)), None)
+                grid = next(iter(unavailable_grids(self.source, self.target)), None)
             if grid is not None:
                 raise _way_error(self.source, self.target, grid) from error
 
@@ -453,19 +434,20 @@ def _transformer(source: pyproj.CRS, target: pyproj.CRS) -> Transformer:
     try:
         return Transformer.from_crs(source, target, always_xy=True, only_best=True, allow_ballpark=False)
     except (ProjError, CRSError) as error:
-        raise _way_error(source, target, _grid_of_message(str(error))) from error
+        raise _way_error(source, target, grid_of_message(str(error))) from error
 
 
 def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> OrthoError:
     if grid is None:
         return CrsError(
-            f"there is no transformation from {source.name!r} to {target.name!r}", field="CRS",
+            f"there is no transformation from {source.name!r} to {target.name!r}",
+            field="CRS",
             remedy="choose systems of known datum, such as UTM on WGS84",
-        )  # fmt: skip
+        )
     return CrsError(
         f"the transformation from {source.name!r} to {target.name!r} needs the grid {grid}, which is not installed",
         field="CRS",
-        remedy=_grid_remedy(grid, "or choose a system on WGS84"),
+        remedy=grid_remedy(grid, "or choose a system on WGS84"),
     )
 
 
@@ -486,8 +468,12 @@ def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, s
         grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
         log.warning(
             "%s -> %s: used %.1f m, a transformation of %.1f m needs the grid %s, which is not installed",
-            source.name, target.name, used.get_last_used_operation().accuracy, better.accuracy, grid,
-        )  # fmt: skip
+            source.name,
+            target.name,
+            used.get_last_used_operation().accuracy,
+            better.accuracy,
+            grid,
+        )
 
 
 #: By the texts that systems are made of: a CRS writes its WKT to be hashed.

@@ -58,9 +58,10 @@ def refuse_files(text: str) -> None:
         for name in {match[1].strip(), match[1].split(maxsplit=1)[0] if match[1].strip() else ""}:
             if name and _is_of_working_folder(name):
                 raise CrsError(
-                    f"a coordinate system names {name[:80]!r}, which is a file in the current folder", field="CRS",
+                    f"a coordinate system names {name[:80]!r}, which is a file in the current folder",
+                    field="CRS",
                     remedy="run the command in another folder, or install the grid in PROJ's own folder",
-                )  # fmt: skip
+                )
 
 
 def _is_of_working_folder(name: str) -> bool:

@@ -93,9 +93,10 @@ def refuse_absurd(undulation: np.ndarray, name: str) -> None:
     if absurd.size:
         raise DatumError(
             f"this height datum lies {absurd[0]:.4g} m above the ellipsoid, and the Earth's geoid within 110 m of it",
-            file=None if name.startswith("EPSG:") else name, field="vertical",
+            file=None if name.startswith("EPSG:") else name,
+            field="vertical",
             remedy="give a geoid grid in metres, and check that the file is not damaged",
-        )  # fmt: skip
+        )
 
 
 def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, shift: np.ndarray, file: str) -> None:
@@ -116,6 +117,8 @@ def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, sh
         except ProjError:
             continue
         raise DatumError(
-            f"this geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, which lies in it", file=file,
-            field="vertical", remedy="the file is cut off or damaged: copy it again",
-        )  # fmt: skip
+            f"this geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, which lies in it",
+            file=file,
+            field="vertical",
+            remedy="the file is cut off or damaged: copy it again",
+        )

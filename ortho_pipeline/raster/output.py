@@ -61,9 +61,10 @@ def gdal_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise InputError(
-            f"the output cannot be written ({first_line(error)})", file=path,
+            f"the output cannot be written ({first_line(error)})",
+            file=path,
             remedy="check the free disk space and the creation options",
-        ) from error  # fmt: skip
+        ) from error
     finally:
         gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", previous)
 
@@ -267,23 +268,29 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
         if key not in known:
             meant = difflib.get_close_matches(key, known, 1)
             raise InputError(
-                f"the {driver} driver has no creation option {key}", field="creation option",
+                f"the {driver} driver has no creation option {key}",
+                field="creation option",
                 remedy=f"did you mean {meant[0]}?" if meant else f"see the {driver} driver in GDAL's documentation",
-            )  # fmt: skip
+            )
         if key not in _LAYOUT:
             raise InputError(
-                f"the creation option {key} is not taken: it does more than lay out the file", field="creation option",
+                f"the creation option {key} is not taken: it does more than lay out the file",
+                field="creation option",
                 remedy=Text(
-                    "grid and CRS of an ortho are options of their own (", Setting("output.crs"), ", ",
-                    Setting("output.resolution"), ")"
+                    "grid and CRS of an ortho are options of their own (",
+                    Setting("output.crs"),
+                    ", ",
+                    Setting("output.resolution"),
+                    ")",
                 ),
-            )  # fmt: skip
+            )
         if not _PLAIN_VALUE.fullmatch(value) or not _fits(known[key], value):
             values = ", ".join(choice.text or "" for choice in known[key].findall("Value")) or known[key].get("type")
             raise InputError(
-                f"{value[:60]!r} is not a value of the creation option {key}", field="creation option",
+                f"{value[:60]!r} is not a value of the creation option {key}",
+                field="creation option",
                 remedy=f"{key} takes: {values}",
-            )  # fmt: skip
+            )
     defaults = {"BIGTIFF": "IF_SAFER"}
     if driver == "GTiff":
         defaults |= {"TILED": "YES", "BLOCKXSIZE": str(side), "BLOCKYSIZE": str(side)}

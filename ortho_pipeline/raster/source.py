@@ -26,10 +26,11 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
-from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
-from ortho_pipeline.raster.gate import DRIVERS, DecodedUnit, open_seen
+from ortho_pipeline.raster.opening.drivers import DRIVERS
+from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
+from ortho_pipeline.raster.pixel_types import nodata_of, numpy_type, read_type
 from ortho_pipeline.runtime.process_limits import require_memory
 
 gdal.UseExceptions()
@@ -96,10 +97,14 @@ def open_pixels(
     if block.size > memory:
         raise InputError(
             f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
-            f"{memory / 1e6:,.0f} MB of memory allowed", file=block.path, field="block size",
-            remedy=Text("tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger ",
-                        Setting("output.memory", "MB")),
-        )  # fmt: skip
+            f"{memory / 1e6:,.0f} MB of memory allowed",
+            file=block.path,
+            field="block size",
+            remedy=Text(
+                "tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger ",
+                Setting("output.memory", "MB"),
+            ),
+        )
     keep_blocks(block.size)
     return dataset, block.size
 
@@ -151,9 +156,11 @@ def _refuse_pipes(path: Path) -> None:
                 kind = stat.S_IFMT(os.stat(folder / name).st_mode)
             if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
                 raise InputError(
-                    "a pipe or a device lies beside this image where its metadata would be", file=path,
-                    field=name, remedy="remove it",
-                )  # fmt: skip
+                    "a pipe or a device lies beside this image where its metadata would be",
+                    file=path,
+                    field=name,
+                    remedy="remove it",
+                )
 
 
 def _check_size(dataset: gdal.Dataset, name: str) -> None:
@@ -220,9 +227,10 @@ class Grid:
         # Beyond that many pixels from the origin a number does not tell one pixel from the next.
         if not (xmin < xmax and ymin < ymax and max(map(abs, (xmin, ymin, xmax, ymax))) / min(dx, dy) < 2**52):
             raise InputError(
-                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent", field="extent",
+                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent",
+                field="extent",
                 remedy="give xmin ymin xmax ymax",
-            )  # fmt: skip
+            )
         if align:
             # A hair of tolerance keeps an extent that is already aligned from growing by a pixel of rounding.
             xmin, ymin = math.floor(xmin / dx + 1e-6) * dx, math.floor(ymin / dy + 1e-6) * dy
@@ -269,11 +277,12 @@ class _RasterFile:
         if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
             # GDAL before 3.7 gives bytes with a sign as bytes without one.
             raise InputError(
-                "these pixels are bytes with a sign, which this GDAL reads as 0 to 255", file=self.path,
+                "these pixels are bytes with a sign, which this GDAL reads as 0 to 255",
+                file=self.path,
                 remedy="make 16 bit of them (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
-            )  # fmt: skip
-        self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
-        self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
+            )
+        self.dtype = np.result_type(*(numpy_type(band.DataType) for band in bands))
+        self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
         flags = self._io(bands[0].GetMaskFlags)
         # GDAL's own order: a mask of the dataset stands beside nodata.
@@ -393,7 +402,7 @@ class RasterSource:
         if bands is not None:
             self._files = [_RasterFile(name, access, numbers) for name, numbers in self._chosen(bands)]
         self.count = sum(file.count for file in self._files)
-        self.dtype = _read_as(np.result_type(*(file.dtype for file in self._files)), dtype)
+        self.dtype = read_type(np.result_type(*(file.dtype for file in self._files)), dtype)
         self.nodata = tuple(value for file in self._files for value in file.nodata)
         self.palette = any(file.palette for file in self._files)
         self.block = sum(file.block for file in self._files)
@@ -407,9 +416,11 @@ class RasterSource:
         for band in bands:
             if not 1 <= band <= len(places):
                 raise InputError(
-                    f"there is no band {band}: the image has {len(places)}", file=self.path, field="output.bands",
+                    f"there is no band {band}: the image has {len(places)}",
+                    file=self.path,
+                    field="output.bands",
                     remedy=f"give one from 1 to {len(places)}",
-                )  # fmt: skip
+                )
             path, number = places[band - 1]
             if chosen and chosen[-1][0] == path:
                 chosen[-1][1].append(number)
@@ -463,38 +474,3 @@ class RasterSource:
                 valid[start:stop] = part
             start = stop
         return valid
-
-
-def _numpy_type(gdal_type: int) -> np.dtype[Any]:
-    from osgeo import gdal_array
-
-    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
-
-
-def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
-    value = band.GetNoDataValue()
-    # A value that the type cannot hold marks nothing.
-    return value if value is not None and holds(dtype, value) else None
-
-
-def holds(dtype: np.dtype[Any], value: float) -> bool:
-    """Tell whether a pixel of this type can have a value (of floating point: nearly)."""
-    if dtype.kind == "f":
-        return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
-    limits = np.iinfo(dtype)
-    return float(value).is_integer() and bool(limits.min <= value <= limits.max)
-
-
-def pixel_type(name: str) -> np.dtype[Any]:
-    """Return the type of pixels that GDAL calls `name`."""
-    code = gdal.GetDataTypeByName(name)
-    if name.lower() not in {one.lower() for one in PIXEL_TYPES}:
-        raise InputError(f"no pixels are of the type {name!r}", field="output.dtype", remedy=", ".join(PIXEL_TYPES))
-    return _numpy_type(code)
-
-
-def _read_as(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
-    """Return the type in which pixels are read that are written as `wanted`."""
-    if wanted is None or pixel_type(wanted) == own:
-        return own
-    return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)

@@ -81,5 +81,6 @@ def _refuse_settings() -> None:
     if Path(_SETTINGS).exists():
         raise InputError(
             "numba would take its settings from this file in the working folder, and could run code that they name",
-            file=Path(_SETTINGS).absolute(), remedy="remove the file, or start from another folder",
-        )  # fmt: skip
+            file=Path(_SETTINGS).absolute(),
+            remedy="remove the file, or start from another folder",
+        )

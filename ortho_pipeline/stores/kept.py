@@ -37,7 +37,7 @@ _agreed: dict[str, tuple[int, int, int]] = {}
 
 
 @dataclass(frozen=True)
-class Record:
+class CachedFile:
     """A file that is kept: where, where it came from, and what it was when it came."""
 
     path: Path
@@ -69,9 +69,10 @@ def folder() -> Path:
     if found is None or not found.is_absolute():
         wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
         raise InputError(
-            f"files of the network cannot be kept ({wrong})", field=FOLDER,
+            f"files of the network cannot be kept ({wrong})",
+            field=FOLDER,
             remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -114,7 +115,7 @@ def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Cal
         write_json(_record_of(path), record)
 
 
-def records() -> Iterator[Record]:
+def records() -> Iterator[CachedFile]:
     """Yield what is kept, by name."""
     for path in sorted(folder().glob(f"*/[!.]*{_RECORD}")):
         found = _read(path)
@@ -147,11 +148,11 @@ def _agrees(path: Path, address: str) -> bool:
     return True
 
 
-def _read(path: Path) -> Record | None:
+def _read(path: Path) -> CachedFile | None:
     """Return the record of a kept file; None where it is none, so that the file is fetched again."""
     try:
         given = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
-        record = Record(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
+        record = CachedFile(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
     except (InputError, KeyError, TypeError):
         return None
     kinds = all(type(getattr(record, name)) in kinds for name, kinds in _FIELDS.items())

@@ -26,9 +26,10 @@ from ortho_pipeline.files.traffic import count
 
 #: How often a request is repeated, and for how long, before it has failed.
 RETRIES: dict[str, Any] = {
-    "max_retries": 8, "retry_timeout": timedelta(minutes=3),
+    "max_retries": 8,
+    "retry_timeout": timedelta(minutes=3),
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=15), "base": 2},
-}  # fmt: skip
+}
 #: How often an object is fetched whose content is not what the store says of it.
 _ATTEMPTS = 3
 #: Objects that are written on a condition are small (bytes).
@@ -126,8 +127,9 @@ class Objects:
                 if result.meta["size"] > limit:
                     raise InputError(
                         f"this object has {result.meta['size']} bytes, and {limit} are the most that is read",
-                        file=self.of(name), remedy="check the address",
-                    )  # fmt: skip
+                        file=self.of(name),
+                        remedy="check the address",
+                    )
                 digests = _Digests()
                 taken = take(digests.through(result.stream(min_chunk_size=_CHUNK), limit))
                 content = digests.content(result.meta[self._version])
@@ -138,9 +140,10 @@ class Objects:
             if not wrong:
                 return taken, content
         raise StorageError(
-            f"{wrong}, {_ATTEMPTS} times", file=self.of(name),
+            f"{wrong}, {_ATTEMPTS} times",
+            file=self.of(name),
             remedy="try again later; if it stays so, the object is damaged in its store",
-        )  # fmt: skip
+        )
 
     def names(self, prefix: str = "") -> Iterator[tuple[str, int]]:
         """Yield names and sizes of the objects whose names begin so; a plain web server lists none."""
@@ -221,9 +224,10 @@ class Objects:
             self.delete(name)
         gone = "could not be removed" if self.exists(name) else "was removed"
         raise StorageError(
-            f"{wrong} after it was written, {_ATTEMPTS} times; it {gone}", file=self.of(name),
+            f"{wrong} after it was written, {_ATTEMPTS} times; it {gone}",
+            file=self.of(name),
             remedy="try again; if it stays so, check the store and the way to it",
-        )  # fmt: skip
+        )
 
     def _put_if(self, name: str, data: bytes | Path, content: Content, mode: Any) -> Content:
         """Store an object on a condition.
@@ -276,14 +280,16 @@ class Objects:
             raise Conflict("another version of this object is there", file=self.of(name)) from error
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
             raise InputError(
-                "the store does not let you do this", file=self.of(name),
+                "the store does not let you do this",
+                file=self.of(name),
                 remedy="give credentials as the store's own clients find them (docs/scale.md), or check their rights",
-            ) from error  # fmt: skip
+            ) from error
         except exceptions.BaseError as error:
             raise StorageError(
-                f"the store does not do what was asked ({_status(error)})", file=self.of(name),
+                f"the store does not do what was asked ({_status(error)})",
+                file=self.of(name),
                 remedy="check the address; try again later",
-            ) from error  # fmt: skip
+            ) from error
 
 
 class Conflict(StorageError):

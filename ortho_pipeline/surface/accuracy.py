@@ -122,9 +122,12 @@ class DemAccuracy:
         ]
         classes = [{"slope_deg": [low, high], **vars(errors)} for low, high, errors in self.by_slope()]
         return {
-            "overall": vars(self.overall), "by_slope": classes, "gross": self.gross(),
-            "without_height": int((~np.isfinite(self.differences)).sum()), "points": points,
-        }  # fmt: skip
+            "overall": vars(self.overall),
+            "by_slope": classes,
+            "gross": self.gross(),
+            "without_height": int((~np.isfinite(self.differences)).sum()),
+            "points": points,
+        }
 
 
 def check_dem(surface: DemSurface, ground: Array, crs: str | pyproj.CRS, ids: Sequence[str]) -> DemAccuracy:

@@ -126,7 +126,7 @@ def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
         )
 
 
-class Tiles:
+class TileCache:
     """Arrays by key, as many of the last used as some bytes hold; shared by threads."""
 
     def __init__(self, size: int) -> None:
@@ -180,10 +180,10 @@ class DemSurface(Surface):
     cache_bytes: int
     sigma: float | Surface | None = None
     # What is kept follows from all of the above, so no two surfaces share it.
-    _tiles: Tiles = field(init=False, repr=False)
+    _tiles: TileCache = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_tiles", Tiles(self.cache_bytes))
+        object.__setattr__(self, "_tiles", TileCache(self.cache_bytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return DemSurface, tuple(getattr(self, one.name) for one in fields(self) if one.init)

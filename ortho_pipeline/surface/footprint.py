@@ -131,32 +131,39 @@ class Footprint:
         wanted = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
-                self.beyond, file=file, field="surface.dem",
+                self.beyond,
+                file=file,
+                field="surface.dem",
                 remedy=Text(
-                    "check datum and unit of the DEM (", Setting("surface.vertical"),
-                    ") and the place of the scene, or ", wanted
+                    "check datum and unit of the DEM (",
+                    Setting("surface.vertical"),
+                    ") and the place of the scene, or ",
+                    wanted,
                 ),
-            )  # fmt: skip
+            )
         if not self.complete and surface.fill == "error":
             raise CoverageError(
-                f"the DEM covers {share(self.coverage)} of the scene", file=file,
-
+                f"the DEM covers {share(self.coverage)} of the scene",
+                file=file,
                 remedy=Text(
                     "give a DEM that covers it all, or ", wanted, ", nearest, or an ellipsoidal height in metres"
                 ),
-            )  # fmt: skip
+            )
         if self.coverage == 0.0 and surface.fill == "mask":
             raise CoverageError(
-                "the DEM covers nothing of the scene: the ortho would have no pixels", file=file, field="surface.dem",
+                "the DEM covers nothing of the scene: the ortho would have no pixels",
+                file=file,
+                field="surface.dem",
                 remedy="give the DEM of this place",
-            )  # fmt: skip
+            )
         if self.unmet and surface.fill == "nearest":
             raise CoverageError(
                 f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
                 "the next height of the DEM",
-                file=file, field="surface.fill",
+                file=file,
+                field="surface.fill",
                 remedy=Text("give a DEM that reaches farther, or ", wanted),
-            )  # fmt: skip
+            )
 
     def notes(self) -> list[Notice]:
         """Return a notice if the DEM does not cover the scene as a whole, or only with heights beyond the model."""
@@ -235,9 +242,10 @@ def _nowhere(model: SensorModel, surface: Surface) -> InputError:
             "no border pixel meets the ground: the model does not belong to this image", field="model", remedy=_SOUND
         )
     return InputError(
-        f"the scene does not meet the ground at a height of {surface.height:g} m", field="surface.height",
+        f"the scene does not meet the ground at a height of {surface.height:g} m",
+        field="surface.height",
         remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
-    )  # fmt: skip
+    )
 
 
 def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
@@ -336,8 +344,9 @@ def ground_sample_distance(
     if not (np.isfinite(area) and area > 0):
         raise InputError(
             "a pixel in the middle of the image has no size on the ground: this model is none of an image",
-            field="model", remedy=_SOUND,
-        )  # fmt: skip
+            field="model",
+            remedy=_SOUND,
+        )
     return math.sqrt(area)
 
 
@@ -395,8 +404,9 @@ def choose_grid(
         usual = f"{two_digits(ground_sample_distance(model, crs, width, height, found.middle)):.12f}".rstrip("0")
         raise InputError(
             f"the scene is smaller than one pixel of {step[0]:g} {unit}s, which is the unit of {crs.name!r}",
-            field="output.resolution", remedy=Text("did you mean ", Setting("output.resolution", usual), "?"),
-        )  # fmt: skip
+            field="output.resolution",
+            remedy=Text("did you mean ", Setting("output.resolution", usual), "?"),
+        )
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
 
@@ -419,11 +429,12 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     if not len(ground) or not hull.intersects(shapely.box(xmin, ymin, xmax, ymax)):
         place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "outside of this CRS"
         raise InputError(
-            f"the extent lies beside the scene, which reaches over {place}", field="output.extent",
+            f"the extent lies beside the scene, which reaches over {place}",
+            field="output.extent",
             remedy=Text(
                 "give xmin ymin xmax ymax in units of the output CRS, or leave ", Setting("output.extent"), " out"
             ),
-        )  # fmt: skip
+        )
     return float(hull.intersection(shapely.box(xmin, ymin, xmax, ymax)).area) / (grid.dx * grid.dy)
 
 
@@ -439,7 +450,8 @@ def _centre(model: SensorModel, width: int, height: int) -> Array:
     centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
     if not np.isfinite(centre).all():
         raise InputError(
-            "the middle of the image does not meet the ground: the model does not belong to this image", field="model",
+            "the middle of the image does not meet the ground: the model does not belong to this image",
+            field="model",
             remedy=_SOUND,
-        )  # fmt: skip
+        )
     return centre

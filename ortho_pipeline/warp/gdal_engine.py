@@ -107,10 +107,19 @@ class Transformer:
             return
         name = os.fspath(self.arrays)
         ortho.SetMetadata(
-            {"X_DATASET": name, "X_BAND": "1", "Y_DATASET": name, "Y_BAND": "2", "PIXEL_OFFSET": "0",
-             "LINE_OFFSET": "0", "PIXEL_STEP": "1", "LINE_STEP": "1", "GEOREFERENCING_CONVENTION": "PIXEL_CENTER"},
+            {
+                "X_DATASET": name,
+                "X_BAND": "1",
+                "Y_DATASET": name,
+                "Y_BAND": "2",
+                "PIXEL_OFFSET": "0",
+                "LINE_OFFSET": "0",
+                "PIXEL_STEP": "1",
+                "LINE_STEP": "1",
+                "GEOREFERENCING_CONVENTION": "PIXEL_CENTER",
+            },
             "GEOLOCATION",
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -165,18 +174,24 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
     begin = time.monotonic()
     if isinstance(path, Hiding):
         raise InputError(
-            "GDAL's warper does not look for what terrain hides", field="output.visibility",
+            "GDAL's warper does not look for what terrain hides",
+            field="output.visibility",
             remedy=Text("leave out ", Setting("output.visibility"), " or ", Setting("output.engine", "gdal")),
-        )  # fmt: skip
+        )
     _check(job)
     source, profile, grid, threads = job.source, job.look(), job.grid, job.threads()
     # GDAL's warper reads in one of its threads.
     limit_cache(job.resources.memory, 1, source.block, job.surface.block)
     exact = Exact(job.model, job.surface, grid, (source.width, source.height))
     writer = RasterWriter(
-        path, grid, profile, driver=job.driver, creation_options=job.creation_options, threads=threads,
+        path,
+        grid,
+        profile,
+        driver=job.driver,
+        creation_options=job.creation_options,
+        threads=threads,
         progress=job.resources.progress,
-    )  # fmt: skip
+    )
     with writer, gdal_errors(path), contextlib.ExitStack() as scratch:
         arrays, target = writer.scratch("arrays"), writer.scratch("gdal")
         for temporary in (arrays, target):
@@ -206,9 +221,10 @@ def _check(job: WarpJob) -> None:
     job.check()
     if job.dem_interpolation != "bilinear":
         raise InputError(
-            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="output.dem_interpolation",
+            "with GDAL's warper heights of the DEM are interpolated bilinearly",
+            field="output.dem_interpolation",
             remedy=Text("leave out ", Setting("output.dem_interpolation"), " or ", Setting("output.engine", "gdal")),
-        )  # fmt: skip
+        )
     if len(job.source.paths) > 1:
         raise InputError(
             "GDAL's warper takes one file", file=job.source.paths[1], field="engine", remedy="use our own engine"
@@ -233,9 +249,10 @@ def _standing(
             return replace(candidate, max_error_px=error)
         tried.append(f"{candidate.method}: {error:.3g} px off")
     raise InputError(
-        f"no transformer of GDAL stands for this model ({'; '.join(tried)})", field="output.engine",
+        f"no transformer of GDAL stands for this model ({'; '.join(tried)})",
+        field="output.engine",
         remedy=Text("take our own engine (", Setting("output.engine", "ortho"), ")"),
-    )  # fmt: skip
+    )
 
 
 def _candidates(
@@ -323,9 +340,13 @@ def _create(path: Path, profile: Profile, grid: Grid) -> gdal.Dataset:
     """Create the raster that GDAL warps into; its last band is the mask, if the profile has one."""
     mask = profile.validity == "mask"
     return gdal.GetDriverByName("GTiff").Create(
-        os.fspath(path), grid.width, grid.height, profile.count + mask, _gdal_type(profile.dtype),
+        os.fspath(path),
+        grid.width,
+        grid.height,
+        profile.count + mask,
+        _gdal_type(profile.dtype),
         ["TILED=YES", "BIGTIFF=IF_SAFER"],
-    )  # fmt: skip
+    )
 
 
 def _describe(dataset: gdal.Dataset, profile: Profile) -> None:
@@ -360,7 +381,10 @@ def _warp_exactly(
         dstNodata=profile.nodata,
         multithread=threads > 1,
         warpMemoryLimit=job.resources.memory // 2,
-        warpOptions=[*settings, f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
-                     "INIT_DEST=NO_DATA"],
+        warpOptions=[
+            *settings,
+            f"NUM_THREADS={threads}",
+            "INIT_DEST=0" if profile.nodata is None else "INIT_DEST=NO_DATA",
+        ],
         callback=callback,
-    )  # fmt: skip
+    )

@@ -27,6 +27,7 @@ from ortho_pipeline.geodesy.crs import (
     utm_crs,
 )  # fmt: skip
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
+from ortho_pipeline.geodesy.missing_grids import grid_remedy
 from ortho_pipeline.geodesy.naming import crs_definition, crs_text
 from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 
@@ -94,8 +95,8 @@ def test_a_missing_grid_is_an_error_that_names_it_and_the_remedy(name: str) -> N
 
 
 def test_only_egm96_is_to_be_had_from_debian() -> None:
-    assert "Debian's proj-data" in module._grid_remedy("us_nga_egm96_15.tif", "or give a grid")
-    assert "Debian" not in module._grid_remedy("us_nga_egm08_25.tif", "or give a grid")
+    assert "Debian's proj-data" in grid_remedy("us_nga_egm96_15.tif", "or give a grid")
+    assert "Debian" not in grid_remedy("us_nga_egm08_25.tif", "or give a grid")
 
 
 def test_ellipsoid_needs_nothing() -> None:

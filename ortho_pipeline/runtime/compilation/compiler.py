@@ -117,5 +117,6 @@ def _say_once() -> None:
     log.warning(
         "Compiled kernels are not kept, because %s. Every run compiles them again, for some seconds. "
         "Remedy: set %s to a folder of your own to which nobody else can write",
-        places.own()[1], places.FOLDER,
-    )  # fmt: skip
+        places.own()[1],
+        places.FOLDER,
+    )

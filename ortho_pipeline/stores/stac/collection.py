@@ -133,9 +133,11 @@ class Collection:
         _require_collection(document, place)
         if document["type"] == "Collection" and self._document["type"] == "Catalog":
             raise InputError(
-                f"this is a catalog of collections, such as {str(document.get('id'))[:60]!r}", file=self.address,
-                field="links", remedy=f"give one of them, such as {place}",
-            )  # fmt: skip
+                f"this is a catalog of collections, such as {str(document.get('id'))[:60]!r}",
+                file=self.address,
+                field="links",
+                remedy=f"give one of them, such as {place}",
+            )
         extent = extent_boxes(document)
         return not extent or any_meet(extent, boxes)
 

@@ -74,9 +74,10 @@ def _answer(url: str) -> bytes:
         except urllib.error.HTTPError as error:
             if error.code not in _PASSING:
                 raise InputError(
-                    f"the server does not give this document (HTTP status {error.code})", file=url,
+                    f"the server does not give this document (HTTP status {error.code})",
+                    file=url,
                     remedy="check the address",
-                ) from error  # fmt: skip
+                ) from error
             failure = f"HTTP status {error.code}"
         except (OSError, http.client.HTTPException) as error:
             failure = f"no answer ({type(error).__name__})"
@@ -109,7 +110,9 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     path = Path(here).parent / text
     if not within(path, [Path(here).resolve().parent, Path(here).parent, *roots]):
         raise InputError(
-            f"this names {text[:200]!r}, which is outside of its own folder", file=base, field="href",
+            f"this names {text[:200]!r}, which is outside of its own folder",
+            file=base,
+            field="href",
             remedy=Text("put the files into one folder, or allow another one with ", Setting("scene.roots", "DIR")),
-        )  # fmt: skip
+        )
     return os.fspath(path)

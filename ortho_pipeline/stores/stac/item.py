@@ -125,9 +125,10 @@ class Item:
             if len(named) != 1:
                 raise InputError(
                     f"several assets may be the RPC of {image.key!r}: {self._keys(named or found)}",
-                    file=self.address, field="assets",
+                    file=self.address,
+                    field="assets",
                     remedy=Text("name one as ", Setting("scene.rpc"), ", or give the address of the image itself"),
-                )  # fmt: skip
+                )
             found = named
         if not found:
             return None
@@ -142,9 +143,11 @@ class Item:
             if len(found) == 1:
                 return found[0]
             raise InputError(
-                f"{'several assets are' if found else 'there is no asset'} {key!r}", file=self.address, field="assets",
+                f"{'several assets are' if found else 'there is no asset'} {key!r}",
+                file=self.address,
+                field="assets",
                 remedy=f"one of {self._keys(found or None)}",
-            )  # fmt: skip
+            )
         several: list[Asset] = []
         for group in groups:
             if len(group) == 1:
@@ -152,9 +155,11 @@ class Item:
             several = several or group
         if several:
             raise InputError(
-                f"several assets may be meant: {self._keys(several)}", file=self.address, field="assets",
+                f"several assets may be meant: {self._keys(several)}",
+                file=self.address,
+                field="assets",
                 remedy=f"name one, for example {self.address}#{several[0].key}",
-            )  # fmt: skip
+            )
         raise InputError(
             f"no asset is a {what}",
             file=self.address,
@@ -200,10 +205,17 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
         raise InputError("a STAC item has assets", file=address, field="assets", remedy=REMEDY)
     place = Location(address).url
     own = next(
-        (link["href"] for link in _list(document.get("links")) if isinstance(link, dict) and link.get("rel") == "self"
-         and isinstance(link.get("href"), str) and Location(link["href"]).is_address and place.is_address),
+        (
+            link["href"]
+            for link in _list(document.get("links"))
+            if isinstance(link, dict)
+            and link.get("rel") == "self"
+            and isinstance(link.get("href"), str)
+            and Location(link["href"]).is_address
+            and place.is_address
+        ),
         place,
-    )  # fmt: skip
+    )
     found = []
     for key, asset in assets.items():
         if not isinstance(asset, dict) or not isinstance(asset.get("href"), str):

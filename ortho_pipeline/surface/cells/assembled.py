@@ -101,9 +101,11 @@ def open_cells(
     placed += [(cell_of_sea, *cell_of_sea.place(), "") for cell_of_sea in map(SeaCell, sea)]
     if not placed:
         raise CoverageError(
-            "none of the cells under the scene is there", file=source.address, field="surface.dem",
+            "none of the cells under the scene is there",
+            file=source.address,
+            field="surface.dem",
             remedy="give a DEM of this place",
-        )  # fmt: skip
+        )
     mosaic = laid_out(source.address, sorted(placed, key=lambda one: one[0].path))
     made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
     cells = {"cells": [cell.name for cell in sorted(there)], "sea_cells": [cell.name for cell in sorted(sea)]}
@@ -123,15 +125,18 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
     if declared is not None and declared.vertical != Vertical("EPSG:3855"):
         raise DatumError(
             f"this cell says that its heights are in {declared.name!r}, and those of this DEM are above EGM2008",
-            file=path, field="surface.dem",
+            file=path,
+            field="surface.dem",
             remedy=Text("give the cells as a DEM of their own: ", Setting("surface.dem", "FOLDER/*.tif")),
-        )  # fmt: skip
+        )
     wrong = misplaced(cell, grid.shape, grid.crs_from_pixel)
     if wrong:
         raise InputError(
-            f"this is not the cell that its name says: {wrong}", file=path, field="surface.dem",
+            f"this is not the cell that its name says: {wrong}",
+            file=path,
+            field="surface.dem",
             remedy="copy it again from the public bucket",
-        )  # fmt: skip
+        )
     unit = file.unit
     file.close()
     return file, crs_of_cells()[0], grid, unit
@@ -140,14 +145,18 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
 def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
     names = ", ".join(cell.name for cell in lost[:_SHOWN]) + (" and others" if len(lost) > _SHOWN else "")
     what = (
-        f"there are no public heights of this land: {names}" if known
+        f"there are no public heights of this land: {names}"
+        if known
         else f"{names} are not there, and without {LIST} nobody says whether that is sea"
-    )  # fmt: skip
+    )
     otherwise = "" if known else f"; or put the list {LIST} beside the cells"
     return CoverageError(
-        what, file=source.address, field="surface.dem",
+        what,
+        file=source.address,
+        field="surface.dem",
         remedy=Text(
-            "give a DEM of this place, or choose how to fill it: ", Setting("surface.fill", "mask"),
-            f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}"
+            "give a DEM of this place, or choose how to fill it: ",
+            Setting("surface.fill", "mask"),
+            f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}",
         ),
-    )  # fmt: skip
+    )

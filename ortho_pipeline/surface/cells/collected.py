@@ -73,8 +73,10 @@ def open_collected(
     if not 0 < len(items) <= _MOST_ITEMS:
         raise CoverageError(
             f"{counted(len(items), 'item')} of this collection {'lies' if len(items) == 1 else 'lie'} under the scene",
-            file=name, field="surface.dem", remedy="give a DEM of this place" if not items else _CHOOSE,
-        )  # fmt: skip
+            file=name,
+            field="surface.dem",
+            remedy="give a DEM of this place" if not items else _CHOOSE,
+        )
     chosen = [item.heights(name.asset) for item in items]
     ask_beside(*(asset.href for asset in chosen if Location(asset.href).is_far), allow_network=network)
     opened = [_placed(asset, access, override) for asset in chosen]
@@ -108,13 +110,16 @@ def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Pl
         return (file, system, grid, unit), True
     if own.vertical != declared.vertical and not override:
         raise DatumError(
-            f"this file declares its heights as {own.name!r}, and its STAC item says {declared.name!r}", file=file.path,
+            f"this file declares its heights as {own.name!r}, and its STAC item says {declared.name!r}",
+            file=file.path,
             field="surface.vertical",
             remedy=Text(
-                "say which is true: ", Setting("surface.vertical"), " together with ",
-                Setting("surface.override_vertical")
+                "say which is true: ",
+                Setting("surface.vertical"),
+                " together with ",
+                Setting("surface.override_vertical"),
             ),
-        )  # fmt: skip
+        )
     return (file, crs, grid, unit), False
 
 

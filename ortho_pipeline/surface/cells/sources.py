@@ -58,10 +58,12 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
         return _Bucket(text, allow_network)
     if not Path(text).is_dir():
         raise InputError(
-            "there is no such folder of cells", file=text, field="surface.source",
+            "there is no such folder of cells",
+            file=text,
+            field="surface.source",
             remedy="give a folder that holds cells by their names in the public bucket, a STAC collection of them, or "
             "an address",
-        )  # fmt: skip
+        )
     return _Folder(text)
 
 
@@ -154,17 +156,21 @@ class _Catalogue(Source):
         folder, _, name = href.rpartition("/")
         if "?" in name:
             raise InputError(
-                "an address with a signature is not read", file=href.partition("?")[0], field="surface.source",
+                "an address with a signature is not read",
+                file=href.partition("?")[0],
+                field="surface.source",
                 remedy="give a collection whose assets are open, or the store itself with your credentials",
-            )  # fmt: skip
+            )
         fetch = functools.partial(Objects(folder, allow_network=self._allow_network).fetch, name, limit=LARGEST)
         try:
             return str(kept("dem", href, fetch, fault=functools.partial(fault_of, cell)))
         except FileNotFoundError as error:
             raise InputError(
-                "a collection names this cell, and it is not there", file=href, field="surface.source",
+                "a collection names this cell, and it is not there",
+                file=href,
+                field="surface.source",
                 remedy="check the collection, or take another source",
-            ) from error  # fmt: skip
+            ) from error
 
 
 def fault_of(cell: Cell, path: Path | str) -> str:

@@ -240,10 +240,15 @@ def write_accuracy(
     grid = layer_grid(sight.grid, step)
     layer = _Layer(budget, sight.on(grid), surface, size, heights, resources.memory // 8)
     profile = Profile(
-        count=len(BANDS), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=BANDS,
-        interpretations=(0,) * len(BANDS), metadata=dict(metadata or {}),
+        count=len(BANDS),
+        dtype=np.dtype(np.float32),
+        validity="nodata",
+        nodata=math.nan,
+        descriptions=BANDS,
+        interpretations=(0,) * len(BANDS),
+        metadata=dict(metadata or {}),
         scales=tuple((1.0, 0.0, unit) for unit in ("m", "m", "", "m")),
-    )  # fmt: skip
+    )
     # Little is gained by more effort, and half of the time of the layer would be spent on it.
     options = {"LEVEL": "1", "PREDICTOR": "NO", **overviews(grid)}
     with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
@@ -373,10 +378,14 @@ class _Layer:
             part = (slice(j, j + -(-nj // spacing) + 1), slice(i, i + -(-ni // spacing) + 1))
             here = (slice(row, row + nj), slice(column, column + ni))
             accuracy_kernel.fill(
-                Nodes(nodes[part], samples[part], spacing, self.middle, self.half), self._heights(samples[part]),
-                self.budget.even, (float(self.size[0]), float(self.size[1])), radii(), bands[(slice(None), *here)],
+                Nodes(nodes[part], samples[part], spacing, self.middle, self.half),
+                self._heights(samples[part]),
+                self.budget.even,
+                (float(self.size[0]), float(self.size[1])),
+                radii(),
+                bands[(slice(None), *here)],
                 self.totals,
-            )  # fmt: skip
+            )
 
     def _pieces(self, samples: Array, height: int, width: int, spacing: int) -> Iterator[tuple[int, int, int, int]]:
         """Yield the pieces (row, column, rows, columns) of a tile whose windows of heights fit into the memory."""

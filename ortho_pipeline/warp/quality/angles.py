@@ -53,8 +53,10 @@ class Sun:
         if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
             raise InputError(
                 f"the sun does not stand at an azimuth of {self.azimuth_deg:g} and {self.elevation_deg:g} degrees over "
-                "the horizon", field="output.sun", remedy="give degrees from north and over the horizon, above 0",
-            )  # fmt: skip
+                "the horizon",
+                field="output.sun",
+                remedy="give degrees from north and over the horizon, above 0",
+            )
 
     @property
     def way(self) -> Array:
@@ -104,9 +106,15 @@ def write_angles(
     grid = layer_grid(sight.grid, step)
     own, names = sight.on(grid), ["view_zenith", "view_azimuth", *(["sun_incidence"] if sun else [])]
     profile = Profile(
-        count=len(names), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=tuple(names),
-        interpretations=(0,) * len(names), scales=((1.0, 0.0, "degree"),) * len(names), metadata=_metadata(sun),
-    )  # fmt: skip
+        count=len(names),
+        dtype=np.dtype(np.float32),
+        validity="nodata",
+        nodata=math.nan,
+        descriptions=tuple(names),
+        interpretations=(0,) * len(names),
+        scales=((1.0, 0.0, "degree"),) * len(names),
+        metadata=_metadata(sun),
+    )
     low, high = math.inf, -math.inf
     options = {"LEVEL": "1", **overviews(grid)}
     threads = (resources or Resources()).threads or 1
@@ -126,9 +134,13 @@ def _metadata(sun: Sun | None) -> Mapping[str, str]:
 
 
 def _angles(
-    sight: Sight, surface: Surface, size: tuple[int, int], heights: tuple[float, float],
-    window: tuple[int, int, int, int], sun: Sun | None,
-) -> Array:  # fmt: skip
+    sight: Sight,
+    surface: Surface,
+    size: tuple[int, int],
+    heights: tuple[float, float],
+    window: tuple[int, int, int, int],
+    sun: Sun | None,
+) -> Array:
     """Return the bands ``(n, height, width)`` of a window (left, top, width, height) of a layer."""
     left, top, width, height = window
     columns, rows = np.meshgrid(left + 0.5 + np.arange(width), top + 0.5 + np.arange(height))

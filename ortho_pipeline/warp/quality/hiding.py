@@ -22,9 +22,11 @@ from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
 CLASSES = {
-    1: ("visible", "#d9e8d0"), 2: ("hidden", "#b4500b"), 3: ("outside of the image", "#e6e6e6"),
+    1: ("visible", "#d9e8d0"),
+    2: ("hidden", "#b4500b"),
+    3: ("outside of the image", "#e6e6e6"),
     4: ("without a height", "#6b6b6b"),
-}  # fmt: skip
+}
 VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
 
 

@@ -35,9 +35,17 @@ _VRT_NAMES = frozenset(
 )
 #: Parts of a VRT that hold text only, whatever is in them.
 _VRT_TEXTS = frozenset(
-    {"srs", "metadata", "gcplist", "histograms", "gdalrasterattributetable", "colortable", "categorynames",
-     "description"}
-)  # fmt: skip
+    {
+        "srs",
+        "metadata",
+        "gcplist",
+        "histograms",
+        "gdalrasterattributetable",
+        "colortable",
+        "categorynames",
+        "description",
+    }
+)
 #: What holds the text of a coordinate system in VRTs, side-cars of GDAL and of Esri, and DIMAP, in lower case.
 _CRS_NAMES = frozenset({"srs", "projection", "wkt", "horizontal_cs_code", "horizontal_cs_name"})
 _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
@@ -106,9 +114,11 @@ def _names_of_vrt(path: Any) -> Iterator[Named]:
             values = [text.lower() for text in _value(child)]
             if name not in _VRT_NAMES or (name == "subclass" and not _VRT_CLASSES.issuperset(values)):
                 raise InputError(
-                    f"only plain VRTs are opened, and {child[1]} {' '.join(values)[:40]} is none", file=path,
-                    field=child[1][:80], remedy=PLAIN_VRT,
-                )  # fmt: skip
+                    f"only plain VRTs are opened, and {child[1]} {' '.join(values)[:40]} is none",
+                    file=path,
+                    field=child[1][:80],
+                    remedy=PLAIN_VRT,
+                )
             if name == "sourcefilename":
                 yield _source(child, path, band)
             kinds = [text.lower() for part, one in _parts(child) if part == "subclass" for text in _value(one)]
@@ -165,14 +175,19 @@ def products_of_volume(path: Any) -> list[str]:
     if document is None or _inner(document, "raster_data"):
         return []
     components = [
-        part for content in _inner(document, "dataset_content") for parts in _inner(content, "dataset_components")
+        part
+        for content in _inner(document, "dataset_content")
+        for parts in _inner(content, "dataset_components")
         for part in _inner(parts, "component")
-    ]  # fmt: skip
+    ]
     return [
         text.strip()
-        for part in components if any("DIMAP" in _value(kind) for kind in _inner(part, "component_type"))
-        for place in _inner(part, "component_path") for href in _inner(place, "href") for text in _value(href)
-    ]  # fmt: skip
+        for part in components
+        if any("DIMAP" in _value(kind) for kind in _inner(part, "component_type"))
+        for place in _inner(part, "component_path")
+        for href in _inner(place, "href")
+        for text in _value(href)
+    ]
 
 
 def _inner(node: Any, name: str) -> list[Any]:
@@ -226,9 +241,11 @@ def _names_of_pcidsk(path: Any) -> Iterator[Named]:
     names = [images[k + 64 : k + 128].strip(b" \0") for k in range(0, len(images), 1024)]
     if len(images) < 1024 * count or any(name and not name.startswith(b"/SIS=") for name in names):
         raise InputError(
-            "the channels of this PCIDSK file lie in other files", file=path, field="IHi.2",
+            "the channels of this PCIDSK file lie in other files",
+            file=path,
+            field="IHi.2",
             remedy="make one file of it (gdal_translate in.pix out.tif)",
-        )  # fmt: skip
+        )
     yield from ()
 
 
@@ -246,6 +263,10 @@ def _beginning(path: Any, size: int) -> bytes:
 
 
 NAMES_OF: dict[str, Any] = {
-    "VRT": _names_of_vrt, "DIMAP": _names_of_dimap, "ERS": _names_of_ers, "ISIS3": _names_of_isis3,
-    "PCIDSK": _names_of_pcidsk, "TIL": _names_of_til,
-}  # fmt: skip
+    "VRT": _names_of_vrt,
+    "DIMAP": _names_of_dimap,
+    "ERS": _names_of_ers,
+    "ISIS3": _names_of_isis3,
+    "PCIDSK": _names_of_pcidsk,
+    "TIL": _names_of_til,
+}
