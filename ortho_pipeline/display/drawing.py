@@ -173,9 +173,9 @@ class Drawing:
             from matplotlib.figure import Figure
         except ImportError as error:
             raise InputError(
-                "PNG needs matplotlib, which is not installed",
+                "PNG output needs matplotlib, which is not installed",
                 field="kind",
-                remedy=Text("pip install 'ortho-pipeline[plots]', or take ", Setting("kind", "svg")),
+                remedy=Text("pip install 'ortho-pipeline[plots]', or use ", Setting("kind", "svg")),
             ) from error
         figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

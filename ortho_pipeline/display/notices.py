@@ -42,7 +42,7 @@ class Notice(Text):
     def __new__(cls, code: str, text: str, **fields: Any) -> Notice:
         """Make a notice of a code, a text and fields."""
         if not _CODE.fullmatch(code):
-            raise ValueError(f"{code!r} is not a code: lower case with hyphens")
+            raise ValueError(f"{code!r} is not a notice code; use lower case and hyphens")
         notice = super().__new__(cls, text)
         object.__setattr__(notice, "code", code)
         object.__setattr__(notice, "fields", MappingProxyType(fields))

@@ -220,7 +220,11 @@ class VsiPath:
         """
         data = self.read(MAX_READ + 1)
         if len(data) > MAX_READ:
-            raise OSError(errno.EFBIG, f"a file of more than {MAX_READ // 1_000_000} MB is not read whole", self._name)
+            raise OSError(
+                errno.EFBIG,
+                f"the file is larger than {MAX_READ // 1_000_000} MB, the limit for reading it at once",
+                self._name,
+            )
         return data
 
     def read_text(self, encoding: str = "utf-8") -> str:
@@ -414,7 +418,9 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
             return name[url.end() :]
         if scheme not in SCHEMES:
             raise InputError(
-                f"URLs of the kind {scheme!r} are not read", file=name, remedy=f"one of {', '.join(SCHEMES)}, or a file"
+                f"URLs with the scheme {scheme!r} are not supported",
+                file=name,
+                remedy=f"one of {', '.join(SCHEMES)}, or a file",
             )
         name = SCHEMES[scheme] + name[url.end() :]
     if not Location(name).in_archive:
@@ -440,16 +446,15 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
     plain = _decoded(address)
     if _NAMED.search(plain) or _SIGNED.search(_PAGE.sub("", plain) if paged else plain):
         raise InputError(
-            "an address with credentials in it (a password, a signature) is not read, for what is read is named in all "
-            "outputs",
+            "an address must not contain credentials (a password, a signature), because outputs name all their inputs",
             file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
-            remedy="give it without them, as s3://, gs:// or az:// with the credentials in the environment",
+            remedy="use s3://, gs:// or az://, with the credentials in the environment",
         )
     if not allowed:
         raise InputError(
-            "files of the network are not opened unasked",
+            "network access is off by default",
             file=address,
-            remedy=Text("allow them with ", Setting("scene.allow_network")),
+            remedy=Text("allow it with ", Setting("scene.allow_network")),
         )
     _open_network()
 

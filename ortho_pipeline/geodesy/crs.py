@@ -86,7 +86,7 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     try:
         refuse_files(text if isinstance(text, str) else json.dumps(text))
         if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
-            raise ValueError("neither a name nor a form of a coordinate system")
+            raise ValueError("not a name, a code or a definition of a CRS")
         return pyproj.CRS.from_user_input(text)
     except (CRSError, ProjError, ValueError, TypeError, RecursionError) as error:
         shown = str(text) if len(str(text)) < 80 else f"{str(text)[:80]}..."
@@ -130,7 +130,7 @@ def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
         raise CrsError(error.message, field="output.crs", remedy=remedy) from error
     operation = plain.coordinate_operation
     if "Derived" in plain.type_name or (operation is not None and operation.method_name.startswith("PROJ ")):
-        raise CrsError(f"a GeoTIFF cannot hold {plain.to_string()!r}", field="output.crs", remedy=remedy)
+        raise CrsError(f"a GeoTIFF cannot store the CRS {plain.to_string()!r}", field="output.crs", remedy=remedy)
     return crs
 
 
@@ -195,7 +195,7 @@ class Vertical:
             return cls.parse(name)
         if not _BARE_NAME.fullmatch(name):
             raise DatumError(
-                f"{name[:80]!r} is the path of a grid, which is not opened because a file names it",
+                f"a file refers to the geoid grid {name[:80]!r} by its path; such paths are not opened",
                 field="vertical",
                 remedy=Text("give the grid as ", Setting("points.vertical", "FILE")),
             )
@@ -269,7 +269,7 @@ def _vertical_of_code(code: str) -> Vertical:
             f"{code} ({crs.name}) is not a vertical CRS", field="vertical", remedy=f"give {VERTICAL_FORMS}"
         )
     if part.axis_info[0].direction.lower() != "up":
-        raise DatumError(f"{code} ({crs.name}) counts depths, not heights", field="vertical")
+        raise DatumError(f"{code} ({crs.name}) gives depths, not heights", field="vertical")
     return Vertical(":".join(authority))
 
 
@@ -290,7 +290,7 @@ def vertical_transformer(name: str) -> Transformer:
             raise _grid_error(Vertical(name), fault)
         if set(name) & {",", '"'}:
             raise DatumError(
-                "PROJ cannot read a grid whose path holds a comma or a quotation mark", file=name, remedy="rename it"
+                "PROJ cannot read a grid whose path contains a comma or a quotation mark", file=name, remedy="rename it"
             )
         return Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
@@ -305,22 +305,22 @@ def _grid_error(vertical: Vertical, message: str) -> DatumError:
     if not vertical.name.startswith("EPSG:"):
         exists = Path(vertical.name).exists()
         return DatumError(
-            "is not a geoid grid that PROJ reads" if exists else "this geoid grid does not exist",
+            "PROJ cannot read this file as a geoid grid" if exists else "this geoid grid does not exist",
             file=vertical.name,
             field="vertical",
-            remedy="give a .gtx or GeoTIFF geoid grid, or its name if it lies in PROJ's search path",
+            remedy="give a .gtx or GeoTIFF geoid grid, or only its name if it is in PROJ's search path",
         )
     grid = grid_of_message(message)
     if grid is None:
         return DatumError(
             f"there is no transformation from {vertical.label} to the ellipsoid",
             field="vertical",
-            remedy="give the geoid grid file of this datum instead",
+            remedy="give a geoid grid file of this datum instead",
         )
     return DatumError(
         f"heights in {vertical.label} need the geoid grid {grid}, which is not installed",
         field="vertical",
-        remedy=grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) in place of the datum's name"),
+        remedy=grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) instead of the datum's name"),
     )
 
 
@@ -442,12 +442,12 @@ def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> Orth
         return CrsError(
             f"there is no transformation from {source.name!r} to {target.name!r}",
             field="CRS",
-            remedy="choose systems of known datum, such as UTM on WGS84",
+            remedy="choose a CRS with a known datum, such as UTM on WGS84",
         )
     return CrsError(
         f"the transformation from {source.name!r} to {target.name!r} needs the grid {grid}, which is not installed",
         field="CRS",
-        remedy=grid_remedy(grid, "or choose a system on WGS84"),
+        remedy=grid_remedy(grid, "or choose a CRS on WGS84"),
     )
 
 
@@ -467,7 +467,8 @@ def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, s
         better = group.unavailable_operations[0]
         grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
         log.warning(
-            "%s -> %s: used %.1f m, a transformation of %.1f m needs the grid %s, which is not installed",
+            "%s -> %s: using a transformation accurate to %.1f m. A better one (%.1f m) needs the grid %s, "
+            "which is not installed",
             source.name,
             target.name,
             used.get_last_used_operation().accuracy,

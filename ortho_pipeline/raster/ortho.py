@@ -90,7 +90,7 @@ class Profile:
 def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> float:
     if source.validity == "alpha":
         raise InputError(
-            "the image says by its alpha band which pixels are valid",
+            "the alpha band of this image already marks the valid pixels",
             file=source.path,
             field="output.nodata",
             remedy=Text(
@@ -99,7 +99,7 @@ def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> f
         )
     if not holds(dtype, value):
         raise InputError(
-            f"pixels of the type {dtype} cannot have the value {value:g}",
+            f"pixels of type {dtype} cannot have the value {value:g}",
             field="output.nodata",
             remedy=Text("give another value, or another type with ", Setting("output.dtype")),
         )
@@ -109,10 +109,10 @@ def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> f
 def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource) -> float | None:
     if value is not None and not holds(dtype, value):
         raise InputError(
-            f"the image's nodata value {value:g} does not fit into {dtype}",
+            f"the nodata value {value:g} of the image does not fit into {dtype}",
             file=source.path,
             field="output.dtype",
-            remedy=Text("set the value of pixels without an image with ", Setting("output.nodata")),
+            remedy=Text("choose another nodata value with ", Setting("output.nodata")),
         )
     return value
 
@@ -223,7 +223,7 @@ class RasterWriter:
         progress: Progress | None = None,
     ) -> None:
         if driver not in ("COG", "GTiff"):
-            raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
+            raise InputError(f"orthos cannot be written as {driver!r}", field="format", remedy="COG or GTiff")
         self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
         # The bands of a block lie together in the file, and GDAL holds several such blocks.
         self._side = square_side(profile, 512)

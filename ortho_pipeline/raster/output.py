@@ -79,7 +79,7 @@ def close(dataset: gdal.Dataset | None) -> None:
         make it, which some of its drivers say by returning none.
     """
     if dataset is None:
-        raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not make the file")
+        raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not create the file")
     try:
         dataset.FlushCache()
     except RuntimeError:
@@ -174,7 +174,7 @@ def check_written(
                     left, top = column * width, row * height
                     band.ReadRaster(left, top, min(width, band.XSize - left), min(height, band.YSize - top))
     except RuntimeError as error:
-        raise InputError(f"the output cannot be read again ({first_line(error)})", **told) from error
+        raise InputError(f"the output cannot be read back ({first_line(error)})", **told) from error
 
 
 # -- whole files ------------------------------------------------------------------------------------------------------
@@ -274,14 +274,13 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
             )
         if key not in _LAYOUT:
             raise InputError(
-                f"the creation option {key} is not taken: it does more than lay out the file",
+                f"the creation option {key} is not allowed: it changes more than the layout of the file",
                 field="creation option",
                 remedy=Text(
-                    "grid and CRS of an ortho are options of their own (",
+                    "set the grid and CRS of an ortho with ",
                     Setting("output.crs"),
-                    ", ",
+                    " and ",
                     Setting("output.resolution"),
-                    ")",
                 ),
             )
         if not _PLAIN_VALUE.fullmatch(value) or not _fits(known[key], value):

@@ -37,7 +37,7 @@ def pixel_type(name: str) -> np.dtype[Any]:
     """Return the type of pixels that GDAL calls `name`."""
     code = gdal.GetDataTypeByName(name)
     if name.lower() not in {known.lower() for known in PIXEL_TYPES}:
-        raise InputError(f"no pixels are of the type {name!r}", field="output.dtype", remedy=", ".join(PIXEL_TYPES))
+        raise InputError(f"{name!r} is not a pixel type", field="output.dtype", remedy=", ".join(PIXEL_TYPES))
     return numpy_type(code)
 
 

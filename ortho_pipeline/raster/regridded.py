@@ -43,7 +43,7 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
     dataset = open_dataset(path, **access)
     left, dx, skew, top, other, dy = dataset.GetGeoTransform()
     if skew or other:
-        raise InputError("this raster is turned against the axes of its CRS", field="geotransform")
+        raise InputError("this raster is not north-up", field="geotransform")
     crs = parse_crs(dataset.GetProjection())
     return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
 
@@ -91,10 +91,14 @@ class Regridded:
         wanted = f"{counted(profile.count, 'band')} of {profile.dtype}"
         if own != wanted:
             raise InputError(
-                f"this ortho has {own}, where {wanted} would be filled",
+                f"this ortho has {own}, but {wanted} is needed to fill gaps",
                 file=self.path,
                 remedy=Text(
-                    "make it of the same bands and type (", Setting("output.bands"), ", ", Setting("output.dtype"), ")"
+                    "make it with the same bands and type (",
+                    Setting("output.bands"),
+                    ", ",
+                    Setting("output.dtype"),
+                    ")",
                 ),
             )
 
@@ -173,7 +177,7 @@ class Regridded:
         xmin, ymin, xmax, ymax = own.extent
         if not (box[0] < xmax and box[2] > xmin and box[1] < ymax and box[3] > ymin):
             raise InputError(
-                f"this ortho ({crs_text(own.crs)}) lies elsewhere",
+                f"this ortho ({crs_text(own.crs)}) does not overlap the scene",
                 file=self.path,
                 remedy="give an ortho of this place, or leave it out",
             )

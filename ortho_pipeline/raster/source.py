@@ -44,7 +44,7 @@ MAX_BLOCK = 1 << 30
 MEMORY = 512_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = re.compile(r"(?is).+\.(xml|txt|imd|rpb|pvl|met|att|eph|tfw|wld|prj|hdr|ovr|msk|rpc|dim)$")
-_WHOLE = "give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again"
+_WHOLE = "give a complete raster in an allowed format ('ortho doctor' lists them), or copy it again"
 
 
 def open_dataset(
@@ -96,12 +96,12 @@ def open_pixels(
     dataset, block = _opened(path, allow_network, roots, True)
     if block.size > memory:
         raise InputError(
-            f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
-            f"{memory / 1e6:,.0f} MB of memory allowed",
+            f"one block of this raster needs {block.size / 1e6:,.0f} MB, more than the allowed "
+            f"{memory / 1e6:,.0f} MB of memory",
             file=block.path,
             field="block size",
             remedy=Text(
-                "tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger ",
+                "tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image increase ",
                 Setting("output.memory", "MB"),
             ),
         )
@@ -119,7 +119,7 @@ def _opened(
     if isinstance(place, VsiPath):
         drivers.remove("VRT")
         if Location(name).in_archive and not place.exists():
-            raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
+            raise InputError("there is no such file in the archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
         what = "this is a pipe or a device" if Path(name).exists() else "there is no such file"
         raise InputError(what, file=name, remedy=check_path(name))
@@ -136,7 +136,7 @@ def _opened(
         raise InputError(
             f"GDAL cannot open this as a raster ({first_line(error)})",
             file=name,
-            remedy="give a raster of a format that GDAL reads; 'ortho doctor' lists the allowed ones",
+            remedy="give a raster in an allowed format ('ortho doctor' lists them)",
         ) from error
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
@@ -156,7 +156,7 @@ def _refuse_pipes(path: Path) -> None:
                 kind = stat.S_IFMT(os.stat(folder / name).st_mode)
             if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
                 raise InputError(
-                    "a pipe or a device lies beside this image where its metadata would be",
+                    "a pipe or a device is in the place of this image's metadata",
                     file=path,
                     field=name,
                     remedy="remove it",
@@ -171,9 +171,9 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
     block = math.prod(band.GetBlockSize()) * gdal.GetDataTypeSize(band.DataType) // 8
     if max(width, height) > MAX_SIDE or block > MAX_BLOCK:
         raise InputError(
-            f"the header claims {width} x {height} pixels in blocks of {block} bytes",
+            f"the header states {width} x {height} pixels in blocks of {block} bytes",
             file=name,
-            remedy="the file is damaged, or has to be tiled first (gdal_translate -co TILED=YES)",
+            remedy="the file is damaged, or must be tiled first (gdal_translate -co TILED=YES in.tif out.tif)",
         )
 
 
@@ -207,7 +207,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         if not (self.dx > 0 and self.dy > 0 and math.isfinite(self.left) and math.isfinite(self.top)):
-            raise InputError("a pixel has a positive size", field="resolution")
+            raise InputError("the pixel size must be positive", field="resolution")
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             raise InputError(
                 f"the output would have {self.width} x {self.height} pixels",
@@ -223,7 +223,9 @@ class Grid:
         xmin, ymin, xmax, ymax = (float(value) for value in extent)
         dx, dy = resolution
         if not (0 < dx < 1e12 and 0 < dy < 1e12):
-            raise InputError(f"no pixel is {dx:g} x {dy:g} large", field="resolution", remedy="correct it")
+            raise InputError(
+                f"{dx:g} x {dy:g} is not a pixel size", field="resolution", remedy="give a positive resolution"
+            )
         # Beyond that many pixels from the origin a number does not tell one pixel from the next.
         if not (xmin < xmax and ymin < ymax and max(map(abs, (xmin, ymin, xmax, ymax))) / min(dx, dy) < 2**52):
             raise InputError(
@@ -272,14 +274,14 @@ class _RasterFile:
         bands = self.bands
         if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
             raise InputError(
-                "complex pixels are not resampled", file=self.path, remedy="split them into real bands first"
+                "complex pixels cannot be resampled", file=self.path, remedy="split them into real bands first"
             )
         if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
             # GDAL before 3.7 gives bytes with a sign as bytes without one.
             raise InputError(
-                "these pixels are bytes with a sign, which this GDAL reads as 0 to 255",
+                "this GDAL reads signed bytes wrongly, as 0 to 255",
                 file=self.path,
-                remedy="make 16 bit of them (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
+                remedy="convert them to 16 bits (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
             )
         self.dtype = np.result_type(*(numpy_type(band.DataType) for band in bands))
         self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)

@@ -80,7 +80,7 @@ class Kernel(Marked):
 def _refuse_settings() -> None:
     if Path(_SETTINGS).exists():
         raise InputError(
-            "numba would take its settings from this file in the working folder, and could run code that they name",
+            "numba would read its settings from this file in the working folder, which could run foreign code",
             file=Path(_SETTINGS).absolute(),
-            remedy="remove the file, or start from another folder",
+            remedy="remove the file, or run the command in another folder",
         )

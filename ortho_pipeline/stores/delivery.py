@@ -55,10 +55,10 @@ def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[P
     """
     if address.partition("://")[0] not in STORES:
         raise InputError(
-            "nothing is written to such an address",
+            "outputs cannot be written to such an address",
             file=address,
             field="folder",
-            remedy=f"one of {', '.join(STORES)}, or a folder",
+            remedy=f"use one of {', '.join(STORES)}, or a folder",
         )
     store = Objects(address, allow_network=allow_network)
     with tempfile.TemporaryDirectory(prefix="ortho_") as folder:

@@ -28,7 +28,7 @@ from ortho_pipeline.stores.objects import Content
 #: Environment variable: the folder of what is kept.
 FOLDER = "ORTHO_CACHE"
 _RECORD = ".json"
-_REMEDY = f"name a folder that you may write to and that has room in the environment variable {FOLDER}"
+_REMEDY = f"set the environment variable {FOLDER} to a folder with write access and enough free space"
 _RECORD_BYTES = 100_000
 #: Members of a record, and of which types they are.
 _FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
@@ -69,7 +69,7 @@ def folder() -> Path:
     if found is None or not found.is_absolute():
         wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
         raise InputError(
-            f"files of the network cannot be kept ({wrong})",
+            f"downloaded files cannot be cached ({wrong})",
             field=FOLDER,
             remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
         )
@@ -109,7 +109,7 @@ def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Cal
             content = fetch(part)
             wrong = fault(part) if fault is not None else ""
             if wrong:
-                raise InputError(f"what was fetched is not sound: {wrong}", file=address, remedy="check the address")
+                raise InputError(f"the downloaded file is not valid: {wrong}", file=address, remedy="check the address")
             _agreed[os.fspath(path)] = states([part])[os.fspath(part)]
         record = {"address": address, "bytes": content.size, "sha256": content.sha256, "fetched": time.time()}
         write_json(_record_of(path), record)

@@ -186,7 +186,7 @@ def parse_fill(fill: str | float) -> str | float:
     height = number_of(fill)
     if math.isnan(height):
         raise InputError(
-            f"{fill!r} does not say how to fill voids",
+            f"{fill!r} is not a way to fill voids",
             field="surface.fill",
             remedy="give error, mask, nearest or an ellipsoidal height in metres",
         )
@@ -203,5 +203,5 @@ def positions(xy: ArrayLike) -> Array:
     """
     found = np.asarray(xy, dtype=float)
     if found.ndim != 2 or found.shape[1] < 2:
-        raise InputError(f"positions have the shape (N, 2), not {found.shape}")
+        raise InputError(f"expected positions of shape (N, 2), not {found.shape}")
     return found[:, :2]

@@ -120,7 +120,7 @@ def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
         ) from error
     if not np.isfinite(undulation).any():
         raise DatumError(
-            f"the geoid grid of {vertical.label} does not reach this DEM",
+            f"{vertical.label} does not cover this DEM",
             field="surface.vertical",
             remedy=dem_vertical_remedy(),
         )
@@ -400,7 +400,7 @@ class DemSurface(Surface):
 
 def _no_height(path: str) -> CoverageError:
     return CoverageError(
-        "this DEM holds no valid height here", file=path, remedy="check its nodata value, unit and extent"
+        "this DEM has no valid height here", file=path, remedy="check its nodata value, unit and extent"
     )
 
 

@@ -200,10 +200,10 @@ class DemFile:
             )
         if gdal.DataTypeIsComplex(dataset.GetRasterBand(1).DataType):
             raise InputError(
-                "complex numbers are not heights",
+                "the pixels of this DEM are complex numbers, not heights",
                 file=self.path,
                 field="band 1",
-                remedy="choose one part of them with gdal_calc.py",
+                remedy="extract the real part with gdal_calc.py",
             )
         # GDAL counts from the corner of the first pixel; heights belong to the centres.
         centre = (x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d)
@@ -226,7 +226,7 @@ class DemFile:
                 f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
                 file=self.path,
                 field="CRS",
-                remedy="set a CRS of known datum with gdal_edit.py -a_srs",
+                remedy="set a CRS with a known datum with gdal_edit.py -a_srs",
             ) from error
 
     def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
@@ -241,7 +241,7 @@ class DemFile:
             raise InputError(
                 f"the heights cannot be read ({first_line(error, self.path)})",
                 file=self.path,
-                remedy="copy the DEM again: it is damaged",
+                remedy="the file is damaged: copy it again",
             ) from error
         scale, offset = (1.0 if band.GetScale() is None else band.GetScale()), band.GetOffset() or 0.0
         heights = raw.astype(float)

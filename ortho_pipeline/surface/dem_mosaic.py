@@ -40,7 +40,7 @@ _OFF_GRID, _SAME_STEP = 0.01, 1e-6
 _MOST_BETWEEN = 12
 #: Samples of an arc that says to be the whole circle.
 _CIRCLE = 360.0
-_WARP = "make one grid of them (gdalwarp in1.tif in2.tif out.tif), or leave out what does not belong"
+_WARP = "resample them to one grid (gdalwarp in1.tif in2.tif out.tif), or leave out the files that do not belong"
 
 
 class Samples(Protocol):
@@ -263,7 +263,7 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
         _refuse_other_system(first, crs, grid, other, its_crs, its_grid)
         if (its_crs is not crs and _datum(its_crs) != _datum(crs)) or its_unit != unit:
             raise DatumError(
-                f"this file has {_said(its_crs, its_unit)}, and {first.path} has {_said(crs, unit)}: they are not one "
+                f"this file has {_said(its_crs, its_unit)}, but {first.path} has {_said(crs, unit)}: they are not one "
                 "DEM",
                 file=other.path,
                 field="height datum",
@@ -284,7 +284,7 @@ def _refuse_other_system(
 ) -> None:
     if its_grid.crs is not grid.crs and not its_grid.crs.equals(grid.crs):
         raise CrsError(
-            f"this file is in {its_crs.name!r}, and {first.path} in {crs.name!r}",
+            f"this file is in {its_crs.name!r}, but {first.path} is in {crs.name!r}",
             file=other.path,
             field="CRS",
             remedy=_WARP,
@@ -292,7 +292,7 @@ def _refuse_other_system(
     (_, a, b, _, c, d), (_, own_a, own_b, _, own_c, own_d) = grid.crs_from_pixel, its_grid.crs_from_pixel
     if b or c or own_b or own_c or abs(own_d / d - 1) > 1e-6 or own_a * a < 0:
         raise CrsError(
-            f"the rows of this file do not have the direction and spacing of those of {first.path}",
+            f"the rows of this file differ in direction or spacing from those of {first.path}",
             file=other.path,
             field="geotransform",
             remedy=_WARP,
@@ -306,7 +306,7 @@ def _datum(crs: pyproj.CRS) -> tuple[object, object] | None:
 
 def _said(crs: pyproj.CRS, unit: str) -> str:
     declared: DeclaredVertical | None = declared_vertical(crs)
-    return f"heights in {declared.name if declared else 'a datum that it does not say'!r} ({unit or 'no unit'})"
+    return f"heights in {declared.name if declared else 'no stated datum'!r} ({unit or 'no unit'})"
 
 
 def _west(members: Sequence[tuple[Samples, SampleGrid]]) -> float:
@@ -332,7 +332,7 @@ def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) ->
             return count
     one, other = members[-1][0][0], members[0][0][0]
     raise CrsError(
-        f"there are no common columns for the samples of this file and those of {other.path}",
+        f"the columns of this file do not match those of {other.path}",
         file=one.path,
         field="geotransform",
         remedy=_WARP,
@@ -372,7 +372,7 @@ def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> 
         column, row = (grid.crs_from_pixel[0] - first) / width, (grid.crs_from_pixel[3] - y) / dy
         if max(abs(column - round(column)), abs(row - round(row))) > _OFF_GRID:
             raise CrsError(
-                "this file lies between the samples of the others",
+                "the samples of this file are not on the grid of the other files",
                 file=samples.path,
                 field="geotransform",
                 remedy=_WARP,

@@ -121,7 +121,9 @@ def tile_maker(job: WarpJob) -> TileMaker:
 def _check(job: WarpJob) -> None:
     job.check()
     if not 0 < job.tolerance < math.inf:
-        raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
+        raise InputError(
+            "the tolerance must be positive and finite", field="tolerance", remedy="the default is 0.01 px"
+        )
 
 
 def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:

@@ -41,5 +41,5 @@ def engine_of(name: str) -> Engine:
         If none has that name.
     """
     if name not in _ENGINES:
-        raise InputError(f"no engine is called {name!r}", field="output.engine", remedy=" or ".join(_ENGINES))
+        raise InputError(f"unknown engine {name!r}", field="output.engine", remedy=" or ".join(_ENGINES))
     return _ENGINES[name]

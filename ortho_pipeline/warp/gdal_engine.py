@@ -174,7 +174,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpResult:
     begin = time.monotonic()
     if isinstance(path, Hiding):
         raise InputError(
-            "GDAL's warper does not look for what terrain hides",
+            "GDAL's warper cannot detect occlusions",
             field="output.visibility",
             remedy=Text("leave out ", Setting("output.visibility"), " or ", Setting("output.engine", "gdal")),
         )
@@ -221,13 +221,16 @@ def _check(job: WarpJob) -> None:
     job.check()
     if job.dem_interpolation != "bilinear":
         raise InputError(
-            "with GDAL's warper heights of the DEM are interpolated bilinearly",
+            "GDAL's warper interpolates the DEM bilinearly only",
             field="output.dem_interpolation",
             remedy=Text("leave out ", Setting("output.dem_interpolation"), " or ", Setting("output.engine", "gdal")),
         )
     if len(job.source.paths) > 1:
         raise InputError(
-            "GDAL's warper takes one file", file=job.source.paths[1], field="engine", remedy="use our own engine"
+            "GDAL's warper accepts only one file",
+            file=job.source.paths[1],
+            field="engine",
+            remedy="use the default engine",
         )
 
 
@@ -249,9 +252,9 @@ def _standing(
             return replace(candidate, max_error_px=error)
         tried.append(f"{candidate.method}: {error:.3g} px off")
     raise InputError(
-        f"no transformer of GDAL stands for this model ({'; '.join(tried)})",
+        f"none of GDAL's transformers represents this model ({'; '.join(tried)})",
         field="output.engine",
-        remedy=Text("take our own engine (", Setting("output.engine", "ortho"), ")"),
+        remedy=Text("use the default engine (", Setting("output.engine", "ortho"), ")"),
     )
 
 

@@ -128,7 +128,7 @@ def test_what_is_no_height_datum(text: str) -> None:
 def test_a_file_that_is_no_geoid(tmp_path: Path) -> None:
     path = tmp_path / "notes.gtx"
     path.write_text("this is no grid")
-    with pytest.raises(DatumError, match="not a geoid grid"):
+    with pytest.raises(DatumError, match="as a geoid grid"):
         Vertical.parse(str(path))
 
 
@@ -147,7 +147,7 @@ def test_a_geoid_whose_header_lies(tmp_path: Path, change: tuple[bytes, tuple]) 
     # PROJ fills gigabytes with zeros for the first two.
     path = tmp_path / "geoid.gtx"
     path.write_bytes(struct.pack(change[0], *change[1]) + bytes(256))
-    with pytest.raises(DatumError, match="not a geoid grid"):
+    with pytest.raises(DatumError, match="as a geoid grid"):
         Vertical.parse(str(path))
     path.write_bytes(struct.pack(">ddddii", 30.0, 33.0, 1.0, 1.0, 8, 8) + bytes(256))
     assert Vertical.parse(str(path)).undulation([34.0], [33.0]) == 0
@@ -242,7 +242,7 @@ def test_a_geotiff_geoid_whose_header_lies(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["pipe.gtx", "pipe.tif"])
 def test_a_geoid_that_is_a_pipe(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / name)
-    with pytest.raises(DatumError, match="not a geoid grid"):
+    with pytest.raises(DatumError, match="as a geoid grid"):
         Vertical.parse(str(tmp_path / name))
 
 

@@ -129,7 +129,7 @@ def test_the_grid_has_to_reach_the_dem(tmp_path: Path) -> None:
     geoid = write_dem(
         tmp_path / "geoid.tif", np.full((20, 20), 30.0), "EPSG:4326", (0, 0.1, 0, 10, 0, -0.1), kind=gdal.GDT_Float32
     )
-    with pytest.raises(DatumError, match="does not reach"):
+    with pytest.raises(DatumError, match="does not cover"):
         open_dem(write_dem(tmp_path / "d.tif", hills()), str(geoid))
 
 

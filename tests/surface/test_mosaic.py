@@ -74,7 +74,7 @@ def test_many_files_are_the_dem_that_gdals_mosaic_of_them_is(tmp_path: Path) -> 
 
 
 def own_bilinear(cells: dict[tuple[int, int], np.ndarray], places: np.ndarray) -> np.ndarray:
-    """Return heights at (lon, lat), bilinear between the samples of a cell, which go on with those of its neighbours.
+    """Return heights at (lon, lat), bilinear not on the grid of the other of a cell, which go on with those of its neighbours.
 
     Between the last row of a cell and the first of the one below, each row is linear between its own samples.
     """
@@ -124,7 +124,7 @@ def test_cells_of_several_widths_are_each_sampled_in_their_own_grid(tmp_path: Pa
 def test_columns_without_a_common_multiple_are_refused(tmp_path: Path) -> None:
     odd = write_cell(tmp_path, 30, 41, 31)
     write_cell(tmp_path, 30, 42, 30)
-    with pytest.raises(CrsError, match=r"no common columns.*N42") as caught:
+    with pytest.raises(CrsError, match=r"the columns of this file do not match.*N42") as caught:
         open_dem(tmp_path / "*.tif", "ellipsoid")
     assert caught.value.file == str(odd)
     assert caught.value.remedy
@@ -145,7 +145,7 @@ def test_cells_on_both_sides_of_the_antimeridian_are_neighbours(tmp_path: Path) 
         ({"crs": "EPSG:4326+5773"}, DatumError, "EGM96"),
         ({"unit": "ft"}, DatumError, "'ft'|\\(ft\\)"),
         ({"crs": "EPSG:4258"}, CrsError, "ETRS89"),
-        ({"shift": 0.02}, CrsError, "between the samples"),
+        ({"shift": 0.02}, CrsError, "not on the grid of the other"),
     ],
 )
 def test_what_is_not_one_dem_is_refused_by_the_name_of_the_file(

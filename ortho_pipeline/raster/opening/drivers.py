@@ -106,10 +106,10 @@ def require_driver(name: str, file: Any) -> None:
     """Raise an `InputError` if this GDAL was built without a driver."""
     if gdal.GetDriverByName(name) is None:
         raise InputError(
-            f"this is for GDAL's driver {name}, and this GDAL ({gdal.__version__}) was built without it",
+            f"this file needs GDAL's driver {name}, but this GDAL ({gdal.__version__}) was built without it",
             file=file,
-            remedy="take a GDAL that has it (that of Debian and Ubuntu has), or name a GeoTIFF: one image of a "
-            "product, or what gdal_translate makes elsewhere",
+            remedy="use a GDAL that has it, such as the one of Debian or Ubuntu; or give a GeoTIFF "
+            "(an image of the product, or one converted with gdal_translate)",
         )
 
 

@@ -48,7 +48,7 @@ _CRS_SIDE_CARS = (".aux.xml", ".prj", ".hdr")
 _TEXT_SIDE_CAR = re.compile(r"\.(rpb|imd|eph|att|geo|tab|wld|\w{1,3}w)|[_.]?rpc\.(txt|xml)|_metadata\.txt")
 _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
-_OUTSIDE = ", put the files into one folder, or make one file of them (gdal_translate in out.tif)"
+_OUTSIDE = ", put the files into one folder, or convert them to one file (gdal_translate in out.tif)"
 
 
 def open_seen(
@@ -142,23 +142,23 @@ class _Gate:
         """See to a raster that another file leads to: GDAL opens it with any driver, lazily or at once."""
         key = str(path.resolve())
         if key in chain:
-            raise InputError("this VRT is a source of itself", file=path, remedy="take one of the two out of the other")
+            raise InputError("this VRT refers to itself", file=path, remedy="remove the circular reference")
         if key in self._seen:
             return
         self._seen.add(key)
         if len(self._seen) > _MANY:
-            raise InputError(f"this leads to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
+            raise InputError(f"this raster refers to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
         name = str(path)
         self._see_texts_beside(path)
         kind = identified(name, DRIVERS)
         first = None if kind is None else identified(name, None)
         if kind is None or first not in DRIVERS or (kind == "VRT" and isinstance(path, VsiPath)):
             raise InputError(
-                f"{path.name!r} is not a raster of an allowed format, and GDAL would open it "
-                f"({first or kind or 'by whatever driver takes it'})",
+                f"{path.name!r} is not a raster of an allowed format, but GDAL would open it "
+                f"({first or kind or 'with another driver'})",
                 file=by,
                 field=field,
-                remedy="take it away, or make a GeoTIFF of it (gdal_translate)",
+                remedy="remove it, or convert it to GeoTIFF (gdal_translate in out.tif)",
             )
         if kind in REFERRING:
             self._see_named(path, kind, chain | {key})
@@ -172,7 +172,7 @@ class _Gate:
                 f"{path.name!r} cannot be opened ({str(error).strip().partition(chr(10))[0]})",
                 file=by,
                 field=field,
-                remedy="the file is damaged: copy it again, or take it away",
+                remedy="the file is damaged: copy it again, or remove it",
             ) from error
         self._see_open(dataset, path)
 
@@ -194,7 +194,7 @@ class _Gate:
             raise InputError(
                 f"this folder has several products: {', '.join(sorted(found)[:6])}",
                 file=folder,
-                remedy="name the DIM_*.XML of one of them, or an image",
+                remedy="give the DIM_*.XML of one of them, or an image",
             )
         return folder / found[0] if found == names and found else None
 
@@ -209,14 +209,14 @@ class _Gate:
                 f"this volume has several products: {', '.join(str(place) for place in places[:6])}",
                 file=volume,
                 field="Dataset_Components",
-                remedy="name one of them",
+                remedy="give one of them",
             )
         if places and isinstance(places[0], str):
             raise InputError(
-                f"its product {places[0]!r} is not there",
+                f"its product {places[0]!r} is missing",
                 file=volume,
                 field="COMPONENT_PATH",
-                remedy="copy the delivery with its folders, or name an image",
+                remedy="copy the delivery with its folders, or give an image",
             )
         return places[0] if places else None
 
@@ -247,10 +247,10 @@ class _Gate:
                 self._must_be_inside(side_car, path, other)
                 if identified(str(side_car), None) not in PLAIN:
                     raise InputError(
-                        f"the side-car {other!r} is not a plain raster",
+                        f"the sidecar file {other!r} is not a plain raster",
                         file=path,
                         field=other,
-                        remedy="take it away; gdaladdo makes new overviews",
+                        remedy="remove it; gdaladdo makes new overviews",
                     )
                 # Overviews of an HFA file in .rrd are read by that driver alone, and are not rasters of their own.
                 if rest != ".rrd":
@@ -299,23 +299,23 @@ class _Gate:
         except OSError as error:
             # Longer than a file system takes, or in a folder that may not be read.
             raise InputError(
-                f"{(name or path.name)[:80]!r} cannot be a file here ({error.strerror})",
+                f"{(name or path.name)[:80]!r} is not a usable file name ({error.strerror})",
                 file=by,
                 field=field,
-                remedy="correct the name, or take it away",
+                remedy="correct the name, or remove it",
             ) from error
         if not plain:
             raise InputError(
-                f"{name or path.name!r} is not a file", file=by, field=field, remedy="put a file there, or take it away"
+                f"{name or path.name!r} is not a file", file=by, field=field, remedy="put a file there, or remove it"
             )
 
     def _outside(self, name: str, by: Any, field: str, path: Path | None) -> None:
         root = "DIR" if path is None else os.path.commonpath([path.parent, Path(by).resolve().parent])
         raise InputError(
-            f"this file reads {name[:200]!r}, which is outside of its own folder",
+            f"this file refers to {name[:200]!r}, which is outside its own folder",
             file=by,
             field=field,
-            remedy=Text("name a folder that holds both with ", Setting("scene.roots", root), _OUTSIDE),
+            remedy=Text("allow a folder that contains both with ", Setting("scene.roots", root), _OUTSIDE),
         )
 
     # -- what GDAL tells ---------------------------------------------------------------------------------------------
@@ -335,7 +335,7 @@ class _Gate:
                 "the geotransform of this raster is not finite",
                 file=path,
                 field="geotransform",
-                remedy="set the true one with gdal_edit.py -a_ullr",
+                remedy="set the right one with gdal_edit.py -a_ullr",
             )
         kind = dataset.GetDriver().ShortName
         for name in _listed(dataset):

@@ -49,7 +49,7 @@ _VRT_TEXTS = frozenset(
 #: What holds the text of a coordinate system in VRTs, side-cars of GDAL and of Esri, and DIMAP, in lower case.
 _CRS_NAMES = frozenset({"srs", "projection", "wkt", "horizontal_cs_code", "horizontal_cs_name"})
 _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
-PLAIN_VRT = "make a file of it first (gdal_translate in.vrt out.tif)"
+PLAIN_VRT = "convert it to a file first (gdal_translate in.vrt out.tif)"
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ class Named:
 def _header(path: Any, limit: int = _MAX_HEADER) -> str:
     """Return a header as C reads it: up to the first NUL."""
     if not path.is_file():
-        raise InputError("this is not a file", file=path, remedy="put a file there, or take it away")
+        raise InputError("this is not a file", file=path, remedy="put a file there, or remove it")
     if path.stat().st_size > limit:
         raise InputError(
-            "a header of more than 5 MB is not opened", file=path, remedy="make one file of it (gdal_translate)"
+            "the header is larger than 5 MB", file=path, remedy="convert it to one file (gdal_translate in out.tif)"
         )
     data = path.read_bytes().partition(b"\0")[0]
     try:
@@ -114,7 +114,7 @@ def _names_of_vrt(path: Any) -> Iterator[Named]:
             values = [text.lower() for text in _value(child)]
             if name not in _VRT_NAMES or (name == "subclass" and not _VRT_CLASSES.issuperset(values)):
                 raise InputError(
-                    f"only plain VRTs are opened, and {child[1]} {' '.join(values)[:40]} is none",
+                    f"only plain VRTs are opened; {child[1]} {' '.join(values)[:40]} is not allowed",
                     file=path,
                     field=child[1][:80],
                     remedy=PLAIN_VRT,
@@ -130,7 +130,9 @@ def _source(node: Any, path: Any, band: str) -> Named:
     texts = _value(node)
     relative = [text.strip() for name, one in _parts(node) if name == "relativetovrt" for text in _value(one)]
     if len(texts) != 1 or len(relative) > 1 or not set(relative) <= {"0", "1"}:
-        raise InputError("a source of this VRT has no plain name", file=path, field="SourceFilename", remedy=PLAIN_VRT)
+        raise InputError(
+            "a source of this VRT has no plain file name", file=path, field="SourceFilename", remedy=PLAIN_VRT
+        )
     return Named(texts[0], "SourceFilename", relative=relative == ["1"], raw=band == "raw")
 
 
@@ -216,14 +218,16 @@ def _names_of_isis3(path: Any) -> Iterator[Named]:
     data = _beginning(path, _MAX_HEADER)
     end = re.search(rb"\r?\n(END|End)\r?\n", data + (b"\n" if len(data) < _MAX_HEADER else b""))
     if end is None and len(data) >= _MAX_HEADER:
-        raise InputError("a label of more than 5 MB is not opened", file=path, remedy="make a GeoTIFF of it")
+        raise InputError(
+            "the label is larger than 5 MB", file=path, remedy="convert it to GeoTIFF (gdal_translate in out.tif)"
+        )
     text = data.decode("latin-1")
     raw = "geotiff" not in text.lower()
     for match in re.finditer(r"\^core", text, re.IGNORECASE):
         named = re.compile(r"""\s*=\s*("[^"'\r\n]*"|(?!/\*)[^"'\s(#]+)\s""").match(text + "\n", match.end())
         if named is None:
             raise InputError(
-                "^Core has no plain value", file=path, field="^Core", remedy="make a GeoTIFF of it (gdal_translate)"
+                "^Core has no plain value", file=path, field="^Core", remedy="convert it to GeoTIFF (gdal_translate)"
             )
         yield Named(named[1].strip('"'), "^Core", raw=raw)
 
@@ -241,10 +245,10 @@ def _names_of_pcidsk(path: Any) -> Iterator[Named]:
     names = [images[k + 64 : k + 128].strip(b" \0") for k in range(0, len(images), 1024)]
     if len(images) < 1024 * count or any(name and not name.startswith(b"/SIS=") for name in names):
         raise InputError(
-            "the channels of this PCIDSK file lie in other files",
+            "the channels of this PCIDSK file are in other files",
             file=path,
             field="IHi.2",
-            remedy="make one file of it (gdal_translate in.pix out.tif)",
+            remedy="convert it to one file (gdal_translate in.pix out.tif)",
         )
     yield from ()
 

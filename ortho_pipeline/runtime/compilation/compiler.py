@@ -115,7 +115,7 @@ def _sources(module: str) -> str:
 @functools.cache
 def _say_once() -> None:
     log.warning(
-        "Compiled kernels are not kept, because %s. Every run compiles them again, for some seconds. "
+        "Compiled kernels are not cached, because %s. Every run compiles them again, for some seconds. "
         "Remedy: set %s to a folder of your own to which nobody else can write",
         places.own()[1],
         places.FOLDER,

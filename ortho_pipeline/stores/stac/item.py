@@ -124,10 +124,10 @@ class Item:
             named = [asset for asset in found if asset.name.startswith(stem)]
             if len(named) != 1:
                 raise InputError(
-                    f"several assets may be the RPC of {image.key!r}: {self._keys(named or found)}",
+                    f"several assets could be the RPC of {image.key!r}: {self._keys(named or found)}",
                     file=self.address,
                     field="assets",
-                    remedy=Text("name one as ", Setting("scene.rpc"), ", or give the address of the image itself"),
+                    remedy=Text("choose one with ", Setting("scene.rpc"), ", or give the address of the image itself"),
                 )
             found = named
         if not found:
@@ -155,16 +155,16 @@ class Item:
             several = several or group
         if several:
             raise InputError(
-                f"several assets may be meant: {self._keys(several)}",
+                f"several assets could be the image: {self._keys(several)}",
                 file=self.address,
                 field="assets",
-                remedy=f"name one, for example {self.address}#{several[0].key}",
+                remedy=f"choose one, for example {self.address}#{several[0].key}",
             )
         raise InputError(
             f"no asset is a {what}",
             file=self.address,
             field="assets",
-            remedy=f"name one after a #, of {self._keys() or 'another item'}",
+            remedy=f"add the key of one after a #: {self._keys() or 'another item'}",
         )
 
     def _keys(self, assets: Iterable[Asset] | None = None) -> str:
@@ -199,10 +199,10 @@ def item_at(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath,
 def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath, ...] = ()) -> Item:
     """Return the item that a JSON object is; see `read_item`."""
     if document.get("type") != "Feature" or not isinstance(document.get("stac_version"), str):
-        raise InputError("this is no STAC item", file=address, field="stac_version", remedy=REMEDY)
+        raise InputError("this is not a STAC item", file=address, field="stac_version", remedy=REMEDY)
     assets = document.get("assets")
     if not isinstance(assets, dict):
-        raise InputError("a STAC item has assets", file=address, field="assets", remedy=REMEDY)
+        raise InputError("this STAC item has no assets", file=address, field="assets", remedy=REMEDY)
     place = Location(address).url
     own = next(
         (
@@ -219,7 +219,7 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
     found = []
     for key, asset in assets.items():
         if not isinstance(asset, dict) or not isinstance(asset.get("href"), str):
-            raise InputError("an asset has an href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
+            raise InputError("this asset has no href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
         roles = tuple(role for role in _list(asset.get("roles")) if isinstance(role, str))
         kind = asset.get("type") if isinstance(asset.get("type"), str) else ""
         systems = tuple(_systems(asset, document.get("properties")))

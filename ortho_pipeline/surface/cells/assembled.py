@@ -101,7 +101,7 @@ def open_cells(
     placed += [(cell_of_sea, *cell_of_sea.place(), "") for cell_of_sea in map(SeaCell, sea)]
     if not placed:
         raise CoverageError(
-            "none of the cells under the scene is there",
+            "this source has no DEM cells for the scene",
             file=source.address,
             field="surface.dem",
             remedy="give a DEM of this place",
@@ -124,15 +124,15 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
     declared = declared_vertical(crs) if len(crs.axis_info) > 2 else None
     if declared is not None and declared.vertical != Vertical("EPSG:3855"):
         raise DatumError(
-            f"this cell says that its heights are in {declared.name!r}, and those of this DEM are above EGM2008",
+            f"this cell states the height datum {declared.name!r}, but the heights of this DEM are above EGM2008",
             file=path,
             field="surface.dem",
-            remedy=Text("give the cells as a DEM of their own: ", Setting("surface.dem", "FOLDER/*.tif")),
+            remedy=Text("give the cells as an ordinary DEM: ", Setting("surface.dem", "FOLDER/*.tif")),
         )
     wrong = misplaced(cell, grid.shape, grid.crs_from_pixel)
     if wrong:
         raise InputError(
-            f"this is not the cell that its name says: {wrong}",
+            f"the name of this cell does not match its content: {wrong}",
             file=path,
             field="surface.dem",
             remedy="copy it again from the public bucket",
@@ -145,9 +145,9 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
 def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
     names = ", ".join(cell.name for cell in lost[:_SHOWN]) + (" and others" if len(lost) > _SHOWN else "")
     what = (
-        f"there are no public heights of this land: {names}"
+        f"the public DEM has no heights for this land: {names}"
         if known
-        else f"{names} are not there, and without {LIST} nobody says whether that is sea"
+        else f"{names} are missing, and without {LIST} it is unknown whether this is sea"
     )
     otherwise = "" if known else f"; or put the list {LIST} beside the cells"
     return CoverageError(
@@ -155,7 +155,7 @@ def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
         file=source.address,
         field="surface.dem",
         remedy=Text(
-            "give a DEM of this place, or choose how to fill it: ",
+            "give a DEM of this place, or choose how to fill the gap: ",
             Setting("surface.fill", "mask"),
             f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}",
         ),

@@ -29,7 +29,7 @@ _MOST_ITEMS = 10_000
 #: Two items that share more than this part of the smaller one show the same ground; neighbours share rims.
 _SAME_GROUND = 0.5
 _SHOWN = 6
-_CHOOSE = "give a FeatureCollection file of the items that belong together, or make one grid of their files (gdalwarp)"
+_CHOOSE = "give a FeatureCollection file of the items that belong together, or resample them to one grid (gdalwarp)"
 Placed = tuple[Samples, pyproj.CRS, SampleGrid, str]
 
 
@@ -72,7 +72,7 @@ def open_collected(
     )
     if not 0 < len(items) <= _MOST_ITEMS:
         raise CoverageError(
-            f"{counted(len(items), 'item')} of this collection {'lies' if len(items) == 1 else 'lie'} under the scene",
+            f"{counted(len(items), 'item')} of this collection {'covers' if len(items) == 1 else 'cover'} the scene",
             file=name,
             field="surface.dem",
             remedy="give a DEM of this place" if not items else _CHOOSE,
@@ -110,11 +110,11 @@ def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Pl
         return (file, system, grid, unit), True
     if own.vertical != declared.vertical and not override:
         raise DatumError(
-            f"this file declares its heights as {own.name!r}, and its STAC item says {declared.name!r}",
+            f"the height datum is {own.name!r} in this file, but {declared.name!r} in its STAC item",
             file=file.path,
             field="surface.vertical",
             remedy=Text(
-                "say which is true: ",
+                "state the right one: ",
                 Setting("surface.vertical"),
                 " together with ",
                 Setting("surface.override_vertical"),
@@ -152,8 +152,8 @@ def _same_ground(mosaic: DemMosaic, ids: Mapping[str, str]) -> list[Notice]:
     return [
         Notice(
             "dem-items-overlap",
-            f"{counted(len(hidden), 'item')} of the DEM's collection {'shows' if len(hidden) == 1 else 'show'} ground "
-            f"that another one shows too: there the finer one counts, of equal ones that of the later date ({shown})",
+            f"{counted(len(hidden), 'item')} of the DEM's collection {'overlaps' if len(hidden) == 1 else 'overlap'} "
+            f"another one ({shown}). There the finer item was used, and the newer one if both are equally fine",
             items=hidden,
         )
     ]

@@ -58,10 +58,10 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
         return _Bucket(text, allow_network)
     if not Path(text).is_dir():
         raise InputError(
-            "there is no such folder of cells",
+            "there is no such folder of DEM cells",
             file=text,
             field="surface.source",
-            remedy="give a folder that holds cells by their names in the public bucket, a STAC collection of them, or "
+            remedy="give a folder of cells with the names of the public bucket, a STAC collection of them, or "
             "an address",
         )
     return _Folder(text)
@@ -156,7 +156,7 @@ class _Catalogue(Source):
         folder, _, name = href.rpartition("/")
         if "?" in name:
             raise InputError(
-                "an address with a signature is not read",
+                "signed URLs are not read",
                 file=href.partition("?")[0],
                 field="surface.source",
                 remedy="give a collection whose assets are open, or the store itself with your credentials",
@@ -166,10 +166,10 @@ class _Catalogue(Source):
             return str(kept("dem", href, fetch, fault=functools.partial(fault_of, cell)))
         except FileNotFoundError as error:
             raise InputError(
-                "a collection names this cell, and it is not there",
+                "the collection lists this cell, but it does not exist",
                 file=href,
                 field="surface.source",
-                remedy="check the collection, or take another source",
+                remedy="check the collection, or choose another source",
             ) from error
 
 
@@ -189,8 +189,8 @@ def misplaced(cell: Cell, shape: tuple[int, int], place: Affine) -> str:
     """Return how the samples of a file do not lie where those of a cell do; empty if they do."""
     if shape != cell.grid.shape:
         rows, columns = cell.grid.shape
-        return f"it has {shape[1]} x {shape[0]} samples, and this cell has {columns} x {rows}"
+        return f"it has {shape[1]} x {shape[0]} samples instead of {columns} x {rows}"
     own = np.array(cell.grid.crs_from_pixel)
     ends = np.array([[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [1, shape[1], 0, 0, 0, 0], [0, 0, 0, 1, 0, shape[0]]])
     off = np.abs(ends @ (np.array(place) - own)).max() / own[1]
-    return "" if off < _OFF_GRID else "it lies elsewhere than this cell"
+    return "" if off < _OFF_GRID else "it is at another place than this cell"

@@ -86,7 +86,7 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
     for one in opened:
         if one.source.palette:
             raise InputError(
-                "indices into a palette have no brightness",
+                "palette indices have no brightness to balance",
                 file=one.layer.ortho.path,
                 field="mosaic.balance",
                 remedy="leave it out",
@@ -116,10 +116,10 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
         layer, band = wrong[0]
         raise InputError(
             f"band {band + 1} of {placed.layers[layer].ortho.name} would need a gain of {gains[layer, band]:.3g}: it "
-            "does not look like what overlaps it",
+            "does not match the orthos that overlap it",
             file=placed.layers[layer].ortho.path,
             field="mosaic.balance",
-            remedy="leave it out, or make mosaics of scenes of one kind",
+            remedy="leave the option out, or make a mosaic of scenes of one kind",
         )
     return Balance(gains, offsets, before, after, len(cells), float(outlying.mean()))
 

@@ -71,10 +71,10 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     without = [ortho for ortho in orthos if ortho.accuracy is None]
     if order == "most-accurate" and without:
         raise InputError(
-            f"nobody says how accurate {without[0].name} is at each place",
+            f"{without[0].name} has no accuracy raster",
             file=without[0].path,
             field="mosaic.order",
-            remedy=Text("give all scenes ", Setting("output.accuracy_raster"), ", or order them by best-view"),
+            remedy=Text("rectify all scenes with ", Setting("output.accuracy_raster"), ", or order them by best-view"),
         )
     if order != "first-on-top":
         orthos = sorted(
@@ -103,11 +103,11 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
     if grid.crs != first.crs or not same_pixels or off > _SAME:
         raise InputError(
-            f"{other.name} is not on the grid of {one.name}: {grid.crs.name}, {grid.dx:g} x {grid.dy:g}, off by "
-            f"{off:.3f} px beside {first.crs.name}, {first.dx:g} x {first.dy:g}",
+            f"{other.name} ({grid.crs.name}, {grid.dx:g} x {grid.dy:g}) is off the grid of {one.name} "
+            f"({first.crs.name}, {first.dx:g} x {first.dy:g}) by {off:.3f} px",
             file=other.path,
             field="output",
-            remedy="give all scenes one crs and resolution, and an extent on multiples of it or none",
+            remedy="give all scenes the same CRS and resolution, and no extent or one on multiples of the resolution",
         )
 
 
@@ -120,9 +120,9 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
         first = first or kind
         if kind != first:
             raise InputError(
-                f"{ortho.name} has {kind[0]} (valid by {kind[1]}), {orthos[0].name} {first[0]} (by {first[1]})",
+                f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
                 file=ortho.path,
-                remedy="make mosaics of scenes of one kind",
+                remedy="make a mosaic of scenes of one kind",
             )
 
 

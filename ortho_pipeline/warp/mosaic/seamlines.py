@@ -85,7 +85,7 @@ def owners_of(placed: Mosaic, balance: Balance | None, *, seamlines: bool, memor
     for one in opened:
         if seamlines and one.source.palette:
             raise InputError(
-                "indices into a palette have no differences",
+                "seam lines cannot follow palette indices",
                 file=one.layer.ortho.path,
                 field="mosaic.seamlines",
                 remedy="leave it out",

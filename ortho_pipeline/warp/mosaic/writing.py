@@ -32,7 +32,9 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
         If GDAL leaves an ortho out.
     """
     if placed.by_pixel:
-        raise InputError("a VRT does not choose pixel by pixel", file=path, field="mosaic.format", remedy="make a COG")
+        raise InputError(
+            "a VRT cannot choose between orthos pixel by pixel", file=path, field="mosaic.format", remedy="write a COG"
+        )
     names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
     with raster_output(path) as temporary:
         made = gdal.BuildVRT(
@@ -48,7 +50,9 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
             listed = {Path(name).resolve() for name in dataset.GetFileList()}
         missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (placed.grid.width, placed.grid.height):
-            raise InputError(f"GDAL leaves out {', '.join(missing) or 'pixels'}", file=path, remedy="make a COG of it")
+            raise InputError(
+                f"GDAL leaves out {', '.join(missing) or 'pixels'} in this VRT", file=path, remedy="write a COG"
+            )
 
 
 def write_cog(

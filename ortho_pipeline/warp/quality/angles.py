@@ -52,10 +52,9 @@ class Sun:
     def __post_init__(self) -> None:
         if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
             raise InputError(
-                f"the sun does not stand at an azimuth of {self.azimuth_deg:g} and {self.elevation_deg:g} degrees over "
-                "the horizon",
+                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} degrees are no position of the sun",
                 field="output.sun",
-                remedy="give degrees from north and over the horizon, above 0",
+                remedy="give the azimuth from north and an elevation above 0, in degrees",
             )
 
     @property
