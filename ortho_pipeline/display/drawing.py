@@ -302,7 +302,7 @@ def _rgba(name: str | None, opacity: float) -> Any:
 
 
 class Axes:
-    """A frame (x, y, width, height) in a drawing, and the values that its sides stand for."""
+    """A frame (x, y, width, height) in a drawing, and the values at its sides."""
 
     def __init__(
         self, drawing: Drawing, frame: tuple[float, ...], x: tuple[float, float], y: tuple[float, float]

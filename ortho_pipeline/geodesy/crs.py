@@ -159,7 +159,12 @@ class Vertical:
     Parameters
     ----------
     name : str
-        One of these; make it with `parse`, which checks it.
+        One of these. Create it with `parse`, which checks it.
+
+    Examples
+    --------
+    >>> Vertical.parse("egm96").label
+    'EGM96 height (EPSG:5773)'
     """
 
     name: str
@@ -189,7 +194,7 @@ class Vertical:
 
     @classmethod
     def stated(cls, text: str) -> Vertical:
-        """Return the height datum that a file of strangers names: as `parse`, but no grid by its path."""
+        """Return the height datum that a file states: as `parse`, but a path of a grid is an error."""
         name = text.strip()
         if Path(name).suffix.lower() not in _GRID_SUFFIXES:
             return cls.parse(name)
@@ -209,7 +214,7 @@ class Vertical:
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Name for messages and reports."""
         if self.is_ellipsoid:
             return "WGS84 ellipsoid"
         if self.name.startswith("EPSG:"):
@@ -232,7 +237,7 @@ class Vertical:
         Raises
         ------
         DatumError
-            If the grid is not installed (the message names it and says how to get it), or gives absurd heights.
+            If the grid is not installed (the remedy says how to get it), or gives impossible heights.
         """
         lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
         if self.is_ellipsoid:
@@ -332,14 +337,14 @@ class GroundTransform:
 
     Systems on a modern ellipsoid are promoted to 3D, so small differences between realisations enter the height.
     Systems on a classical ellipsoid (Bessel, Airy, Hayford ...) are transformed in plan and keep the WGS84 height,
-    since nobody measures heights above those. Geocentric systems are allowed on either side.
+    because heights are not measured above those. Geocentric systems are allowed on either side.
 
     Instances can be pickled, and shared between threads.
 
     Parameters
     ----------
     source, target : str or pyproj.CRS
-        Compound and 3D systems stand for their horizontal part.
+        Of compound and 3D systems the horizontal part is used.
 
     Raises
     ------

@@ -32,16 +32,16 @@ def dem_vertical(
     Parameters
     ----------
     declared : DeclaredVertical or None
-        What the CRS of the DEM says.
+        Datum that the CRS of the DEM states.
     option : Vertical or None
-        What the user says.
+        Datum that the user gives.
     override : bool
-        Let the user be right against an authority code.
+        Use the user's datum even against an authority code.
 
     Raises
     ------
     DatumError
-        If nobody says it, or both do and differ.
+        If neither states the datum, or if they contradict each other.
     """
     if declared is None:
         if option is None:
@@ -94,12 +94,12 @@ def dem_unit(text: str, declared: DeclaredVertical | None) -> float:
     Raises
     ------
     DatumError
-        If the unit is not known, or the band and the CRS say different ones.
+        If the unit is unknown, or the band and the CRS state different ones.
     """
     stated = UNITS.get("".join(c for c in text.lower() if c.isalpha())) if text else None
     if text and stated is None:
         raise DatumError(f"unknown unit of heights {text!r}", field="unit", remedy="use metres or feet")
-    # Two-dimensional systems say nothing; 3D ones made by promotion say metre whatever the band holds.
+    # Two-dimensional systems have no unit of heights; promoted 3D ones always state metres.
     axis = declared.metres_per_unit if declared else None
     if stated is not None and axis is not None and abs(stated - axis) > 1e-3:
         raise DatumError(

@@ -20,7 +20,7 @@ class DeclaredVertical:
     name : str
         As written there.
     vertical : Vertical or None
-        The datum, None if the name says nothing that is known.
+        The datum; None if the name is unknown.
     certain : bool
         True if an authority code or a grid identifies it, False if only its name does.
     metres_per_unit : float

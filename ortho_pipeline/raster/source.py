@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 MAX_SIDE = 4_000_000
 #: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
 MAX_BLOCK = 1 << 30
-#: Bytes that reading and warping may take where nobody says how many.
+#: Default memory of reading and warping, in bytes.
 MEMORY = 512_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = re.compile(r"(?is).+\.(xml|txt|imd|rpb|pvl|met|att|eph|tfw|wld|prj|hdr|ovr|msk|rpc|dim)$")
@@ -61,9 +61,9 @@ def open_dataset(
     path : path
         A file, also in an archive; URLs and GDAL's network file systems only with `allow_network`.
     roots : sequence of path
-        Folders that the files may lie in that this one leads to, besides its own.
+        Further folders in which files that this one refers to may be.
     siblings : bool
-        Whether GDAL may look at side-car files. Without them RPC metadata are those of the file itself.
+        Whether GDAL may read sidecar files. Without them RPC metadata are those of the file itself.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def _opened(
 
 
 def _refuse_pipes(path: Path) -> None:
-    """Refuse an image beside whose metadata or side-cars lies a pipe or a device: GDAL would wait for it for ever."""
+    """Raise an `InputError` if metadata or a sidecar of an image is a pipe or a device: GDAL would wait for ever."""
     folder = path if path.is_dir() else path.parent
     with contextlib.suppress(OSError):
         found = listing(folder)
@@ -193,8 +193,21 @@ def first_line(error: BaseException, of: object = "") -> str:
 class Grid:
     """North-up pixel grid of an output raster.
 
-    `left` and `top` are the map coordinates of the outer corner of the first pixel, `dx` and `dy` the (positive) size
-    of a pixel, in units of `crs`.
+    Parameters
+    ----------
+    left, top : float
+        Map coordinates of the outer corner of the first pixel, in units of `crs`.
+    dx, dy : float
+        Size of a pixel (positive), in units of `crs`.
+    width, height : int
+        Number of columns and rows.
+
+    Examples
+    --------
+    >>> import pyproj
+    >>> grid = Grid(pyproj.CRS(32636), 500_000.0, 4_100_000.0, 2.0, 2.0, 100, 50)
+    >>> grid.extent
+    (500000.0, 4099900.0, 500200.0, 4100000.0)
     """
 
     crs: pyproj.CRS
@@ -243,16 +256,16 @@ class Grid:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """xmin, ymin, xmax, ymax."""
+        """Map coordinates of the outer edges: xmin, ymin, xmax, ymax."""
         return self.left, self.top - self.height * self.dy, self.left + self.width * self.dx, self.top
 
     @property
     def geotransform(self) -> tuple[float, float, float, float, float, float]:
-        """GDAL's six numbers."""
+        """The six numbers of GDAL's geotransform."""
         return self.left, self.dx, 0.0, self.top, 0.0, -self.dy
 
     def xy(self, columns: NDArray[Any], rows: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return map coordinates of pixel positions (corner convention: the centre of the first pixel is 0.5, 0.5)."""
+        """Return map coordinates of pixel positions. The centre of the first pixel is (0.5, 0.5)."""
         return self.left + np.asarray(columns) * self.dx, self.top - np.asarray(rows) * self.dy
 
 
@@ -345,10 +358,10 @@ class _RasterFile:
 
 
 class RasterSource:
-    """A raster that several threads read windows of; it may lie in several files, a band or some in each.
+    """A raster in one or several files. Several threads may read windows of it at the same time.
 
-    Images of one scene that have the same size (a file for each band, as vendors deliver them) are one source: their
-    bands share one pass through the geometry.
+    Vendors often deliver a file for each band. Files of the same size are one source: the geometry of their bands
+    is computed once.
 
     Parameters
     ----------
@@ -357,10 +370,10 @@ class RasterSource:
     bands : sequence of int, optional
         Which bands, counted from 1 over all files, in the order wanted.
     dtype : str, optional
-        GDAL's name of the type that an ortho shall have. Pixels of another type are read as floating point that
-        holds both, so that interpolated values are rounded and clamped once, when they are written.
+        Pixel type of the ortho, as GDAL names it. Pixels of another type are read as floating point that holds
+        both, so that interpolated values are rounded and clamped only once, when they are written.
     memory : int
-        Bytes that one of its blocks may take; see `open_pixels`.
+        Largest allowed size of a block in bytes; see `open_pixels`.
 
     Attributes
     ----------
@@ -369,14 +382,14 @@ class RasterSource:
         Common type of all bands, as they are read.
     nodata : tuple of float or None, per band
     validity : {'all', 'nodata', 'mask', 'alpha'}
-        How the raster says which of its pixels are valid. NaN is never valid.
+        How the raster marks its valid pixels. NaN is never valid.
     block : int
-        Bytes of the blocks that GDAL holds at once to read a pixel of all bands.
+        Bytes that GDAL decodes at once to read one pixel of all bands.
 
     Raises
     ------
     InputError
-        If a file cannot be used, is not as large as the first, or has no such band.
+        If a file cannot be used, differs in size from the first, or has no such band.
     """
 
     def __init__(
@@ -447,7 +460,7 @@ class RasterSource:
 
     @property
     def descriptions(self) -> tuple[str, ...]:
-        """Names of the bands; of several files, bands without one have the name of their file."""
+        """Names of the bands. With several files, a band without a name has the name of its file."""
         several = len(self.paths) > 1
         return tuple(
             band.GetDescription() or (Path(file.path).stem if several else "")

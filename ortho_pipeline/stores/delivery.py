@@ -29,7 +29,7 @@ _AT_ONCE = 4
 
 @dataclass(frozen=True)
 class Upload:
-    """The folder of a delivery, and, when it has ended well, what each of its files is in the store."""
+    """A local folder whose files are uploaded; afterwards `stored` has the content of each in the store."""
 
     folder: Path
     stored: dict[str, Content] = field(default_factory=dict)

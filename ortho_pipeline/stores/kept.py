@@ -38,7 +38,7 @@ _agreed: dict[str, tuple[int, int, int]] = {}
 
 @dataclass(frozen=True)
 class CachedFile:
-    """A file that is kept: where, where it came from, and what it was when it came."""
+    """A cached file: its path, its address, and its size and checksum when it was downloaded."""
 
     path: Path
     address: str
@@ -57,7 +57,7 @@ class CachedFile:
 
 
 def folder() -> Path:
-    """Return the folder of what is kept: ``$ORTHO_CACHE``, or one of the user's folder of caches.
+    """Return the folder of cached files: ``$ORTHO_CACHE``, or a folder in the user's cache folder.
 
     Raises
     ------

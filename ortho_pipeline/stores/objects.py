@@ -36,7 +36,7 @@ _ATTEMPTS = 3
 _MOST_ON_A_CONDITION = 100_000_000
 _TIMEOUTS = {"connect_timeout": "10s", "timeout": "900s"}
 _CHUNK = 4 << 20
-#: What is noted beside an object that is encrypted.
+#: Attributes that are stored with an encrypted object.
 _SHA256 = "sha256"
 #: Bytes of the parts in which a large object is stored.
 PART = 8 << 20

@@ -164,7 +164,7 @@ def slopes_at(surface: DemSurface, lonlat: Array) -> Array:
 def typical_sigma(surface: Surface) -> float | None:
     """Return the standard deviation (m) of the heights of a surface, of a raster their root mean square.
 
-    None where nobody says, or the raster holds none.
+    None if it is unknown, or the raster has none.
     """
     sigma = surface.sigma
     if not isinstance(sigma, DemSurface):

@@ -59,19 +59,19 @@ def open_dem(
     path : path
         A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.dem_mosaic`).
     vertical : Vertical or str, optional
-        What the heights are measured above. Needed where the DEM does not say it.
+        Height datum. Required if the DEM does not state it.
     override : bool
-        Let `vertical` stand against a datum that the DEM declares by an authority code.
+        Use `vertical` even if the DEM states another datum by an authority code.
     fill : 'error', 'mask', 'nearest' or float
-        What stands for a void (see `Surface`); a number is an ellipsoidal height in metres.
+        Value in a void (see `Surface`). A number is an ellipsoidal height in metres.
     memory : int
-        Bytes of a whole job. An eighth of them may hold heights that were read.
+        Memory of the whole job in bytes. An eighth of it may cache heights.
 
     Raises
     ------
     InputError, DatumError, CrsError
-        If it cannot be opened, its height datum is unknown or contradicted, a geoid grid is missing, or it has no
-        usable georeference.
+        If it cannot be opened, its height datum is unknown or contradicts `vertical`, a geoid grid is missing, or
+        it has no usable georeference.
     """
     access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)
@@ -366,7 +366,7 @@ class DemSurface(Surface):
 
     @functools.cached_property
     def height_range(self) -> tuple[float, float]:
-        """Lowest and highest height (m) of the whole surface, with a fill height; every sample is read, once."""
+        """Lowest and highest height (m) of the whole surface, with a fill height. Reads every sample once."""
         rows, columns = self.shape
         return self.range_within(0, 0, columns, rows)
 

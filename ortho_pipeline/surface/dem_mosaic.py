@@ -56,7 +56,7 @@ class Samples(Protocol):
 
     @property
     def unit(self) -> str:
-        """The unit of the heights, as the file calls it; empty where it says nothing."""
+        """The unit of the heights as the file states it; empty if it states none."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ class Samples(Protocol):
 
 
 def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
-    """Return the files that a pattern such as ``folder/*.tif`` stands for, by name; None where it is no pattern.
+    """Return the files that match a pattern such as ``folder/*.tif``, by name; None if it is not a pattern.
 
     Raises
     ------

@@ -421,7 +421,7 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     Raises
     ------
     InputError
-        If there are none: the extent lies beside the scene.
+        If there are none: the extent does not overlap the scene.
     """
     import shapely
 

@@ -1,4 +1,4 @@
-"""GDAL's own warper as a second engine: slower, and a cross-check by a program that nobody here wrote.
+"""GDAL's own warper as a second engine: slower, and an independent check.
 
 One of GDAL's transformers stands for the sensor model: the one that expresses it, found by trying. How far it is off
 the exact model on the surface is measured through that transformer, at points of the ortho.
@@ -87,7 +87,7 @@ class Transformer:
 
     @property
     def limit(self) -> float:
-        """Largest error (px) with which it may stand for a model."""
+        """Largest error (px) with which it may represent a model."""
         return EXPRESSED if self.method.startswith("GCP") else REFUSE_ERROR
 
     def source(self, dataset: gdal.Dataset, bands: tuple[int, ...] = (1,)) -> gdal.Dataset:
@@ -234,13 +234,13 @@ def _check(job: WarpJob) -> None:
         )
 
 
-# -- what stands for a model -------------------------------------------------------------------------------------------
+# -- transformers that represent a model -------------------------------------------------------------------------------
 
 
 def _standing(
     exact: Exact, exported: RpcExport | None, image: gdal.Dataset, arrays: Path, scratch: contextlib.ExitStack
 ) -> Transformer:
-    """Return the first transformer that stands for the model, with its error."""
+    """Return the first transformer that represents the model, with its error."""
     tried = []
     for candidate in _candidates(exact, exported, arrays, scratch):
         try:

@@ -47,7 +47,7 @@ class WarpJob:
     profile : Profile, optional
         What the ortho looks like; like its source without.
     exported : RpcExport, optional
-        The RPC that stands for the model (`rpc.export_rpc`), where there is one, for an engine that knows no other.
+        The RPC that represents the model (`rpc.export_rpc`), if there is one, for an engine that needs it.
     """
 
     model: SensorModel

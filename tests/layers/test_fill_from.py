@@ -186,7 +186,7 @@ def test_an_ortho_that_cannot_fill_is_refused_before_the_first_pixel(tiny, steep
     kind = other_ortho(tmp_path / "kind.tif", grid, dtype="float32")
     bare = tmp_path / "bare.tif"
     gdal.GetDriverByName("GTiff").Create(str(bare), 20, 20, 1, gdal.GDT_Byte).FlushCache()
-    for path, words in ((elsewhere, "lies elsewhere"), (bands, "2 bands"), (kind, "float32"), (bare, "CRS"),
+    for path, words in ((elsewhere, "does not overlap the scene"), (bands, "2 bands"), (kind, "float32"), (bare, "CRS"),
                         (tmp_path / "none.tif", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=words) as caught:
             commands.check(tiny.image, **common, output=dataclasses.replace(output, fill_from=path))

@@ -74,7 +74,7 @@ def test_many_files_are_the_dem_that_gdals_mosaic_of_them_is(tmp_path: Path) -> 
 
 
 def own_bilinear(cells: dict[tuple[int, int], np.ndarray], places: np.ndarray) -> np.ndarray:
-    """Return heights at (lon, lat), bilinear not on the grid of the other of a cell, which go on with those of its neighbours.
+    """Return heights at (lon, lat), bilinear between the samples of a cell, which go on with those of its neighbours.
 
     Between the last row of a cell and the first of the one below, each row is linear between its own samples.
     """

@@ -63,8 +63,7 @@ def open_seen(
     drivers : sequence of str
         Those of `DRIVERS` that may read it.
     siblings : bool
-        Whether GDAL may look at side-car files.
-
+        Whether GDAL may read sidecar files.
     Returns
     -------
     gdal.Dataset, DecodedUnit
@@ -221,7 +220,7 @@ class _Gate:
         return places[0] if places else None
 
     def _see_texts_beside(self, path: Any) -> None:
-        """See to the texts in side-cars: some drivers read them, and ask PROJ for their CRS, to identify a file."""
+        """Check the texts in sidecars: some drivers read them and pass their CRS to PROJ to identify a file."""
         for other in _beside(path):
             rest = other.lower()
             for start in (path.name.lower(), path.stem.lower()):
@@ -269,7 +268,7 @@ class _Gate:
                     self._see(target, path, named.field, chain)
 
     def _targets(self, named: Named, by: Any) -> Iterator[Any]:
-        """Yield the places that a name may stand for, all of them inside."""
+        """Yield the paths that a name may mean, all of them inside the allowed folders."""
         # With and without what some drivers strip or turn.
         for name in {named.name, named.name.strip(), named.name.strip().replace("\\", "/")}:
             if not name or name.startswith("/vsi") or re.search(r"[<>{}:\x00-\x1f]", name.strip()):
@@ -396,7 +395,7 @@ def _listed(dataset: gdal.Dataset) -> list[str]:
     try:
         return list(dataset.GetFileList() or [])
     except RuntimeError:
-        # Of a side-car that it cannot read GDAL complains once; who needs what stands in it is told by its reader.
+        # GDAL reports a sidecar that it cannot read once; the reader of its content reports it again.
         return list(dataset.GetFileList() or [])
 
 

@@ -61,7 +61,7 @@ class Asset:
 
     @property
     def is_rpc(self) -> bool:
-        """Whether it is a side-car with an RPC."""
+        """Whether it is a sidecar file with an RPC."""
         return bool(_RPC_NAME.search(self.name)) or (self.key.lower() == "rpc" and not self.is_raster)
 
     @property
@@ -91,7 +91,7 @@ class Item:
         Raises
         ------
         InputError
-            If there is none, or several stand beside each other.
+            If there is none, or several are possible.
         """
         rasters = [asset for asset in self.assets if asset.is_raster]
         groups = [[asset for asset in rasters if role in asset.roles] for role in _ROLES]
@@ -111,7 +111,7 @@ class Item:
         return self._chosen(key, [[asset for asset in self.assets if asset.is_table]], "table of points")
 
     def rpc_of(self, image: Asset) -> Asset | None:
-        """Return the side-car with the RPC of an image; None where there is none, or where GDAL finds it by itself.
+        """Return the sidecar with the RPC of an image; None if there is none, or if GDAL finds it by itself.
 
         Raises
         ------

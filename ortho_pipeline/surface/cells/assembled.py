@@ -81,7 +81,7 @@ def open_cells(
     Raises
     ------
     CoverageError
-        If land under the extents has no cell, or nobody says whether there is land.
+        If land under the extents has no cell, or it is unknown whether there is land.
     DatumError
         If a cell says to be above another datum than EGM2008, or the geoid grid is not installed.
     InputError

@@ -60,7 +60,7 @@ def open_collected(
     CoverageError
         If no item lies there.
     DatumError
-        If items say different things of what their heights are measured above, or nobody says it.
+        If the items state different height datums, or none is stated.
     InputError
         If it is no collection, an item has no raster of heights, or there are too many items.
     """
@@ -133,7 +133,7 @@ def _stated(asset: Asset, grid: SampleGrid) -> tuple[pyproj.CRS, DeclaredVertica
             if declared is not None and horizontal(crs).equals(grid.crs, ignore_axis_order=True):
                 return crs, declared
         except CrsError:
-            # What cannot be read says nothing; the file itself has the say of where it lies.
+            # Ignore what cannot be read: the position in the file itself decides.
             continue
     return None
 

@@ -40,7 +40,7 @@ class Source(ABC):
 
     @abstractmethod
     def land(self) -> frozenset[Cell] | None:
-        """Return all cells that there ought to be: any other one is sea. None where nobody says."""
+        """Return all existing cells: every other one is sea. None if that is unknown."""
 
 
 def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:

@@ -70,13 +70,13 @@ class Budget:
     covariance : (P, P), optional
         Of the model's parameters.
     stated : float, optional
-        Standard deviation (m, per axis) of a model that nobody adjusted, as its vendor states it.
+        Standard deviation (m, per axis) of a model that was not adjusted, as its vendor states it.
     heights : float or Surface, optional
         Standard deviation (m) of the heights; as a surface it has them for "heights".
     datum : float
         Standard deviation (m) of the datum of the heights.
     reference : float
-        Standard deviation (m, per axis) of what all points have in common, beside what the covariance has of it.
+        Standard deviation (m, per axis) of the error common to all points, in addition to the covariance's part.
     interpolation_px : float
         Bound on the warp's error (px).
     """

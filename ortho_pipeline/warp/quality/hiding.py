@@ -1,4 +1,4 @@
-"""What is done about hidden pixels while an ortho is made: a mask of them beside it, no value in it, or another's."""
+"""Occluded pixels of an ortho: write a mask of them, leave them empty, or fill them from another ortho."""
 
 from __future__ import annotations
 
