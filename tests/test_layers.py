@@ -81,12 +81,14 @@ LINE = lines_of(ROOMS)
 GDAL_MODULES = {
     "files.locations",
     "files.traffic",
-    "raster.gate",
-    "raster.references",
-    "raster.block_cache",
+    "raster.opening.drivers",
+    "raster.opening.gate",
+    "raster.opening.references",
+    "raster.caching.block_cache",
     "raster.source",
     "raster.intensity",
     "raster.output",
+    "raster.pixel_types",
     "raster.ortho",
     "raster.regridded",
     "surface.dem_file",
@@ -101,7 +103,7 @@ GDAL_MODULES |= {
     "warp.mosaic.writing",
     "warp.gdal_engine",
 }
-NUMBA_MODULES = {"runtime.kernels.compiler"}
+NUMBA_MODULES = {"runtime.compilation.compiler"}
 MATPLOTLIB_MODULES = {"report.notebook.charts", "display.drawing"}
 MAX_ENTRIES, MAX_MODULES, MAX_LINES, MAX_CLASS, MAX_FUNCTION, MAX_PARAMETERS = 27, 12, 500, 250, 50, 12
 

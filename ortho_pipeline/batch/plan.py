@@ -32,7 +32,7 @@ from ortho_pipeline.options import (
     SurfaceOptions,
 )
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.surface.mosaic import matching_files
+from ortho_pipeline.surface.dem_mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
 STATE = ".run"

@@ -12,7 +12,7 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
-from ortho_pipeline.runtime.kernels import places
+from ortho_pipeline.runtime.compilation import places
 from ortho_pipeline.stores import kept
 
 KERNELS = [

@@ -25,9 +25,9 @@ from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.warp.layers.accuracy import Budget, Parts, parts_at, predictive
-from ortho_pipeline.warp.layers.error_ellipse import circular_error
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.accuracy import Budget, Parts, parts_at, predictive
+from ortho_pipeline.warp.quality.error_ellipse import circular_error
+from ortho_pipeline.warp.quality.sight import Sight
 
 SENSORS = ("ikonos", "cartosat", "orbview3", "bilsat")
 #: UTM zone of each simulated place.

@@ -23,7 +23,7 @@ from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
-from ortho_pipeline.raster.block_cache import cache_restored
+from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report

@@ -32,7 +32,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points.image_errors import sigma_of_covariance
-from ortho_pipeline.raster.block_cache import cache_restored
+from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.runtime.process_limits import one_blas_thread

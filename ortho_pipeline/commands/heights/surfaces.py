@@ -18,8 +18,8 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, open_dem
+from ortho_pipeline.surface.dem_mosaic import matching_files
 from ortho_pipeline.surface.flat import FlatSurface
-from ortho_pipeline.surface.mosaic import matching_files
 
 #: No height is less certain (m) than that: the Earth has none of that size.
 _LARGEST_SIGMA = 10_000.0

@@ -16,7 +16,7 @@ from ortho_pipeline.report.layers.angles import AnglesLayer, angles_style
 from ortho_pipeline.runtime.process_limits import Resources
 
 if TYPE_CHECKING:
-    from ortho_pipeline.warp.layers.angles import Sun
+    from ortho_pipeline.warp.quality.angles import Sun
 
 
 def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
@@ -32,7 +32,7 @@ def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
             raise InputError("only the angles depend on the sun", field="output.sun",
                              remedy=Text("give ", Setting("output.angles"), " too, or leave it out"))  # fmt: skip
         return None
-    from ortho_pipeline.warp.layers.angles import Sun
+    from ortho_pipeline.warp.quality.angles import Sun
 
     if output.sun is not None:
         return Sun(float(output.sun[0]), float(output.sun[1]))
@@ -52,8 +52,8 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
     output = placed.request.output
     if not output.angles:
         return None
-    from ortho_pipeline.warp.layers import angles
-    from ortho_pipeline.warp.layers.sight import Sight
+    from ortho_pipeline.warp.quality import angles
+    from ortho_pipeline.warp.quality.sight import Sight
 
     sight, heights = Sight(placed.model, placed.grid), placed.footprint.heights
     resources = Resources(output.memory, output.threads)

@@ -29,8 +29,8 @@ from ortho_pipeline.surface.dem import DemSurface
 if TYPE_CHECKING:
     from ortho_pipeline.raster.regridded import Regridded
     from ortho_pipeline.warp.job import WarpRecord
-    from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
-    from ortho_pipeline.warp.layers.hiding import Hiding
+    from ortho_pipeline.warp.quality.accuracy import AccuracyResult, Budget
+    from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: Standard deviation (m) of geoids by the name of the height datum: commission errors over land; of any other, national
 #: ones and grids of one's own. Source: Lemoine et al. 1998 (EGM96), Pavlis et al. 2012 (EGM2008).
@@ -63,7 +63,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     output = placed.request.output
     if not output.accuracy_raster:
         return None, []
-    from ortho_pipeline.warp.layers.accuracy import Budget
+    from ortho_pipeline.warp.quality.accuracy import Budget
 
     surface, fit = placed.surface, placed.adjusted.fit
     covariance = _covariance(placed)
@@ -112,7 +112,7 @@ def stated_accuracy(model: SensorModel) -> float | None:
 
 def _covariance(placed: Placement) -> Array | None:
     """Return the covariance of the model's parameters, now or before; None where nothing was adjusted."""
-    from ortho_pipeline.warp.layers.accuracy import predictive
+    from ortho_pipeline.warp.quality.accuracy import predictive
 
     fit, before = placed.adjusted.fit, placed.scene.adjusted
     if len(fit.param_names) and fit.used.any():
@@ -191,7 +191,7 @@ def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | No
     """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
     if placed.request.output.visibility is None:
         return files["ortho"]
-    from ortho_pipeline.warp.layers.hiding import Hiding
+    from ortho_pipeline.warp.quality.hiding import Hiding
 
     return Hiding(files["ortho"], placed.footprint.heights, files.get("visibility"), other)
 
@@ -202,8 +202,8 @@ def write_layers(
     """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
     if known is None:
         return None
-    from ortho_pipeline.warp.layers.accuracy import write_accuracy
-    from ortho_pipeline.warp.layers.sight import Sight
+    from ortho_pipeline.warp.quality.accuracy import write_accuracy
+    from ortho_pipeline.warp.quality.sight import Sight
 
     budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
     scene, output = placed.scene, placed.request.output

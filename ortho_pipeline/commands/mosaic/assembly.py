@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import allowed, states, together, write_json
 from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.options import MosaicOptions
-from ortho_pipeline.raster.block_cache import cache_restored
+from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.report.mosaic.document import mosaic_document, summary_text
 from ortho_pipeline.report.mosaic.page import write_page

@@ -45,7 +45,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import sigma_of_covariance
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.surface.rays import meet_surface
 
 #: Radius (chip px) of the search about the corrected model.

@@ -21,7 +21,7 @@ from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, View, m
 from ortho_pipeline.imaging.ties.pairs import Matched, Pair, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 
 #: Cells of a scene are at most so many times those wanted of its smallest overlap.
 _MOST = 10

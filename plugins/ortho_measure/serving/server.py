@@ -27,7 +27,7 @@ from ortho_measure.session import Session
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.runtime.process_limits import thread_pool
 
 if TYPE_CHECKING:

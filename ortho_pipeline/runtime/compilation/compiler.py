@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numba
 from numba.core.caching import FunctionCache, NullCache
 
-from ortho_pipeline.runtime.kernels import places
-from ortho_pipeline.runtime.kernels.marked import Marked
+from ortho_pipeline.runtime.compilation import places
+from ortho_pipeline.runtime.compilation.marked import Marked
 
 log = logging.getLogger(__name__)
 
@@ -115,7 +115,8 @@ def _sources(module: str) -> str:
 @functools.cache
 def _say_once() -> None:
     log.warning(
-        "Compiled kernels are not kept, because %s. Every run compiles them again, for some seconds. "
+        "Compiled kernels are not cached, because %s. Every run compiles them again, for some seconds. "
         "Remedy: set %s to a folder of your own to which nobody else can write",
-        places.own()[1], places.FOLDER,
-    )  # fmt: skip
+        places.own()[1],
+        places.FOLDER,
+    )
