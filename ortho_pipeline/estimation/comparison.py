@@ -170,16 +170,23 @@ def compare(
             found = replace(found, warnings=(*found.warnings, warning))
         parameters, minimum, dimensions = known[name]
         rows.append(
-            Row(name, parameters, minimum, dimensions, fit=found) if isinstance(found, Fit)
+            Row(name, parameters, minimum, dimensions, fit=found)
+            if isinstance(found, Fit)
             else Row(name, parameters, minimum, dimensions, error=found)
-        )  # fmt: skip
+        )
     corrections = () if own is None else [own_name(own, name) for name in (*CORRECTIONS, OWN)]
     recommended, reason, criterion = recommend(rows, preferred=corrections, unsuited=tuple(unsuited or ()), size=size)
     return Comparison(
-        tuple(rows), tuple(blunders.items()), recommended, reason, criterion,
-        control=int(kept.control.sum()), check=int(kept.check.sum()), model_crs=crs,
+        tuple(rows),
+        tuple(blunders.items()),
+        recommended,
+        reason,
+        criterion,
+        control=int(kept.control.sum()),
+        check=int(kept.check.sum()),
+        model_crs=crs,
         notes=uncovered(kept.image[kept.control], size),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

@@ -51,9 +51,10 @@ def check_formats(formats: Sequence[str]) -> tuple[str, ...]:
     unknown = [name for name in formats if name not in ENDINGS]
     if unknown or not formats:
         raise InputError(
-            f"no format is called {', '.join(unknown) or 'nothing'}", field="formats",
+            f"no format is called {', '.join(unknown) or 'nothing'}",
+            field="formats",
             remedy=f"one or more of {', '.join(FORMATS)}",
-        )  # fmt: skip
+        )
     return tuple(dict.fromkeys(formats))
 
 

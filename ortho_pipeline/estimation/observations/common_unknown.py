@@ -94,6 +94,8 @@ class CommonUnknown:
     def to_json(self) -> dict[str, Any]:
         """Return the section ``common_error`` of documents: sigmas and estimate per axis in metres."""
         return {
-            "points": self.points, "sigma_m": self.sigma, "estimate_m": (self.value * self.sigma).tolist(),
+            "points": self.points,
+            "sigma_m": self.sigma,
+            "estimate_m": (self.value * self.sigma).tolist(),
             "estimate_sigma_m": (np.sqrt(np.diag(self.left)) * self.sigma).tolist(),
-        }  # fmt: skip
+        }
