@@ -294,9 +294,10 @@ def fit(
     """
     if not isinstance(model, SensorModel):
         raise InputError(
-            f"a {type(model).__name__} is no sensor model, and has nothing to adjust", field="model",
+            f"a {type(model).__name__} is no sensor model, and has nothing to adjust",
+            field="model",
             remedy='give a model; of a scene: scene.fit(points, "shift")',
-        )  # fmt: skip
+        )
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
     known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}

@@ -221,9 +221,7 @@ class _Cells:
         return sigma_of(self.plain(name), self.path, self.column(name), zero=zero)
 
 
-def _row(
-    path: str | os.PathLike[str], line: Line, header: Header, expected: Columns, marks: set[str]
-) -> Row | None:  # fmt: skip
+def _row(path: str | os.PathLike[str], line: Line, header: Header, expected: Columns, marks: set[str]) -> Row | None:
     """Return the point of a line, None where it is inactive; `marks` are the decimal marks of the file until here."""
     cells, where = cells_of(path, line, header.delimiter), f"line {line.number}"
     if len(cells) != len(header.names):
@@ -232,8 +230,10 @@ def _row(
         raise InputError(
             f"{counted(len(cells), 'cell')} under {counted(len(header.names), 'column name')} "
             f"({', '.join(header.names)[:120]})",
-            file=path, field=where, remedy=remedy,
-        )  # fmt: skip
+            file=path,
+            field=where,
+            remedy=remedy,
+        )
     if not header.names[-1] and cells[-1]:
         raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
     of = _Cells(path, where, cells, header, expected, marks)
@@ -275,7 +275,9 @@ def _decimal(cell: str, header: Header, marks: set[str], path: str | os.PathLike
     marks.update(mark for mark, there in ((",", comma), (".", point)) if there)
     if len(marks) > 1:
         raise InputError(
-            f"{short(cell)}: commas and points both stand in the numbers of this file", file=path, field=where,
+            f"{short(cell)}: commas and points both stand in the numbers of this file",
+            file=path,
+            field=where,
             remedy="write all decimals alike, and no separators of thousands",
-        )  # fmt: skip
+        )
     return re.sub(r",(?=\d*(?:[eE][+-]?\d+)?$)", ".", cell, count=1) if comma else cell

@@ -47,39 +47,52 @@ class _Format(NamedTuple):
 #: In the order in which they are tried: content tells them apart, then the suffix.
 _FORMATS = (
     _Format(
-        "GeoJSON with 'ji'", read_geojson,
+        "GeoJSON with 'ji'",
+        read_geojson,
         "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
         lambda suffix, start, first: start.startswith(("{", "[")) or suffix in (".geojson", ".json"),
         (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
     ),
     _Format(
-        "QGIS .points", read_qgis,
+        "QGIS .points",
+        read_qgis,
         "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
         lambda suffix, start, first: suffix == ".points" or re.match(r"(?i)mapX\s*,", first),
     ),
     _Format(
-        "ENVI .pts", read_envi, "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
+        "ENVI .pts",
+        read_envi,
+        "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
         lambda suffix, start, first: suffix == ".pts" or start.startswith(";"),
     ),
     _Format(
-        "ASP .gcp", read_asp,
+        "ASP .gcp",
+        read_asp,
         "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
-        lambda suffix, start, first: suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start), (OF_BLOCK,),
+        lambda suffix, start, first: suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start),
+        (OF_BLOCK,),
     ),
     _Format(
-        "CSV/TSV (id,col,row,x,y,h,...)", read_csv,
+        "CSV/TSV (id,col,row,x,y,h,...)",
+        read_csv,
         "write one point a line, its numbers under a header such as id,col,row,x,y,h",
-        lambda suffix, start, first: suffix in (".csv", ".tsv") or is_header(first), (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
+        lambda suffix, start, first: suffix in (".csv", ".tsv") or is_header(first),
+        (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
     ),
     _Format(
-        "ODM gcp_list.txt", read_odm, "write x y z column row image [label], under a line with the CRS",
-        lambda suffix, start, first: odm_crs(first) is not None, (OF_BLOCK,),
+        "ODM gcp_list.txt",
+        read_odm,
+        "write x y z column row image [label], under a line with the CRS",
+        lambda suffix, start, first: odm_crs(first) is not None,
+        (OF_BLOCK,),
     ),
     _Format(
-        "ArcGIS link table", read_links, "write [id] from-x from-y to-x to-y",
+        "ArcGIS link table",
+        read_links,
+        "write [id] from-x from-y to-x to-y",
         lambda suffix, start, first: LINK_TABLE.match(first),
     ),
-)  # fmt: skip
+)
 _NAMES = ", ".join(one.name for one in _FORMATS)
 
 
@@ -123,9 +136,10 @@ def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK)
     kind = _format_of(path, text)
     if expected not in kind.of_block:
         raise InputError(
-            "points of several images do not stand in this format", file=path,
+            "points of several images do not stand in this format",
+            file=path,
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
-        )  # fmt: skip
+        )
     # Only formats whose columns have names can be asked for those of ground alone.
     table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
     if not table.rows:
@@ -150,15 +164,18 @@ def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
             return kind
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(
-            f"numbers without names: it is not said what the columns are; the first line is {short(first)}", file=path,
+            f"numbers without names: it is not said what the columns are; the first line is {short(first)}",
+            file=path,
             field="line 1",
             remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
             "from-x from-y to-x to-y)",
-        )  # fmt: skip
+        )
     raise InputError(
-        f"the format of this point file is not known; its first line is {short(first)}", file=path, field="line 1",
+        f"the format of this point file is not known; its first line is {short(first)}",
+        file=path,
+        field="line 1",
         remedy=f"give one of: {_NAMES}",
-    )  # fmt: skip
+    )
 
 
 def _of_image(
@@ -168,9 +185,11 @@ def _of_image(
     if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"there are points of several images ({some})", file=path, field="image",
+            f"there are points of several images ({some})",
+            file=path,
+            field="image",
             remedy="say which with image_name, or read them as a block (read_block_points)",
-        )  # fmt: skip
+        )
     if image_name is None or not named:
         return table
     kept: list[Row] = []

@@ -80,9 +80,11 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
     role = properties.get("role") or expected.role
     sigma_image = sigma("sigma_image", False)
     covariance, group, common, alike = read_image_errors(
-        [properties.get(one) for one in CSV_ERRORS], path, [f"{where}.properties.{one}" for one in CSV_ERRORS],
+        [properties.get(one) for one in CSV_ERRORS],
+        path,
+        [f"{where}.properties.{one}" for one in CSV_ERRORS],
         sigma_image,
-    )  # fmt: skip
+    )
     row = Row(
         where=where,
         id=str(name) if name is not None else None,
@@ -121,9 +123,11 @@ def _measured(
         pairs = list(ji.items())
     elif expected is OF_BLOCK and not isinstance(file_name, str):
         raise InputError(
-            "it is not said in which image this point was measured", file=path, field=field,
+            "it is not said in which image this point was measured",
+            file=path,
+            field=field,
             remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",
-        )  # fmt: skip
+        )
     for image, pair in pairs:
         if not isinstance(pair, list) or len(pair) != 2:
             raise InputError("no property 'ji' = [column, row]", file=path, field=field, remedy="measure the points")

@@ -55,8 +55,9 @@ def reconciled(sigma: Array, covariance: ArrayLike | None) -> tuple[Array, Array
         raise InputError(
             f"sigma_image {sigma[k]:g} of point {k + 1} contradicts covariance_image, whose root mean square per axis "
             f"is {derived[k]:g}",
-            field="sigma_image", remedy="change both, or give the covariance by with_covariance_image",
-        )  # fmt: skip
+            field="sigma_image",
+            remedy="change both, or give the covariance by with_covariance_image",
+        )
     return np.where(more, derived, sigma), np.where(more[:, None, None], given, square)
 
 
@@ -177,23 +178,29 @@ def read_image_errors(
     if not all(there[:3]):
         missing = CSV_ERRORS[there[:3].index(False)]
         raise InputError(
-            f"a covariance without {missing}", file=path, field=where[there.index(True)],
+            f"a covariance without {missing}",
+            file=path,
+            field=where[there.index(True)],
             remedy=f"give {', '.join(CSV_ERRORS[:3])}, or sigma_image alone",
-        )  # fmt: skip
+        )
     column, row = (sigma_of(values[k], path, where[k], zero=False, what="variance") for k in range(2))
     both = number(values[2], path, where[2])
     matrix = np.array([[[column, both], [both, row]]])
     if not _is_positive_definite(matrix)[0]:
         raise InputError(
             f"{short(values[2])} is too large for the covariance of column and row: it is not positive definite",
-            file=path, field=where[2], remedy="its square is below var_col times var_row",
-        )  # fmt: skip
+            file=path,
+            field=where[2],
+            remedy="its square is below var_col times var_row",
+        )
     derived = float(sigma_of_covariance(matrix)[0])
     if sigma is not None and not abs(sigma - derived) <= _SAME_SIGMA * derived:
         raise InputError(
-            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}", file=path, field=where[0],
+            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}",
+            file=path,
+            field=where[0],
             remedy="leave sigma_image empty where a covariance is given",
-        )  # fmt: skip
+        )
     return (column, row, both), group, common, alike
 
 
@@ -201,9 +208,11 @@ def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
     found = number(value, path, where)
     if found != math.floor(found) or not 0 <= found < 2**53:
         raise InputError(
-            f"{short(value)} is not a group", file=path, field=where,
+            f"{short(value)} is not a group",
+            file=path,
+            field=where,
             remedy="number the groups from 0 on; leave it empty for a point that errs on its own",
-        )  # fmt: skip
+        )
     return int(found)
 
 

@@ -144,9 +144,11 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
         image = given.pop("image file", None)
         if image is not None and image not in images:
             raise InputError(
-                f"no comment FileName{short(image)[1:-1]}= names the image of this point", file=path, field=where,
+                f"no comment FileName{short(image)[1:-1]}= names the image of this point",
+                file=path,
+                field=where,
                 remedy="name it, for example ; FileName0=scene.tif",
-            )  # fmt: skip
+            )
         value = {name: number(cell, path, f"{where}, {name}") for name, cell in given.items()}
         at = (value["image x"] - 1.0, value["image y"] - 1.0)
         ground = (value["x"], value["y"], value.get("elev", math.nan))
@@ -196,9 +198,11 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         cells = re.split(r"\s*,\s*|\s+", line.text.strip())
         if len(cells) < 12 or (len(cells) - 7) % 5:
             raise InputError(
-                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image", file=path, field=where,
+                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image",
+                file=path,
+                field=where,
                 remedy="id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
-            )  # fmt: skip
+            )
         lat, lon, height = (
             number(cells[k], path, f"{where}, {name}") for k, name in ((1, "latitude"), (2, "longitude"), (3, "height"))
         )
@@ -236,10 +240,12 @@ def read_links(path: str | os.PathLike[str], text: str) -> Table:
         )
         if minus_row > 1.0:
             raise InputError(
-                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say", file=path,
-                field=f"{where}, from-y", remedy="make the links on the raster without its georeference, where y is "
+                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say",
+                file=path,
+                field=f"{where}, from-y",
+                remedy="make the links on the raster without its georeference, where y is "
                 "minus the row, or give the points as CSV with the columns Pixel and Line",
-            )  # fmt: skip
+            )
         label = cells[0] if len(cells) == 5 else None
         table.rows.append(Row(where, label, (x, -minus_row), (to[0], to[1], math.nan)))
     return table

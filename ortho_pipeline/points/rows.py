@@ -188,9 +188,11 @@ def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> flo
         )
     if origin != "corner" and not table.origin_allowed:
         raise InputError(
-            f"the format {table.format} says itself what its first pixel is called", file=path,
-            field="points.pixel_origin", remedy="leave the option out",
-        )  # fmt: skip
+            f"the format {table.format} says itself what its first pixel is called",
+            file=path,
+            field="points.pixel_origin",
+            remedy="leave the option out",
+        )
     return PIXEL_ORIGINS[origin]
 
 
@@ -210,10 +212,11 @@ def load_text(path: str | os.PathLike[str]) -> str:
         )
     if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
         raise InputError(
-            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published", file=path,
+            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published",
+            file=path,
             remedy="export the cell array of the GCP tool as text, and give its columns names such as Name, Pixel, "
             "Line, Easting, Northing, Elev",
-        )  # fmt: skip
+        )
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:

@@ -72,9 +72,14 @@ class CommonError(CommonUnknown):
         largest = float(problem.points.sigma_common.max())
         everyone = np.ones(len(problem.rows), dtype=bool)
         return cls(
-            sigma=largest, points=len(everyone), value=np.zeros(2), told=np.zeros((2, 2)), per_sigma=per_sigma,
-            gain=per_sigma, shares=everyone,
-        )  # fmt: skip
+            sigma=largest,
+            points=len(everyone),
+            value=np.zeros(2),
+            told=np.zeros((2, 2)),
+            per_sigma=per_sigma,
+            gain=per_sigma,
+            shares=everyone,
+        )
 
     def offset(self, model: SensorModel, points: Points) -> Array:
         """Return how far (px) it moves each of points ``(N, 2)``; 0 for those that do not share it."""

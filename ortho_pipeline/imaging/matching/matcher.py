@@ -13,6 +13,7 @@ from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.band_shifts import BandShift, spread
+from ortho_pipeline.imaging.matching.agreement import agreed
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
@@ -26,7 +27,7 @@ from ortho_pipeline.imaging.matching.chip_search import (
 )
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.search import Level, agreed, place, refuse_accident
+from ortho_pipeline.imaging.matching.search import Level, place, refuse_accident
 from ortho_pipeline.imaging.matching.sight import HEIGHTS, Chips, across, displacement, placed_along_sight
 from ortho_pipeline.imaging.matching.targets import (
     SAMPLES,
@@ -208,9 +209,7 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
         if inside.any():
             said = f"covers {inside.mean():.1%} of the scene, which is too little to match"
             remedy = "give images that cover more of the scene, or measure points by hand"
-        raise InputError(
-            f"{targets[0].called} {said}", file=targets[0].path, field=targets[0].field, remedy=remedy
-        )  # fmt: skip
+        raise InputError(f"{targets[0].called} {said}", file=targets[0].path, field=targets[0].field, remedy=remedy)
     return image[inside]
 
 
@@ -246,9 +245,15 @@ class _Tried:
     """The chips that are tried, and how far each has come."""
 
     def __init__(
-        self, view: View, targets: Sequence[Target], origins: NDArray[np.int_], cells: NDArray[np.int_], factor: int,
-        threads: int, displaced: float,
-    ) -> None:  # fmt: skip
+        self,
+        view: View,
+        targets: Sequence[Target],
+        origins: NDArray[np.int_],
+        cells: NDArray[np.int_],
+        factor: int,
+        threads: int,
+        displaced: float,
+    ) -> None:
         self.view, self.targets, self.origins, self.cells, self.factor = view, targets, origins, cells, factor
         # Where heights displace chips by more than they bear (px), each is sought by itself.
         self.threads, self.displaced = threads, displaced
@@ -268,10 +273,14 @@ class _Tried:
         """Return what single bands say of the matches that are kept, measured with the last correction."""
         good = np.flatnonzero(self.reason == "")
         return in_each_band(
-            View(self.view.intensity, correction, self.view.surface), self.targets,
-            self.origins[good] + self.whole[good], self.scene[good],
-            (self.offset[good] - self.whole[good]) / self.factor, self.factor, self.threads,
-        )  # fmt: skip
+            View(self.view.intensity, correction, self.view.surface),
+            self.targets,
+            self.origins[good] + self.whole[good],
+            self.scene[good],
+            (self.offset[good] - self.whole[good]) / self.factor,
+            self.factor,
+            self.threads,
+        )
 
     def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
         seen = View(self.view.intensity, correction, self.view.surface)
@@ -316,7 +325,7 @@ class _Tried:
             raise self._too_few()
         better, agreeing = agreed(
             correction, self.centres[good], self.offset[good], self.score[good], _NEAR * self.factor
-        )  # fmt: skip
+        )
         if searched is not None:
             places = turns * (2 * searched / self.factor + 1) ** 2
             refuse_accident(int(agreeing.sum()), len(good), _NEAR, places, self.targets, searched)
@@ -398,21 +407,26 @@ class _Tried:
         if len(residuals) < _MOSTLY * seen and scatter > _VAGUE * self.factor:
             raise InputError(
                 f"the scene and the reference do not agree: {len(residuals)} of {counted(seen, 'chip')} fit together, "
-                f"and those only within {scatter:.1f} px", file=self.targets[0].path, field=self.targets[0].field,
+                f"and those only within {scatter:.1f} px",
+                file=self.targets[0].path,
+                field=self.targets[0].field,
                 remedy=Text(
-                    "check that the reference shows this place, search farther (", Setting("match.search"),
-                    ") if the model may be off by more, or give better heights"
+                    "check that the reference shows this place, search farther (",
+                    Setting("match.search"),
+                    ") if the model may be off by more, or give better heights",
                 ),
-            )  # fmt: skip
+            )
 
     def _too_few(self) -> InputError:
         counts = {name: int((self.reason == name).sum()) for name in REASONS}
         why = ", ".join(f"{count} {REASONS[name]}" for name, count in counts.items() if count)
         return TooFewPoints(
             f"{counted(int((self.reason == '').sum()), 'match')} of {len(self.reason)} tried"
-            f"{': ' + why if why else ''}", file=self.targets[0].path, field=self.targets[0].field,
+            f"{': ' + why if why else ''}",
+            file=self.targets[0].path,
+            field=self.targets[0].field,
             remedy="give images that are more alike (season, resolution), or points that are measured by hand",
-        )  # fmt: skip
+        )
 
     def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:
         """Return all that was tried, and the points."""
@@ -427,15 +441,32 @@ class _Tried:
         crs = parse_crs(self.view.model.crs)
         names = ", ".join(os.path.basename(target.path) for target in self.targets)
         points = Points(
-            ids=tuple(f"m{cell}" for cell in self.cells[good]), image=self.centres[good], ground=self.ground[good],
-            roles=roles, sigma_image=sigma_of_covariance(covariance), sigma_ground=np.zeros((len(good), 3)), crs=crs,
-            source=f"matched with {names}", covariance_image=covariance, groups=groups,
+            ids=tuple(f"m{cell}" for cell in self.cells[good]),
+            image=self.centres[good],
+            ground=self.ground[good],
+            roles=roles,
+            sigma_image=sigma_of_covariance(covariance),
+            sigma_ground=np.zeros((len(good), 3)),
+            crs=crs,
+            source=f"matched with {names}",
+            covariance_image=covariance,
+            groups=groups,
             sigma_common=np.full(len(good), settings.reference_sigma),
-        )  # fmt: skip
+        )
         return Matches(
-            self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.found,
-            self.factor, levels, parts, points,
-        )  # fmt: skip
+            self.centres,
+            delivered,
+            self.score,
+            self.reason,
+            self.cells,
+            self.scene,
+            self.target,
+            self.found,
+            self.factor,
+            levels,
+            parts,
+            points,
+        )
 
 
 def _robust(design: Array, values: Array) -> Array:

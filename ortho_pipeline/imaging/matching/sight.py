@@ -121,9 +121,14 @@ class Chips:
 
 
 def along_sight(
-    view: View, targets: Sequence[Target], factor: int, search: float, window: tuple[int, int, int, int],
-    displaced: float, threads: int,
-) -> tuple[ImageCorrection, int, int] | None:  # fmt: skip
+    view: View,
+    targets: Sequence[Target],
+    factor: int,
+    search: float,
+    window: tuple[int, int, int, int],
+    displaced: float,
+    threads: int,
+) -> tuple[ImageCorrection, int, int] | None:
     """Return the shift of the model on which most chips agree across the line of sight, each found by itself.
 
     That is how a scene is placed where heights are wrong by more than chips are large, from chip to chip.
@@ -141,9 +146,7 @@ def along_sight(
     chips, agreeing : int
         Or None, where so many could as well agree by accident.
     """
-    start = ImageCorrection.identity(
-        view.model, "affine", ((window[0] + window[2]) / 2, (window[1] + window[3]) / 2)
-    )  # fmt: skip
+    start = ImageCorrection.identity(view.model, "affine", ((window[0] + window[2]) / 2, (window[1] + window[3]) / 2))
     columns, rows = cells_of(window[2] - window[0], window[3] - window[1], _ASKED)
     origins, _ = candidates(view, window, (columns, rows), SIDE, factor, np.ones((rows, columns), dtype=bool))
     corrected = View(view.intensity, start, view.surface)
@@ -173,9 +176,14 @@ def displacement(view: View, shown: Array, dem_sigma: float, factor: int) -> flo
 
 
 def placed_along_sight(
-    view: View, targets: Sequence[Target], level: tuple[int, float], region: tuple[int, int, int, int],
-    displaced: float, threads: int, refused: InputError,
-) -> tuple[ImageCorrection, list[Level]]:  # fmt: skip
+    view: View,
+    targets: Sequence[Target],
+    level: tuple[int, float],
+    region: tuple[int, int, int, int],
+    displaced: float,
+    threads: int,
+    refused: InputError,
+) -> tuple[ImageCorrection, list[Level]]:
     """Return the correction on which chips agree across the line of sight, where heights may be the cause of a refusal.
 
     Raises
@@ -190,9 +198,11 @@ def placed_along_sight(
     if found is None:
         raise InputError(
             f"{refused.message}; nor do chips agree across the line of sight, along which wrong heights displace them "
-            f"by {displaced:.0f} px", file=refused.file, field=refused.field,
+            f"by {displaced:.0f} px",
+            file=refused.file,
+            field=refused.field,
             remedy=Text("give better heights, or: ", refused.remedy or ""),
-        ) from None  # fmt: skip
+        ) from None
     correction, chips, agreeing = found
     shift = correction.coefficients[[0, 3]]
     radius = math.ceil((reach + HEIGHTS * displaced) / factor)
@@ -242,9 +252,12 @@ def displacements(view: View, target: Target, partials: Array, ground: Array) ->
     """
     per_metre = map_from_enu(parse_crs(view.model.crs), ground)
     second = np.stack(
-        [(target.project(ground + one, view.model.crs) - target.project(ground - one, view.model.crs)) / 2
-         for one in np.moveaxis(per_metre, 2, 0)], axis=-1,
-    )  # fmt: skip
+        [
+            (target.project(ground + one, view.model.crs) - target.project(ground - one, view.model.crs)) / 2
+            for one in np.moveaxis(per_metre, 2, 0)
+        ],
+        axis=-1,
+    )
     first = partials @ per_metre
     # Along a ray of another scene plan follows height; in an orthoimage it does not.
     with np.errstate(invalid="ignore"):

@@ -137,17 +137,21 @@ class Reference:
         missing_band = next((number for number in bands if not 1 <= number <= source.count), None)
         if missing_band is not None:
             raise InputError(
-                f"the reference has {counted(source.count, 'band')}; there is no band {missing_band}", file=source.path,
-                field="match.reference_bands", remedy=f"give numbers from 1 to {source.count}",
-            )  # fmt: skip
+                f"the reference has {counted(source.count, 'band')}; there is no band {missing_band}",
+                file=source.path,
+                field="match.reference_bands",
+                remedy=f"give numbers from 1 to {source.count}",
+            )
         dataset = source.dataset
         text, transform = dataset.GetProjection(), dataset.GetGeoTransform(can_return_null=True)
         if not text or transform is None:
             missing = "coordinate system" if transform is not None else "georeference"
             raise CrsError(
-                f"the reference has no {missing}: where it lies is not known", file=source.path, field="reference",
+                f"the reference has no {missing}: where it lies is not known",
+                file=source.path,
+                field="reference",
                 remedy="give an orthoimage (GeoTIFF with its CRS), or set it with gdal_edit.py -a_srs and -a_ullr",
-            )  # fmt: skip
+            )
         forward = np.array([[transform[1], transform[2]], [transform[4], transform[5]]])
         with np.errstate(all="ignore"):
             sound = abs(np.linalg.det(forward)) > 0
@@ -157,9 +161,11 @@ class Reference:
             sound = bool(np.isfinite(inverse).all() and np.abs(offset).max() < 2**52)
         if not sound:
             raise CrsError(
-                "the reference has a georeference that cannot be inverted", file=source.path, field="reference",
+                "the reference has a georeference that cannot be inverted",
+                file=source.path,
+                field="reference",
                 remedy="give an orthoimage",
-            )  # fmt: skip
+            )
         with completed(source.path):
             crs = horizontal(parse_crs(text))
             # A system of no known datum is refused here, by the name of its file.
@@ -265,9 +271,10 @@ def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
         first = targets[0]
         raise InputError(
             f"a pixel of {os.path.basename(view.intensity.source.path)} is {ratio:.3g} pixels of {first.called}",
-            file=first.path, field=first.field,
+            file=first.path,
+            field=first.field,
             remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
-        )  # fmt: skip
+        )
     # Averaged to the pixels of a target half as fine, a real scene was found half a pixel off; in its own, a twentieth.
     # Of a scene that was enlarged, two by two are its own: single ones show its noise as if it were structure.
     return max(2 if view.intensity.enlarged else 1, round(1 / ratio / _FINER))

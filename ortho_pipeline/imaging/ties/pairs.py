@@ -233,9 +233,15 @@ class Pair:
         covariance = replace(parts, height=0.0).covariance(chips.covariance, along)
         height, sigma = _heights(residuals, covariance, along)
         return Matched(
-            places, second, covariance / 2, turned @ covariance @ turned.swapaxes(1, 2) / 2, height, sigma,
-            chips.score, parts,
-        )  # fmt: skip
+            places,
+            second,
+            covariance / 2,
+            turned @ covariance @ turned.swapaxes(1, 2) / 2,
+            height,
+            sigma,
+            chips.score,
+            parts,
+        )
 
 
 def shared(view: View, target: OtherScene) -> Array:

@@ -73,9 +73,11 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
     overlaps = _overlaps(views, targets)
     if not overlaps:
         raise InputError(
-            "no two of the scenes show the same ground", file=views[0].intensity.source.path, field="images",
+            "no two of the scenes show the same ground",
+            file=views[0].intensity.source.path,
+            field="images",
             remedy="give scenes that overlap; if they do, a model leads elsewhere (`ortho info`)",
-        )  # fmt: skip
+        )
     block = _Block(views, targets, settings)
     for home, view in enumerate(views):
         partners = {other: shown for (first, other), shown in overlaps.items() if first == home}
@@ -87,13 +89,17 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
             for one in block.pairs
         )
         raise InputError(
-            f"there are no ties: {said}", file=views[0].intensity.source.path, field="images",
+            f"there are no ties: {said}",
+            file=views[0].intensity.source.path,
+            field="images",
             remedy=Text(
-                "search farther (", Setting("match.search"),
-                ") if the models may be off by more, state how wrong the heights may be (", Setting("surface.sigma"),
-                "), or measure tie points by hand"
+                "search farther (",
+                Setting("match.search"),
+                ") if the models may be off by more, state how wrong the heights may be (",
+                Setting("surface.sigma"),
+                "), or measure tie points by hand",
             ),
-        )  # fmt: skip
+        )
     return block.ties()
 
 
@@ -181,9 +187,12 @@ class _Block:
         return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()]
 
     def _take(
-        self, home: int, asking: Sequence[_Track], found: Mapping[int, tuple[NDArray[np.int_], Matched]],
+        self,
+        home: int,
+        asking: Sequence[_Track],
+        found: Mapping[int, tuple[NDArray[np.int_], Matched]],
         placed: Mapping[int, Pair],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Add what was found to the tracks."""
         own: dict[int, list[Array]] = {}
         for other, (index, matched) in found.items():
@@ -210,9 +219,12 @@ class _Block:
             for image, (place, covariance) in sorted(track.places.items())
         ]
         return Ties(
-            np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
-            np.array([row[2] for row in rows]), np.array([row[3] for row in rows]), tuple(self.pairs),
-        )  # fmt: skip
+            np.array([row[0] for row in rows]),
+            np.array([row[1] for row in rows]),
+            np.array([row[2] for row in rows]),
+            np.array([row[3] for row in rows]),
+            tuple(self.pairs),
+        )
 
 
 def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], Matched]]) -> None:
