@@ -120,9 +120,12 @@ if not TYPE_CHECKING:  # a checker knows the names from above, and no others
 
 #: What a notebook shows as a table: module and name of each type.
 _SHOWN = (
-    ("hookspecs", "Scene"), ("points.table", "Points"), ("estimation.fit", "Fit"), ("block.fit", "BlockFit"),
+    ("hookspecs", "Scene"),
+    ("points.table", "Points"),
+    ("estimation.fit", "Fit"),
+    ("block.fit", "BlockFit"),
     ("estimation.choice.comparison", "ComparisonRecord"),
-)  # fmt: skip
+)
 
 
 def _html(result: Any) -> str:

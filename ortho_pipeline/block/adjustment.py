@@ -249,9 +249,10 @@ def pseudo_of(
         for name, prior in priors.get(image, {}).items():
             if name not in names:
                 raise InputError(
-                    f"a prior names the parameter {name!r}, which the model of {image!r} does not have", field="priors",
+                    f"a prior names the parameter {name!r}, which the model of {image!r} does not have",
+                    field="priors",
                     remedy=f"its parameters are {', '.join(names) or 'none'}",
-                )  # fmt: skip
+                )
             found.append(Pseudo(begin + names.index(name), prior.mean, prior.sigma))
         begin += len(names)
     return tuple(found)
@@ -301,9 +302,10 @@ def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
     if not solved.converged:
         uncertain_images(solved, solved.problem.points)
         raise NotConverged(
-            "the adjustment did not converge", file=solved.problem.points.source or None,
+            "the adjustment did not converge",
+            file=solved.problem.points.source or None,
             remedy="give more control points, spread in plan and height, or a simpler model or correction",
-        )  # fmt: skip
+        )
     return solved, solved.without_astray(selection)
 
 

@@ -70,10 +70,16 @@ class CommonError(CommonUnknown):
             return None
         rays = problem.points.rays
         found = cls(
-            sigma=float(sigmas.max()), points=shared, value=np.zeros(2), told=np.zeros((2, 2)), sigmas=sigmas,
-            known=problem.known, by_params=np.zeros((problem.size, 2)), by_points=np.zeros((len(sigmas), 3, 2)),
+            sigma=float(sigmas.max()),
+            points=shared,
+            value=np.zeros(2),
+            told=np.zeros((2, 2)),
+            sigmas=sigmas,
+            known=problem.known,
+            by_params=np.zeros((problem.size, 2)),
+            by_points=np.zeros((len(sigmas), 3, 2)),
             seen=np.zeros((rays, 2, 2)),
-        )  # fmt: skip
+        )
         return found._seen_by(problem, state, selection) if (used & (sigmas == 0)).any() else found
 
     def corrected(self, known: Array) -> Array:

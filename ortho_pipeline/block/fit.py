@@ -248,16 +248,21 @@ class BlockFit:
             return None
         east, north, up = np.sqrt((values**2).mean(axis=0)).tolist()
         return ObjectRms(
-            x=east, y=north, h=up, plan=math.hypot(east, north), n=len(values), min=values.min(axis=0).tolist(),
+            x=east,
+            y=north,
+            h=up,
+            plan=math.hypot(east, north),
+            n=len(values),
+            min=values.min(axis=0).tolist(),
             max=values.max(axis=0).tolist(),
-        )  # fmt: skip
+        )
 
     @property
     def record(self) -> BlockAdjustment:
         """What is published of it (docs/engineering/formats.md)."""
-        shared: dict[str, Any] = {} if self.common_error is None else {
-            "common_error": CommonErrorRecord.of(self.common_error)
-        }  # fmt: skip
+        shared: dict[str, Any] = (
+            {} if self.common_error is None else {"common_error": CommonErrorRecord.of(self.common_error)}
+        )
         if self.shared_errors:
             shared["shared_errors"] = dict(self.shared_errors)
         return BlockAdjustment(
@@ -306,7 +311,13 @@ class BlockFit:
         columns = json_value([points.measured, self.residuals, self.back_projected])
         rows = zip(points.point, points.image, self.used_rays, *columns, strict=True)
         return tuple(
-            Ray(id=points.ids[point], image=points.images[image], used=bool(used), measured=measured, residual=residual,
-                back_projected=projected)
+            Ray(
+                id=points.ids[point],
+                image=points.images[image],
+                used=bool(used),
+                measured=measured,
+                residual=residual,
+                back_projected=projected,
+            )
             for point, image, used, measured, residual, projected in rows
-        )  # fmt: skip
+        )

@@ -57,7 +57,9 @@ def network_of(fit: BlockFit) -> NetworkRecord:
     return NetworkRecord(
         pairs=tuple(
             ImagePairRecord(
-                first=points.images[first], second=points.images[second], points=int((which.ravel() == k).sum()),
+                first=points.images[first],
+                second=points.images[second],
+                points=int((which.ravel() == k).sum()),
                 angle_deg=np.median(angles[which.ravel() == k]),
             )
             for k, (first, second) in enumerate(found.tolist())
@@ -65,7 +67,7 @@ def network_of(fit: BlockFit) -> NetworkRecord:
         angles=_angles(largest[np.isfinite(largest)]),
         parts=_parts(points.images, found),
         largest_deg=json_value(largest),
-    )  # fmt: skip
+    )
 
 
 def _angles(known: Array) -> Angles | None:

@@ -146,9 +146,13 @@ def run(
 @click.command(cls=Command)
 @click.argument("orthos", metavar="ORTHO...", nargs=-1, required=True, type=click.Path())
 @click.option(
-    "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE",
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False),
+    required=True,
+    metavar="FILE",
     help="The mosaic: .tif (a COG) or .vrt. Its record (.json) and its page (.html) lie beside it.",
-)  # fmt: skip
+)
 @mosaic_options
 @network_option
 @json_option

@@ -53,9 +53,7 @@ def adjust(
     from ortho_pipeline.commands import block as blocks
 
     command = click.get_current_context().meta["command"]
-    result = blocks.adjust(
-        images, folder, points, scene, models=models, match=match, surface=surface, command=command
-    )  # fmt: skip
+    result = blocks.adjust(images, folder, points, scene, models=models, match=match, surface=surface, command=command)
     print_result(result, as_json)
 
 

@@ -27,15 +27,22 @@ from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
     "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="Points: .geojson or .csv."
 )
 @click.option(
-    "--report", type=click.Path(dir_okay=False), metavar="FILE.html",
+    "--report",
+    type=click.Path(dir_okay=False),
+    metavar="FILE.html",
     help="Page to look at the matches: chips, map, residuals; its numbers beside it as .json.",
-)  # fmt: skip
+)
 @scene_options
 @json_option
 def match(
-    image: str, match: MatchOptions, surface: SurfaceOptions, output: str, report: str | None, scene: SceneOptions,
+    image: str,
+    match: MatchOptions,
+    surface: SurfaceOptions,
+    output: str,
+    report: str | None,
+    scene: SceneOptions,
     as_json: bool,
-) -> None:  # fmt: skip
+) -> None:
     """Find control points of IMAGE by matching it with orthoimages of the same place.
 
     Every fifth cell of the image is kept apart to check. The points carry covariances, which 'ortho fit', 'rectify',

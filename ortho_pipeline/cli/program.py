@@ -25,36 +25,54 @@ if TYPE_CHECKING:
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
 #: Every command of the host: the module of this room that holds it, and the first sentence of its help.
 COMMANDS = {
-    "adjust": ("block", "Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a "
-                        "block)."),
+    "adjust": (
+        "block",
+        "Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a block).",
+    ),
     "cache": ("machine.cache", "Show, check or remove what is kept of the network: cells of DEMs."),
     "compare": ("scene.fitting", "Fit many models to the same points of IMAGE and recommend one."),
-    "dem-check": ("scene.heights", "Compare a DEM with check heights: bias, RMSE, NMAD and LE90, also by the slope of "
-                                   "the terrain."),
+    "dem-check": (
+        "scene.heights",
+        "Compare a DEM with check heights: bias, RMSE, NMAD and LE90, also by the slope of the terrain.",
+    ),
     "doctor": ("machine.doctor", "Show what is installed: GDAL, PROJ, geoid grids, plugins."),
-    "edge": ("scene.bands", "Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, "
-                            "width in pixels)."),
-    "export": ("scene.rectifying", "Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps or a "
-                                   "--reference are given."),
-    "fit": ("scene.fitting", "Adjust the model of IMAGE to control points and show every residual (measured minus "
-                             "predicted, pixels)."),
-    "info": ("survey.first_use", "Describe an image: sensor, model and where it was read from, position, ground sample "
-                                 "distance."),
+    "edge": (
+        "scene.bands",
+        "Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, width in pixels).",
+    ),
+    "export": (
+        "scene.rectifying",
+        "Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps or a --reference are given.",
+    ),
+    "fit": (
+        "scene.fitting",
+        "Adjust the model of IMAGE to control points and show every residual (measured minus predicted, pixels).",
+    ),
+    "info": (
+        "survey.first_use",
+        "Describe an image: sensor, model and where it was read from, position, ground sample distance.",
+    ),
     "init": ("survey.first_use", "Write the file of a run over the scenes of FOLDER, with comments, for 'ortho run'."),
-    "intersect": ("block", "Intersect the rays of points that were measured in several IMAGEs: ground coordinates with "
-                           "their sigmas."),
+    "intersect": (
+        "block",
+        "Intersect the rays of points that were measured in several IMAGEs: ground coordinates with their sigmas.",
+    ),
     "match": ("matching", "Find control points of IMAGE by matching it with orthoimages of the same place."),
     "models": ("machine.installed", "List the models that can be fitted to points alone."),
     "mosaic": ("batch", "Make one raster of ORTHOs that lie on one grid, and measure how well they agree."),
     "rectify": ("scene.rectifying", "Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."),
-    "register": ("scene.bands", "Bring single bands IMAGES onto one of them and write one image of all, which opens as "
-                                "the reference did."),
+    "register": (
+        "scene.bands",
+        "Bring single bands IMAGES onto one of them and write one image of all, which opens as the reference did.",
+    ),
     "report": ("scene.rectifying", "Write the plots of a report, each as a picture of its own."),
     "run": ("batch", "Make the orthos of all scenes that PIPELINE.yaml names."),
     "sensors": ("machine.installed", "List the sensors that are installed."),
-    "ties": ("matching", "Find tie points between overlapping IMAGEs: places that two of them or more show, with their "
-                         "covariances."),
-}  # fmt: skip
+    "ties": (
+        "matching",
+        "Find tie points between overlapping IMAGEs: places that two of them or more show, with their covariances.",
+    ),
+}
 
 
 class _Commands(click.Group):

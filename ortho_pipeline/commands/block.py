@@ -112,9 +112,11 @@ def adjust(
         for label, image, own in zip(labels, images, scenes, strict=True)
     }
     fit = adjust_block(
-        {label: start.model for label, start in starts.items()}, table,
-        priors={label: start.priors for label, start in starts.items()}, hold=points.hold,
-    )  # fmt: skip
+        {label: start.model for label, start in starts.items()},
+        table,
+        priors={label: start.priors for label, start in starts.items()},
+        hold=points.hold,
+    )
     notes += relative_to_reference(fit, points, match)
     exported: dict[str, rpc.RpcExport] = {}
     for label in labels:
@@ -187,9 +189,11 @@ def intersect(
     if writer is not None and output is not None:
         write_text(output, writer(rows))
     document = {
-        "points": rows, "sigma0": found.sigma0, **to_document([*notes, *_left_open(found)]),
+        "points": rows,
+        "sigma0": found.sigma0,
+        **to_document([*notes, *_left_open(found)]),
         "median_residual_px": _median_residual(found),
-    }  # fmt: skip
+    }
     return Result(files, document, _intersection_text(document))
 
 
@@ -204,9 +208,11 @@ def _heights(table: BlockPoints) -> tuple[float, float] | None:
 def _own(scene: Any, name: str | None) -> SensorModel:
     if name is not None and name not in scene.models:
         raise InputError(
-            f"this image has no model {name!r}", file=scene.path, field="points.model",
+            f"this image has no model {name!r}",
+            file=scene.path,
+            field="points.model",
             remedy=f"its models are {', '.join(scene.models)}",
-        )  # fmt: skip
+        )
     model: SensorModel = scene.model if name is None else scene.models[name]
     return model
 
@@ -216,9 +222,11 @@ def _own(scene: Any, name: str | None) -> SensorModel:
 
 def _files(labels: Sequence[str], folder: Path) -> dict[str, Path]:
     files = {
-        "report": folder / "block_report.json", "html": folder / "block_report.html",
-        "points": folder / "block_points.geojson", "points-csv": folder / "block_points.csv",
-    }  # fmt: skip
+        "report": folder / "block_report.json",
+        "html": folder / "block_report.html",
+        "points": folder / "block_points.geojson",
+        "points-csv": folder / "block_points.csv",
+    }
     for label in labels:
         files[f"{label} model"] = folder / f"{label}_model.json"
         files[f"{label} rpc"] = folder / f"{label}_RPC.TXT"
@@ -261,9 +269,13 @@ def _record(
     matched = options.ties is not None or match.reference
     asked = {"match": match, "surface": surface} if matched else {}
     whole = provenance(
-        Request(images[0]), first, None, ledgers[0].joined(*ledgers[1:]).hashed(), command,
+        Request(images[0]),
+        first,
+        None,
+        ledgers[0].joined(*ledgers[1:]).hashed(),
+        command,
         {"block": options, "scene": replace(scenes[0], model=None), **asked},
-    )  # fmt: skip
+    )
     return {key: whole[key] for key in ("command", "inputs", "options", "software")}
 
 
@@ -331,9 +343,12 @@ def _write(
         scene = start.scene
         adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **made.adjustment.images[label].to_json()}
         saved = SavedModel(
-            _plain(fit.models[label]), scene.sensor, start.source, (scene.width, scene.height),
+            _plain(fit.models[label]),
+            scene.sensor,
+            start.source,
+            (scene.width, scene.height),
             {**record, "adjustment": adjustment},
-        )  # fmt: skip
+        )
         write_model_file(saved, files[f"{label} model"])
         if label in exported:
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
@@ -352,9 +367,13 @@ def _ground_rows(
     rows = []
     for k, name in enumerate(points.ids):
         row = {
-            "id": name, "role": str(points.roles[k]), "rays": int(rays[k]), "ground": json_position(ground[k]),
-            "sigma": json_position(sigmas[k]), "residual": json_position(residuals[k]),
-        }  # fmt: skip
+            "id": name,
+            "role": str(points.roles[k]),
+            "rays": int(rays[k]),
+            "ground": json_position(ground[k]),
+            "sigma": json_position(sigmas[k]),
+            "residual": json_position(residuals[k]),
+        }
         if angles_deg is not None:
             row["angle_deg"] = json_value(angles_deg[k])
         rows.append(row)

@@ -213,9 +213,11 @@ class Fit:
         }
         if self.common_error is not None:
             found["common_error"] = CommonErrorRecord.of(self.common_error)
-        return Statistics(**found) if self.shared_errors is None else GroupedStatistics(
-            **found, shared_errors=self.shared_errors
-        )  # fmt: skip
+        return (
+            Statistics(**found)
+            if self.shared_errors is None
+            else GroupedStatistics(**found, shared_errors=self.shared_errors)
+        )
 
     def __repr__(self) -> str:
         total = {role: found.total for role in ("control", "check", "loo") if (found := self.rmse(role))}

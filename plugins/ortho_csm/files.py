@@ -66,9 +66,10 @@ def read_csm(path: str | PathLike[str]) -> SensorModel:
     name, _, body = data.partition(b"\n")
     if name.strip() not in [one.encode() for one in _NAMES]:
         raise InputError(
-            f"this is not a CSM state of a line scanner or a frame: it begins with {name[:40]!r}", file=path,
+            f"this is not a CSM state of a line scanner or a frame: it begins with {name[:40]!r}",
+            file=path,
             remedy=REMEDY,
-        )  # fmt: skip
+        )
     fields = parse_json(body, path, REMEDY)
     if not isinstance(fields, dict):
         raise InputError("a state is a JSON object", file=path, remedy=REMEDY)
@@ -99,20 +100,23 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
         again, size = read_frame(State(fields, "state")), (model.interior.width, model.interior.height)
     else:
         raise InputError(
-            f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one", field="formats",
+            f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one",
+            field="formats",
             remedy=Text(
-                "take a rigorous model, adjusted by its own parameters (", Setting("points.correction", "model"),
-                "), or another format"
+                "take a rigorous model, adjusted by its own parameters (",
+                Setting("points.correction", "model"),
+                "), or another format",
             ),
-        )  # fmt: skip
+        )
     # What refraction does at other heights a state cannot have: stated, but no reason to refuse it.
     middle = _apart(model, again, size, (model.reference_height - 1.0, model.reference_height + 1.0))
     worst = max(middle, _apart(model, again, size, model.height_range))
     if not middle <= CLOSE and not force:
         raise InputError(
-            f"the state would be {middle:.2g} px off the model, whose lens it cannot have", field="formats",
+            f"the state would be {middle:.2g} px off the model, whose lens it cannot have",
+            field="formats",
             remedy=Text("accept it with ", Setting("force"), ", or write an RPC"),
-        )  # fmt: skip
+        )
     return f"{name}\n{json.dumps({'m_modelName': name, **fields}, indent=2, sort_keys=True)}\n", worst
 
 

@@ -61,9 +61,11 @@ class Record:
             if len({entry.value for entry in found}) > 1:
                 lines = ", ".join(str(entry.line) for entry in found)
                 raise InputError(
-                    f"this key stands in lines {lines} with different values", file=self.file,
-                    field=f"{self.name}: {key}", remedy="remove the wrong one",
-                )  # fmt: skip
+                    f"this key stands in lines {lines} with different values",
+                    file=self.file,
+                    field=f"{self.name}: {key}",
+                    remedy="remove the wrong one",
+                )
             if found:
                 return found[0].value
         return None
@@ -98,9 +100,11 @@ class Record:
         value = self.number(*keys, units=units, low=0, high=1e7)
         if value is not None and value != int(value):
             raise InputError(
-                f"{value} is not whole number", file=self.file, field=f"{self.name}: {keys[0]}",
+                f"{value} is not whole number",
+                file=self.file,
+                field=f"{self.name}: {keys[0]}",
                 remedy="correct the file",
-            )  # fmt: skip
+            )
         return None if value is None else int(value)
 
 
@@ -188,12 +192,15 @@ class Delivery:
             known = ", ".join(one.component for one in self.components[:10])
             problem = "no component" if not found else "more than one component"
             raise InputError(
-                f"{problem} is called {name} (there are {known or 'none'})" if name is not None
+                f"{problem} is called {name} (there are {known or 'none'})"
+                if name is not None
                 else f"the name of the image does not say which component it is (there are {known or 'none'})",
-                file=self.file, field=f"{COMPONENTS}: Component ID",
-                remedy="give the metadata file that belongs to this image" if name is not None
+                file=self.file,
+                field=f"{COMPONENTS}: Component ID",
+                remedy="give the metadata file that belongs to this image"
+                if name is not None
                 else "name the image po_<order>_<band>_<component of 7 digits>.tif",
-            )  # fmt: skip
+            )
         return found[0]
 
     def source_of(self, component: Component) -> SourceImage:
@@ -209,8 +216,10 @@ class Delivery:
             raise InputError(
                 f"component {component.component} is of product image {component.product_image}, which "
                 f"{'no source image has' if not found else 'several source images have'}",
-                file=self.file, field=f"{SOURCES}: Product Image ID", remedy="ask for the whole metadata file",
-            )  # fmt: skip
+                file=self.file,
+                field=f"{SOURCES}: Product Image ID",
+                remedy="ask for the whole metadata file",
+            )
         return found[0]
 
 
@@ -314,9 +323,11 @@ def _sections(path: str, text: str) -> dict[str, list[Record]]:
         number, title = block[0][0], " ".join(block[0][1].split())
         if title in sections:
             raise InputError(
-                f"this section stands there twice, again in line {number}", file=path, field=title[:60],
+                f"this section stands there twice, again in line {number}",
+                file=path,
+                field=title[:60],
                 remedy="remove one of them",
-            )  # fmt: skip
+            )
         sections[title] = _split(path, title, list(_entries(iter(block[1:]))))
     return sections
 
@@ -345,9 +356,11 @@ def _split(path: str, title: str, entries: list[Entry]) -> list[Record]:
 def _records(path: str | PathLike[str], sections: dict[str, list[Record]], title: str) -> list[Record]:
     if title not in sections:
         raise InputError(
-            "this section is missing", file=path, field=title,
+            "this section is missing",
+            file=path,
+            field=title,
             remedy="give the whole _metadata.txt of the delivery; a file that was cut off lacks the last sections",
-        )  # fmt: skip
+        )
     return sections[title]
 
 
@@ -366,8 +379,10 @@ def _check_counts(path: str | PathLike[str], sections: dict[str, list[Record]], 
         if found == 0 or (stated is not None and stated != found):
             raise InputError(
                 f"{found} are described, {'at least one' if stated is None else stated} should be",
-                file=path, field=f"{title}: {key}", remedy="the file is cut off or was edited: copy it again",
-            )  # fmt: skip
+                file=path,
+                field=f"{title}: {key}",
+                remedy="the file is cut off or was edited: copy it again",
+            )
 
 
 # -- meaning ---------------------------------------------------------------------------------------------------------
@@ -402,9 +417,11 @@ def _identity(record: Record, *keys: str) -> str:
     value = record.text(*keys)
     if value is None:
         raise InputError(
-            "this key is missing", file=record.file, field=f"{record.name}: {keys[0]}",
+            "this key is missing",
+            file=record.file,
+            field=f"{record.name}: {keys[0]}",
             remedy="it links components with acquisitions: give the whole metadata file",
-        )  # fmt: skip
+        )
     return value
 
 
@@ -414,13 +431,18 @@ def _placement(record: Record) -> Placement:
     dx = record.number("Pixel Size X", units=METRES, low=0.01, high=1000)
     dy = record.number("Pixel Size Y", units=METRES, low=0.01, high=1000)
     columns, rows = record.count("Columns"), record.count("Rows")
-    for first, second, key in ((x, y, "UL Map X, UL Map Y"), (dx, dy, "Pixel Size X, Pixel Size Y"),
-                               (columns, rows, "Columns, Rows")):  # fmt: skip
+    for first, second, key in (
+        (x, y, "UL Map X, UL Map Y"),
+        (dx, dy, "Pixel Size X, Pixel Size Y"),
+        (columns, rows, "Columns, Rows"),
+    ):
         if (first is None) != (second is None):
             raise InputError(
-                "one of the two is missing", file=record.file, field=f"{record.name}: {key}",
+                "one of the two is missing",
+                file=record.file,
+                field=f"{record.name}: {key}",
                 remedy="the file is cut off or was edited: copy it again",
-            )  # fmt: skip
+            )
     return Placement(
         upper_left=None if x is None or y is None else (x, y),
         pixel=None if dx is None or dy is None else (dx, dy),
@@ -447,7 +469,9 @@ def _projection(order: Record) -> tuple[str | None, str | None]:
     zone, hemisphere = order.count("Zone Number", "Zone", units=("",)), (order.text("Hemisphere") or "").upper()[:1]
     if zone is None or not 1 <= zone <= 60 or hemisphere not in ("N", "S"):
         raise InputError(
-            f"zone {zone} {hemisphere or '(no hemisphere)'} is not a UTM zone", file=order.file,
-            field=f"{order.name}: UTM Specific Parameters", remedy="Zone Number 1 to 60, Hemisphere N or S",
-        )  # fmt: skip
+            f"zone {zone} {hemisphere or '(no hemisphere)'} is not a UTM zone",
+            file=order.file,
+            field=f"{order.name}: UTM Specific Parameters",
+            remedy="Zone Number 1 to 60, Hemisphere N or S",
+        )
     return shown, f"EPSG:{(32600 if hemisphere == 'N' else 32700) + zone}"

@@ -92,9 +92,10 @@ def bands_of(image: ImageFile, wanted: str) -> tuple[Path, ...]:
     if missing or image.band not in names:
         raise InputError(
             f"there is no band {missing[0]!r} beside it" if missing else f"band {image.band!r} is not one of them",
-            file=image.path, field="bands",
+            file=image.path,
+            field="bands",
             remedy=f"all, one, or some of {', '.join(sorted(there))} with the band of this image among them",
-        )  # fmt: skip
+        )
     return tuple(there[name] for name in names)
 
 
@@ -179,16 +180,19 @@ def _factor(stated: Placement, size: tuple[int, int], path: Path, own_pixel: tup
         abs(whole - factor * part) < factor for whole, part in zip(stated.size, size, strict=True)
     )
     if own_pixel is not None and stated.pixel is not None:
-        fits &= all(math.isclose(own, factor * one, rel_tol=1e-3)
-                    for own, one in zip(own_pixel, stated.pixel, strict=True))  # fmt: skip
+        fits &= all(
+            math.isclose(own, factor * one, rel_tol=1e-3) for own, one in zip(own_pixel, stated.pixel, strict=True)
+        )
     else:
         image = ImageFile.of(path)
         fits &= factor == COARSER and not (image is not None and image.grid == "pan")
     if not fits:
         raise InputError(
             f"the image has {size[0]} x {size[1]} pixels, the metadata are of {stated.size[0]} x {stated.size[1]}",
-            file=path, field="Columns, Rows", remedy="give the whole image as delivered, and its own metadata",
-        )  # fmt: skip
+            file=path,
+            field="Columns, Rows",
+            remedy="give the whole image as delivered, and its own metadata",
+        )
     return factor
 
 

@@ -168,8 +168,11 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
     for field, text in (("crs", crs), ("vertical", vertical or "ellipsoid")):
         # What else PROJ understands may name files, and a page opens none.
         if not re.fullmatch(_NAMED, text.strip(), re.ASCII | re.IGNORECASE):
-            raise InputError("this is not known by that name", field=field,
-                             remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008")  # fmt: skip
+            raise InputError(
+                "this is not known by that name",
+                field=field,
+                remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008",
+            )
     if len(values) != 3 or values[0] is None or values[1] is None:
         raise InputError("ground has x and y, and a height or none", field="ground")
     plane = horizontal(parse_crs(crs))

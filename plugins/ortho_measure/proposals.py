@@ -130,10 +130,16 @@ def proposal_of(places: Places, click: Array | None, ground: Array | None, radiu
             on_ground = places.ground_of([click + found.shift])[0]
     reason = found.reason or ("" if np.isfinite(on_ground).all() else "the heights do not reach here")
     (column, both), (_, row) = found.covariance
-    told: dict[str, Any] = json_value({
-        "image": json_position(place), "ground": json_position(on_ground), "score": found.score,
-        "covariance": json_position([column, row, both]), "scattered": found.scattered, "reason": reason,
-    })  # fmt: skip
+    told: dict[str, Any] = json_value(
+        {
+            "image": json_position(place),
+            "ground": json_position(on_ground),
+            "score": found.score,
+            "covariance": json_position([column, row, both]),
+            "scattered": found.scattered,
+            "reason": reason,
+        }
+    )
     return told
 
 

@@ -93,14 +93,15 @@ class Session(Project):
     def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
         for mark in marks:
             if mark.rays or mark.role == "tie":
-                raise InputError("there is one image, and this is a point of several", field="rays",
-                                 remedy="load the page anew")  # fmt: skip
+                raise InputError(
+                    "there is one image, and this is a point of several", field="rays", remedy="load the page anew"
+                )
 
     def _solve(self) -> None:
         marks = self._history.marks
         self._solution = solve(
             self.scene, marks.points(self._called), self._request, self.places.surface, marks.correction
-        )  # fmt: skip
+        )
         if moved(self.rendered[-1], self._solution.model, self.grid.everywhere):
             self.rendered = [*self.rendered, self._solution.model]
 
@@ -178,14 +179,24 @@ class Session(Project):
             correction = self.marks.correction or self._request.points.correction
         # The saved points say themselves where they are and which of them check.
         points = replace(
-            self._request.points, gcps=self.output, crs=None, vertical=None, pixel_origin="corner", check=None,
-            select=None, correction=correction,
-        )  # fmt: skip
+            self._request.points,
+            gcps=self.output,
+            crs=None,
+            vertical=None,
+            pixel_origin="corner",
+            check=None,
+            select=None,
+            correction=correction,
+        )
         with confined(self.output.parent):
             return rectify(
-                self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._request.scene,
-                points=points, surface=self._request.surface, progress=progress,
-            )  # fmt: skip
+                self.scene.path,
+                self.output.with_name(f"{self.output.stem}_ortho"),
+                scene=self._request.scene,
+                points=points,
+                surface=self._request.surface,
+                progress=progress,
+            )
 
     def _radius(self, click: Array | None) -> float:
         """Return within how many px of the prediction a click is looked for."""
@@ -219,8 +230,11 @@ def open_session(
     """
     path = points_file(output)
     if points.fit_model is not None:
-        raise InputError("the reference is shown by the scene's own model", field="points.fit_model",
-                         remedy="leave it out, and fit the model to the saved points")  # fmt: skip
+        raise InputError(
+            "the reference is shown by the scene's own model",
+            field="points.fit_model",
+            remedy="leave it out, and fit the model to the saved points",
+        )
     require_heights(surface)
     request = Request(image, scene, points, surface, match)
     opened = open_by_evidence(request)

@@ -78,27 +78,37 @@ def figures(solution: Solution, surface: Surface) -> dict[str, Any]:
     residuals_m, tests = in_metres(fit, fit.residuals), normalised_residuals(fit)
     points = {
         name: {
-            "residual": json_position(fit.residuals[k]), "residual_m": json_position(residuals_m[k]),
-            "loo": json_position(fit.loo_residuals[k]), "predicted": json_position(fit.predicted[k]),
-            "used": bool(fit.used[k]), "w": json_value(tests[k]),
+            "residual": json_position(fit.residuals[k]),
+            "residual_m": json_position(residuals_m[k]),
+            "loo": json_position(fit.loo_residuals[k]),
+            "predicted": json_position(fit.predicted[k]),
+            "used": bool(fit.used[k]),
+            "w": json_value(tests[k]),
             "suspicious": bool(tests[k] ** 2 > -2 * math.log(SUSPICIOUS)),
         }
         for k, name in enumerate(fit.points.ids)
-    }  # fmt: skip
+    }
     for name, reason in fit.rejected:
         points[name] |= {"suspicious": True, "reason": reason}
     for one in fit.outlying:
         points[one.id] |= {"suspicious": True, "reason": one.reason}
     return {
-        "error": "", "model": fit.model_name, "points": points, "headline": _headline(fit),
-        "parameters": json_value({
-            name: {"value": value, "sigma": sigma}
-            for name, value, sigma in zip(fit.param_names, fit.values, fit.sigmas, strict=True)
-        }),
-        "rmse": fit.rmses.given(), "rmse_m": rmse_metres(fit).given(), "sigma0": fit.sigma0,
+        "error": "",
+        "model": fit.model_name,
+        "points": points,
+        "headline": _headline(fit),
+        "parameters": json_value(
+            {
+                name: {"value": value, "sigma": sigma}
+                for name, value, sigma in zip(fit.param_names, fit.values, fit.sigmas, strict=True)
+            }
+        ),
+        "rmse": fit.rmses.given(),
+        "rmse_m": rmse_metres(fit).given(),
+        "sigma0": fit.sigma0,
         "redundancy": fit.redundancy,
         "notices": [str(one) for one in solution.adjusted.warnings(surface)],
-    }  # fmt: skip
+    }
 
 
 def normalised_residuals(fit: Fit) -> Array:

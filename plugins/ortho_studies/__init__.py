@@ -14,6 +14,7 @@ def ortho_commands() -> Iterable[Subcommand]:
     """Add `ortho simulate` and `ortho reproduce`."""
     yield Subcommand("simulate", "Make scenes of known truth.", "ortho_studies.cli:simulate")
     yield Subcommand(
-        "reproduce", "Compute the tables of the papers that this package implements, beside the papers' numbers.",
+        "reproduce",
+        "Compute the tables of the papers that this package implements, beside the papers' numbers.",
         "ortho_studies.cli:reproduce",
-    )  # fmt: skip
+    )

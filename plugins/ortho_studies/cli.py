@@ -74,9 +74,12 @@ def _experiment(study: Study) -> click.Command:
         "--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page."
     )
     @click.option(
-        "--realisations", type=click.IntRange(min=1), default=study.realisations, show_default=True,
+        "--realisations",
+        type=click.IntRange(min=1),
+        default=study.realisations,
+        show_default=True,
         help="How often noise is drawn.",
-    )  # fmt: skip
+    )
     @json_option
     def run(folder: str | None, realisations: int, as_json: bool) -> None:
         from ortho_studies import studies
@@ -100,9 +103,14 @@ def _option(option: StudyOption) -> Any:
         of_range: Any = click.IntRange if kind is int else click.FloatRange
         kind = of_range(option.low, option.high)
     return click.option(
-        flag, option.name, type=kind, default=option.default, show_default=shown, metavar=option.unit or None,
+        flag,
+        option.name,
+        type=kind,
+        default=option.default,
+        show_default=shown,
+        metavar=option.unit or None,
         help=option.help,
-    )  # fmt: skip
+    )
 
 
 def _help(study: Study, group: str) -> str | None:

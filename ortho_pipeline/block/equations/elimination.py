@@ -49,10 +49,18 @@ class Elimination:
 
         linear, ordering = self.linear, self.linear.ordering
         return point_kernel.Rows(
-            ordering.rays, ordering.starts, ordering.numbers, ordering.known, ordering.image,
-            linear.problem.levels.pairs.slot, linear.by_params, linear.by_point, linear.ground_by_point,
-            linear.misfits.rays, linear.misfits.ground,
-        )  # fmt: skip
+            ordering.rays,
+            ordering.starts,
+            ordering.numbers,
+            ordering.known,
+            ordering.image,
+            linear.problem.levels.pairs.slot,
+            linear.by_params,
+            linear.by_point,
+            linear.ground_by_point,
+            linear.misfits.rays,
+            linear.misfits.ground,
+        )
 
     @property
     def _parts(self) -> list[tuple[int, int]]:

@@ -283,8 +283,10 @@ def _spread(rows, t, fresh, blocks, point, whole, product, inner):
         for k in range(columns):
             value = turned[c, k]
             inner[c, 0], inner[c, 1], inner[c, 2] = (
-                inner[c, 0] + value * east[k], inner[c, 1] + value * north[k], inner[c, 2] + value * up[k],
-            )  # fmt: skip
+                inner[c, 0] + value * east[k],
+                inner[c, 1] + value * north[k],
+                inner[c, 2] + value * up[k],
+            )
     return size
 
 

@@ -73,7 +73,7 @@ def compare(
     command = click.get_current_context().meta["command"]
     result = commands.compare(
         image, points, models=models, folder=folder, scene=scene, surface=surface, match=match, command=command
-    )  # fmt: skip
+    )
     if as_json:
         return print_json(result.to_json())
     return print_comparison(result, units)

@@ -123,7 +123,7 @@ def export(
     given: dict[str, Any] = {"formats": chosen} if chosen else {}
     result = commands.export(
         image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **given
-    )  # fmt: skip
+    )
     print_result(result, as_json)
 
 

@@ -79,11 +79,11 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         "Pixel": f"{document['gsd_m']:.3g} m at {document['reference_height']:.0f} m",
         "View": view_text(document["view"]),
         "UTM": document["utm"],
-        "Corners": "lon,lat " + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
-                                          document["corners_lon_lat"]),
+        "Corners": "lon,lat "
+        + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in document["corners_lon_lat"]),
         **({"Belongs to": ", ".join(document["same_acquisition"])} if document["same_acquisition"] else {}),
         **{name: str(value) for name, value in document["facts"].items()},
-    }  # fmt: skip
+    }
     for name, value in lines.items():
         say(f"{name:<10} {value}")
     print_warnings(document["warnings"])
@@ -95,7 +95,8 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
     option = FLAGS[document["option"]]
     lines = {
         "Raster": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
-        "Looks like": "a DEM: one band of numbers with a sign, on a map" if dem
+        "Looks like": "a DEM: one band of numbers with a sign, on a map"
+        if dem
         else "an orthoimage or another raster on a map; it has no sensor model",
         "Bands": f"{document['bands']}, {document['type']}, nodata {document['nodata']}",
         "CRS": document["crs"],
@@ -103,7 +104,7 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
         "Pixel": "{:.6g} x {:.6g} ".format(*document["pixel"]) + document["unit"],
         "Extent": " ".join(f"{value:.10g}" for value in document["extent"]),
         "Use it as": f"{option} {document['image']}" + (" --dem-vertical DATUM" * (dem and not document["vertical"])),
-    }  # fmt: skip
+    }
     for name, value in lines.items():
         say(f"{name:<10} {value}")
 
@@ -180,8 +181,14 @@ def next_steps(seen: Survey) -> list[str]:
 
 @click.command(cls=Command)
 @click.argument("folder", type=click.Path(file_okay=False))
-@click.option("--output", "-o", "path", type=click.Path(dir_okay=False), metavar="FILE",
-              help="Where to  [default: pipeline.yaml in the folder]")  # fmt: skip
+@click.option(
+    "--output",
+    "-o",
+    "path",
+    type=click.Path(dir_okay=False),
+    metavar="FILE",
+    help="Where to  [default: pipeline.yaml in the folder]",
+)
 @click.option("--overwrite", is_flag=True, help="Replace the file if it is there.")
 @scene_options
 @json_option

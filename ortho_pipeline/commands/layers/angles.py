@@ -29,8 +29,11 @@ def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
     """
     if not output.angles:
         if output.sun is not None:
-            raise InputError("only the angles depend on the sun", field="output.sun",
-                             remedy=Text("give ", Setting("output.angles"), " too, or leave it out"))  # fmt: skip
+            raise InputError(
+                "only the angles depend on the sun",
+                field="output.sun",
+                remedy=Text("give ", Setting("output.angles"), " too, or leave it out"),
+            )
         return None
     from ortho_pipeline.warp.quality.angles import Sun
 
@@ -59,16 +62,23 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
     resources = Resources(output.memory, output.threads)
     size = placed.scene.width, placed.scene.height
     found = angles.write_angles(
-        sight, placed.surface, size, files["angles"], heights=heights, step=output.layer_step, sun=sun,
+        sight,
+        placed.surface,
+        size,
+        files["angles"],
+        heights=heights,
+        step=output.layer_step,
+        sun=sun,
         resources=resources,
-    )  # fmt: skip
+    )
     layer = AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
     write_text(files["angles_style"], angles_style(layer))
     if sun is None:
         del files["shadow"]
         return layer
-    share = angles.write_shadows(sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources,
-                                 driver=output.format)  # fmt: skip
+    share = angles.write_shadows(
+        sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources, driver=output.format
+    )
     return AnglesLayer(
         view_zenith_deg=found.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
     )

@@ -71,17 +71,27 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     datum = 0.0 if surface.sigma is None else _datum(surface)
     apart, unstated = _reference(fit.warnings, placed.scene.adjusted)
     budget = Budget(covariance=covariance, stated=stated, heights=surface.sigma, datum=datum, reference=apart)
-    unknown = [name for name, missing in (("model", not budget.knows_model), ("heights", surface.sigma is None),
-                                          ("reference", unstated)) if missing]  # fmt: skip
+    unknown = [
+        name
+        for name, missing in (
+            ("model", not budget.knows_model),
+            ("heights", surface.sigma is None),
+            ("reference", unstated),
+        )
+        if missing
+    ]
     if not budget.knows_model and surface.sigma is None:
         raise InputError(
             "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
             field="output.accuracy_raster",
             remedy=Text(
-                "give ", Setting("surface.sigma"), ", or control points with ", Setting("points.gcps"),
-                ", or leave it out"
+                "give ",
+                Setting("surface.sigma"),
+                ", or control points with ",
+                Setting("points.gcps"),
+                ", or leave it out",
             ),
-        )  # fmt: skip
+        )
     assumed = _assumptions(budget, surface)
     if output.fill_from is not None:
         assumed.append(
@@ -90,8 +100,11 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None, _common(placed))
     if not unknown:
         return known, []
-    names = {"model": "the model", "heights": Text("the heights (", Setting("surface.sigma"), ")"),
-             "reference": Text("the reference (", Setting("match.reference_sigma"), ")")}  # fmt: skip
+    names = {
+        "model": "the model",
+        "heights": Text("the heights (", Setting("surface.sigma"), ")"),
+        "reference": Text("the reference (", Setting("match.reference_sigma"), ")"),
+    }
     said = Text.joined(" and of ", (names[name] for name in unknown))
     text = Text(
         "the raster of accuracy knows nothing of the errors of ", said, ": its figures are the least that there is"
@@ -175,9 +188,11 @@ def _common(placed: Placement) -> float:
 
 
 def _assumptions(budget: Budget, surface: Surface) -> list[str]:
-    said = ["errors of the model, of the heights and of the reference are independent of each other",
-            "the model follows the scene but for its parameters",
-            "an error is where the ortho shows a point, at its height, less where that is"]  # fmt: skip
+    said = [
+        "errors of the model, of the heights and of the reference are independent of each other",
+        "the model follows the scene but for its parameters",
+        "an error is where the ortho shows a point, at its height, less where that is",
+    ]
     if budget.datum:
         said.insert(1, f"the height datum is good to {metres(budget.datum)}")
     if budget.stated is not None:
@@ -208,15 +223,22 @@ def write_layers(
     budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
     scene, output = placed.scene, placed.request.output
     found = write_accuracy(
-        budget, Sight(placed.model, placed.grid), placed.surface, (scene.width, scene.height), files["accuracy"],
-        heights=placed.footprint.heights, step=output.layer_step, resources=Resources(output.memory, output.threads),
+        budget,
+        Sight(placed.model, placed.grid),
+        placed.surface,
+        (scene.width, scene.height),
+        files["accuracy"],
+        heights=placed.footprint.heights,
+        step=output.layer_step,
+        resources=Resources(output.memory, output.threads),
         metadata={"ASSUMPTIONS": "; ".join(known.assumptions), "UNKNOWN": ", ".join(known.unknown) or "nothing"},
-    )  # fmt: skip
+    )
     if not found.known:
         raise InputError(
-            "the standard deviations of the heights reach no pixel of the ortho", field="surface.sigma",
+            "the standard deviations of the heights reach no pixel of the ortho",
+            field="surface.sigma",
             remedy="give a raster of this place, or a number",
-        )  # fmt: skip
+        )
     layer = _record(found, known, output.layer_step)
     write_text(files["accuracy_style"], accuracy_style(layer))
     return layer
@@ -230,15 +252,21 @@ def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
     by = "points" if known.adjusted else "model"
     common = min(known.common / max(sum(sigma**2 for sigma in found.sigma), 1e-300), shares["model"])
     return AccuracyLayer(
-        ce90_m=found.ce90, range_m=found.quantiles, sigma_m=found.sigma,
+        ce90_m=found.ce90,
+        range_m=found.quantiles,
+        sigma_m=found.sigma,
         shares={
-            by: shares["model"] - common + even * part, "heights": shares["heights"],
+            by: shares["model"] - common + even * part,
+            "heights": shares["heights"],
             "reference": even * (1.0 - part) + common,
             "interpolation": shares["interpolation"],
         },
-        unknown=known.unknown, known=found.known, assumptions=known.assumptions, cell=found.cell * step,
+        unknown=known.unknown,
+        known=found.known,
+        assumptions=known.assumptions,
+        cell=found.cell * step,
         cells=tuple(tuple(row) for row in json_value(_rounded(found.cells))),
-    )  # fmt: skip
+    )
 
 
 def _rounded(values: Array) -> list[list[float]]:

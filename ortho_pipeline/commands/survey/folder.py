@@ -104,9 +104,10 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
     names = list(islice(_files(place, _DEPTH), _MOST + 1))
     if len(names) > _MOST:
         raise InputError(
-            f"more than {_MOST} files lie here", file=folder, remedy="give the folder of one delivery, or write the "
-            "file of the run by hand (docs/run.md)",
-        )  # fmt: skip
+            f"more than {_MOST} files lie here",
+            file=folder,
+            remedy="give the folder of one delivery, or write the file of the run by hand (docs/run.md)",
+        )
     found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
     return Survey(place, tuple(_without_parts(found)))
 
@@ -189,9 +190,10 @@ def _without_parts(found: list[SurveyedFile]) -> list[SurveyedFile]:
     """Leave out what opens as the same image as another file: the metadata beside it."""
     scenes = {Path(one.path).with_suffix("") for one in found if one.kind == "scene" and not one.path.endswith(".xml")}
     return [
-        one for one in found
+        one
+        for one in found
         if not (one.path.lower().endswith(".xml") and (one.kind != "scene" or Path(one.path).with_suffix("") in scenes))
-    ]  # fmt: skip
+    ]
 
 
 def _short(source: str) -> str:

@@ -49,12 +49,12 @@ def init(
     if not seen.of("scene"):
         raise InputError(
             "no image with a model lies here", file=folder, remedy="put the metadata (RPC, DIMAP, .IMD ...) beside it"
-        )  # fmt: skip
+        )
     prefix = os.path.relpath(Path(folder).resolve(), target.resolve().parent)
     if prefix.startswith(os.pardir):
         raise InputError(
             "the file of a run lies in the folder of its scenes or above it", file=target, remedy="give such a name"
-        )  # fmt: skip
+        )
     write_text(target, text(seen, prefix))
     skipped = [one for one in seen.found if one.kind == "image"]
     lines = [counted(len(seen.of("scene")), "scene")]

@@ -95,9 +95,15 @@ def gallery(report: SceneReport, matches: Matches) -> Gallery | None:
     picture = _picture(matches, [k for k, _ in order])
     tiles = [_tile(matches, k, one, place) for place, (k, one) in enumerate(order)]
     return Gallery(
-        tuple(tiles[: len(worst)]), tuple(tiles[len(worst) :]), base64.b64encode(png_bytes(picture)).decode(),
-        (picture.shape[2], picture.shape[1]), matches.scene.shape[1], matches.factor, len(kept), len(rejected),
-    )  # fmt: skip
+        tuple(tiles[: len(worst)]),
+        tuple(tiles[len(worst) :]),
+        base64.b64encode(png_bytes(picture)).decode(),
+        (picture.shape[2], picture.shape[1]),
+        matches.scene.shape[1],
+        matches.factor,
+        len(kept),
+        len(rejected),
+    )
 
 
 def _score(one: MatchPoint) -> float:

@@ -75,8 +75,9 @@ class BlockGrid:
             fresh, fresh_there = (~shown_by(scenes[:number], part, GROUND_CRS) for part in (ground, everywhere))
             if references:
                 fresh &= shown_by(references, ground, GROUND_CRS)
-            parts.append((np.column_stack([np.full(fresh.sum(), number), image[fresh]]), ground[fresh],
-                          everywhere[fresh_there]))  # fmt: skip
+            parts.append(
+                (np.column_stack([np.full(fresh.sum(), number), image[fresh]]), ground[fresh], everywhere[fresh_there])
+            )
         chosen, ground, everywhere = (np.concatenate(part) for part in zip(*parts, strict=True))
         seen, there = (_seen(scenes, part) for part in (ground, everywhere))
         reach = SIDE / 2 * metres_per_pixel(images[0].view)
@@ -87,8 +88,9 @@ class BlockGrid:
         here, points = self.plan(self.ground), self.plan(taken)
         points = points[np.isfinite(points).all(axis=1)]
         kept = ~(np.abs(here[:, None] - points).max(axis=2) < self.reach).any(axis=1)
-        return replace(self, number=self.number[kept], image=self.image[kept], ground=self.ground[kept],
-                       seen=self.seen[kept])  # fmt: skip
+        return replace(
+            self, number=self.number[kept], image=self.image[kept], ground=self.ground[kept], seen=self.seen[kept]
+        )
 
     def plan(self, ground: Array) -> Array:
         """Return ground ``(k, 3)`` east and north (m) of the middle of the block."""

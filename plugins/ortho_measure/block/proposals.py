@@ -88,11 +88,17 @@ class Pair:
         place = self.second.image_of(local.ground_of(image[None] + found.shift))[0]
         # The error of a match is that of both chips, half and half.
         own = found.covariance / 2
-        told: dict[str, Any] = json_value({
-            "seen": True, "reason": "" if np.isfinite(place).all() else "the heights do not reach here",
-            "image": json_position(place), "covariance": _three(jacobian @ own @ jacobian.T), "own": _three(own),
-            "score": found.score, "scattered": found.scattered,
-        })  # fmt: skip
+        told: dict[str, Any] = json_value(
+            {
+                "seen": True,
+                "reason": "" if np.isfinite(place).all() else "the heights do not reach here",
+                "image": json_position(place),
+                "covariance": _three(jacobian @ own @ jacobian.T),
+                "own": _three(own),
+                "score": found.score,
+                "scattered": found.scattered,
+            }
+        )
         return told
 
 
@@ -150,9 +156,11 @@ class TieSearch:
                 if rays[label]["image"] is not None:
                     own.append(rays[label]["own"])
         rays[labels[number]] = {
-            "seen": True, "reason": "", "image": click.tolist(),
+            "seen": True,
+            "reason": "",
+            "image": click.tolist(),
             "covariance": np.mean(own, axis=0).tolist() if own else None,
-        }  # fmt: skip
+        }
         ground = proposal_of(self.places[number], click, None, self.reaches[number]) if self.referenced else None
         return {"rays": json_value(rays), "ground": ground}
 

@@ -76,10 +76,15 @@ class BlockSession(Project):
     rendered: list[tuple[SensorModel, ...]]
 
     def __init__(
-        self, images: BlockImages, references: tuple[Reference, ...], output: Path, options: BlockOptions,
-        opened: Sequence[SceneOptions] = (), match: MatchOptions = MatchOptions(),
+        self,
+        images: BlockImages,
+        references: tuple[Reference, ...],
+        output: Path,
+        options: BlockOptions,
+        opened: Sequence[SceneOptions] = (),
+        match: MatchOptions = MatchOptions(),
         heights: SurfaceOptions = SurfaceOptions(),
-    ) -> None:  # fmt: skip
+    ) -> None:
         surface = images.places[0].surface
         maps = [Sheet(one, surface) for one in references]
         super().__init__(output, surface, [one.view for one in images.places], maps)
@@ -110,9 +115,12 @@ class BlockSession(Project):
     # -- as any project ----------------------------------------------------------------------------------------------
 
     def _identity(self) -> dict[str, Any]:
-        return {"images": [
-            {"name": name, "size": list(view.size)} for name, view in zip(self.images.names, self.views, strict=True)
-        ]}  # fmt: skip
+        return {
+            "images": [
+                {"name": name, "size": list(view.size)}
+                for name, view in zip(self.images.names, self.views, strict=True)
+            ]
+        }
 
     def _source(self) -> dict[str, Any] | None:
         path = self._options.points
@@ -175,8 +183,9 @@ class BlockSession(Project):
         return len(self.rendered) - 1
 
     def _figures(self) -> dict[str, Any]:
-        relative = any(mark.ground_from == "reference" and mark.role != "tie" and mark.counts
-                       for mark in self.marks.by_id.values())  # fmt: skip
+        relative = any(
+            mark.ground_from == "reference" and mark.role != "tie" and mark.counts for mark in self.marks.by_id.values()
+        )
         return {"correction": self.marks.correction, **figures(self._solution, relative)}
 
     def _ahead(self) -> list[Next]:
@@ -243,9 +252,14 @@ class BlockSession(Project):
     def _asked(self) -> BlockOptions:
         """Return how `ortho adjust` is asked for the same with the saved points, which say all of themselves."""
         return replace(
-            self._options, points=self.output, crs=None, vertical=None, pixel_origin="corner", check=None,
+            self._options,
+            points=self.output,
+            crs=None,
+            vertical=None,
+            pixel_origin="corner",
+            check=None,
             correction=self.marks.correction or self._options.correction,
-        )  # fmt: skip
+        )
 
     def compared(self) -> dict[str, Any]:
         """Return the corrections compared on the points as they are now."""
@@ -272,8 +286,16 @@ class BlockSession(Project):
 def _nothing() -> Points:
     """Return a table without points."""
     none = np.zeros(0)
-    return Points((), none.reshape(0, 2), none.reshape(0, 3), none.astype("<U7"), none, none.reshape(0, 3),
-                  horizontal(parse_crs(GROUND_CRS)), "")  # fmt: skip
+    return Points(
+        (),
+        none.reshape(0, 2),
+        none.reshape(0, 3),
+        none.astype("<U7"),
+        none,
+        none.reshape(0, 3),
+        horizontal(parse_crs(GROUND_CRS)),
+        "",
+    )
 
 
 def open_block_session(
@@ -313,9 +335,8 @@ def open_block_session(
     bands = match.reference_bands or ()
     references = open_references(match.reference, bands, **access) if match.reference else ()
     places = tuple(
-        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights),
-               references)
+        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights), references)
         for one in scenes
-    )  # fmt: skip
+    )
     known = BlockImages(tuple(os.fspath(image) for image in images), tuple(labels), tuple(names), scenes, places)
     return BlockSession(known, references, path, points, given, match, surface)

@@ -46,7 +46,7 @@ class BlockSolution:
 
 def solve(
     starts: Mapping[str, Start], points: BlockPoints, hold: float | None, *, robust: bool = True
-) -> BlockSolution:  # fmt: skip
+) -> BlockSolution:
     """Adjust images and points as `ortho adjust` does; where not `robust`, gross errors are left in."""
     models = {label: start.model for label, start in starts.items()}
     if not len(points):
@@ -74,12 +74,16 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     table, sigmas = fit.points, fit.ground_sigmas
     points: dict[str, dict[str, Any]] = {
         name: {
-            "residuals": {}, "loo": {}, "residual_m": json_position(fit.object_residuals[k]),
-            "loo_m": json_value(without.ground[k]), "sigma_m": json_position(sigmas[k]), "w": json_value(without.w[k]),
+            "residuals": {},
+            "loo": {},
+            "residual_m": json_position(fit.object_residuals[k]),
+            "loo_m": json_value(without.ground[k]),
+            "sigma_m": json_position(sigmas[k]),
+            "w": json_value(without.w[k]),
             "suspicious": bool(without.chance[k] < SUSPICIOUS),
         }
         for k, name in enumerate(table.ids)
-    }  # fmt: skip
+    }
     for ray, (of, image) in enumerate(zip(table.point, table.image, strict=True)):
         point, label = points[table.ids[of]], table.images[image]
         point["residuals"][label] = json_position(fit.residuals[ray])
@@ -91,17 +95,24 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         text = f"the block contradicts its {doubt.what} by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
         points[doubt.point] |= {"suspicious": True, "reason": text}
     return {
-        "error": "", "points": points, "headline": _headline(solution, relative), "sigma0": json_value(fit.sigma0),
-        "redundancy": fit.redundancy, "gauge": fit.gauge,
-        "parameters": json_value({
-            label: {
-                name: {"value": value, "sigma": sigma}
-                for (of, name), value, sigma in zip(fit.parameters, fit.values, fit.sigmas, strict=True) if of == label
+        "error": "",
+        "points": points,
+        "headline": _headline(solution, relative),
+        "sigma0": json_value(fit.sigma0),
+        "redundancy": fit.redundancy,
+        "gauge": fit.gauge,
+        "parameters": json_value(
+            {
+                label: {
+                    name: {"value": value, "sigma": sigma}
+                    for (of, name), value, sigma in zip(fit.parameters, fit.values, fit.sigmas, strict=True)
+                    if of == label
+                }
+                for label in table.images
             }
-            for label in table.images
-        }),
+        ),
         "notices": [str(one) for one in fit.warnings],
-    }  # fmt: skip
+    }
 
 
 def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:

@@ -97,10 +97,16 @@ class _Answers:
             "images": [_facts(view.intensity.source.path, view.size) for view in session.views],
             "maps": [_facts(sheet.reference.path, sheet.size) for sheet in session.sheets],
             "labels": list(session.images.labels) if isinstance(session, BlockSession) else None,
-            "output": os.path.basename(session.output), "tile": SIDE, "bands": self._tiles.bands,
-            "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
-            "healed": session.journal.healed, "stopped": session.stopped, "state": session.state(),
-        }  # fmt: skip
+            "output": os.path.basename(session.output),
+            "tile": SIDE,
+            "bands": self._tiles.bands,
+            "corrections": list(CORRECTIONS),
+            "writes": writes,
+            "locked": session.journal.read_only,
+            "healed": session.journal.healed,
+            "stopped": session.stopped,
+            "state": session.state(),
+        }
 
     def leave(self, given: dict[str, Any]) -> dict[str, Any]:
         """Take note that a window is closed."""
@@ -138,7 +144,7 @@ class _Answers:
             raise InputError("there is no place to match", field="image", remedy=_REMEDY)
         return self.scene.proposal(
             None if image is None else _numbers(image, 2), None if ground is None else _numbers(ground, 3)
-        )  # fmt: skip
+        )
 
     def tie(self, given: dict[str, Any]) -> dict[str, Any]:
         """Match a click in one of several images, or a ground, in all of them."""
@@ -193,8 +199,9 @@ class _Answers:
 
     def _require_writer(self, given: dict[str, Any]) -> None:
         if not self._windows.claim(_window(given)):
-            raise InputError("another window measures these points: this one only shows them", field="window",
-                             remedy="take over")  # fmt: skip
+            raise InputError(
+                "another window measures these points: this one only shows them", field="window", remedy="take over"
+            )
 
     def _band(self, pane: str, band: int) -> int:
         if not 0 <= band <= self._tiles.bands[pane]:
@@ -289,9 +296,21 @@ class _Given:
 
 #: What the page may ask: methods of `_Answers`.
 ASKED = (
-    "begin", "leave", "act", "state", "predict", "link", "propose", "tie", "typed", "stretch", "compare", "save",
-    "make", "made",
-)  # fmt: skip
+    "begin",
+    "leave",
+    "act",
+    "state",
+    "predict",
+    "link",
+    "propose",
+    "tie",
+    "typed",
+    "stretch",
+    "compare",
+    "save",
+    "make",
+    "made",
+)
 
 
 def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
@@ -313,9 +332,19 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     app = application(session, entry, hosts, opened, listener.admit)
     # h11 limits the size of headers. The listener is told the true address of a client, whatever headers claim.
     config = uvicorn.Config(
-        app, loop="asyncio", http="h11", ws="none", lifespan="off", proxy_headers=False, server_header=False,
-        date_header=False, access_log=False, log_config=None, timeout_graceful_shutdown=3, backlog=QUEUE,
-    )  # fmt: skip
+        app,
+        loop="asyncio",
+        http="h11",
+        ws="none",
+        lifespan="off",
+        proxy_headers=False,
+        server_header=False,
+        date_header=False,
+        access_log=False,
+        log_config=None,
+        timeout_graceful_shutdown=3,
+        backlog=QUEUE,
+    )
     try:
         ready(f"http://{LOOPBACK}:{number}{entry.path}")
         # Ctrl-C is how this command ends.

@@ -55,48 +55,72 @@ TITLES = {
 }
 KNOBS = (
     Knob(
-        "SIGMA_IMAGE", SIGMA_IMAGE, "px per axis", "fitted",
+        "SIGMA_IMAGE",
+        SIGMA_IMAGE,
+        "px per axis",
+        "fitted",
         "Noise of pointing: that of the paper's images and people, which nobody has published elsewhere. 0.5 px, which "
         "is customary, would leave 0.71 px of the 0.99.",
         ("3|rigorous even:44|*",),
     ),
     Knob(
-        "OFF_NADIR_DEG", OFF_NADIR_DEG, "degrees", "fitted",
+        "OFF_NADIR_DEG",
+        OFF_NADIR_DEG,
+        "degrees",
+        "fitted",
         "Tilt across the track. The satellite can be turned by 30 degrees; the paper does not say how far it was.",
         ("5|poly1 even:44|*",),
     ),
     Knob(
-        "ROUGHNESS", ROUGHNESS, "", "fitted",
+        "ROUGHNESS",
+        ROUGHNESS,
+        "",
+        "fitted",
         "How much the plains roll: what the models without heights leave over the relief.",
         ("5|poly2 even:44|*", "5|poly3 even:44|*", "5|projective even:44|*"),
     ),
     Knob(
-        "RIDGE", RIDGE, "", "fitted",
+        "RIDGE",
+        RIDGE,
+        "",
+        "fitted",
         "Weight of Tikhonov's regularisation, which the paper has for these two models and does not state; in steps "
         "of a factor 3.",
         ("5|rfm2 even:44|*", "5|rfm3 even:44|*"),
     ),
     Knob(
-        "relief", "plains, one range of mountains in the east, 700 to 1900 m", "", "chosen",
+        "relief",
+        "plains, one range of mountains in the east, 700 to 1900 m",
+        "",
+        "chosen",
         "The heights and the mountains in the east are the paper's. Of four shapes that fit the rows with 44 points "
         "this one was taken in sight of all rows: with the others 80 to 85 % of all rows were within 1.5, with this 85 "
         "%, so that up to five points of a hundred are owed to the choice.",
     ),
     Knob(
-        "PLACES", PLACES, "places in a cell", "chosen",
+        "PLACES",
+        PLACES,
+        "places in a cell",
+        "chosen",
         "Of so many places in each cell the lowest is measured, for road crossings lie in plains and valleys. With one "
         "place three predictions in a hundred fewer are within 1.5; with six as many.",
     ),
     Knob(
-        "SIGMA_GROUND", SIGMA_GROUND, "m per axis", "paper",
+        "SIGMA_GROUND",
+        SIGMA_GROUND,
+        "m per axis",
+        "paper",
         "Better than 1 m in planimetry and elevation; a fortieth of a pixel, so that it decides nothing.",
     ),
     Knob(
-        "SIGMA_POSITION", SIGMA_POSITION, "m per axis", "chosen",
+        "SIGMA_POSITION",
+        SIGMA_POSITION,
+        "m per axis",
+        "chosen",
         "Error of the ephemeris, from which the rigorous model starts; it decides nothing, for position and attitude "
         "are adjusted without weights, as in the paper.",
     ),
-)  # fmt: skip
+)
 NAIVE = (
     "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for the check "
     "points, for p unknowns and k points. It knows the noise of each model from the paper, which the simulation has to "
@@ -206,8 +230,9 @@ def reproduce(
     medians = {
         (row.label, QUANTITIES[k]): float(np.median(kept))
         for row, k in asked
-        for kept in [found[rows.index(row), :, k][np.isfinite(found[rows.index(row), :, k])]] if len(kept)
-    }  # fmt: skip
+        for kept in [found[rows.index(row), :, k][np.isfinite(found[rows.index(row), :, k])]]
+        if len(kept)
+    }
     seen = np.isfinite(vectors).any()
     return make_document(
         PAPER,

@@ -109,17 +109,19 @@ def _check(size: int, pixel: float, seed: int, components: int, multispectral: b
             f"size {size}, seed {seed} and {counted(components, 'component')} are not possible",
             field="size, seed, components",
             remedy=f"a size from {SMALLEST} to {LARGEST}, a seed from 0, and 1 to {MOST_COMPONENTS} components",
-        )  # fmt: skip
+        )
     if not pixel >= FINEST or size * pixel > simulated.EXTENT * (1 + 1e-9):
         raise InputError(
-            f"{size} pixels of {pixel:g} m are not possible", field="size, pixel",
+            f"{size} pixels of {pixel:g} m are not possible",
+            field="size, pixel",
             remedy=f"pixels of at least {FINEST} m, and a scene of at most {simulated.EXTENT:g} m",
-        )  # fmt: skip
+        )
     if size % (components * (RATIO if multispectral else 1)):
         raise InputError(
-            f"{size} columns cannot be cut so", field="size",
+            f"{size} columns cannot be cut so",
+            field="size",
             remedy=f"a multiple of {components * (RATIO if multispectral else 1)}",
-        )  # fmt: skip
+        )
 
 
 def _cut(scene: GeoScene, count: int) -> list[Component]:

@@ -137,8 +137,9 @@ class Scan:
             If the line of sight would miss the ground by far or graze it.
         """
         if not 0 <= off_nadir_deg <= 45:
-            raise InputError(f"{off_nadir_deg:g} degrees off nadir are not possible", field="off_nadir_deg",
-                             remedy="0 to 45 degrees")  # fmt: skip
+            raise InputError(
+                f"{off_nadir_deg:g} degrees off nadir are not possible", field="off_nadir_deg", remedy="0 to 45 degrees"
+            )
         aim = geocentric(np.array([[LON, LAT, REFERENCE_HEIGHT]]))[0]
         up = aim / np.linalg.norm(aim)
         east = np.cross([0.0, 0.0, 1.0], up)
@@ -252,9 +253,15 @@ class GeoScene:
         x, y = to_map().transform(LON, LAT)
         west, north = round(x - columns * pixel / 2), round(y + rows * pixel / 2)
         scene = cls(
-            scan, Slope(bend, roughness, seed), _attitude_error(scan, random), float(west), float(north), pixel,
-            columns, rows,
-        )  # fmt: skip
+            scan,
+            Slope(bend, roughness, seed),
+            _attitude_error(scan, random),
+            float(west),
+            float(north),
+            pixel,
+            columns,
+            rows,
+        )
         image = np.concatenate([_spread(points, columns, rows, random) for _ in ("control", "check")])
         return replace(scene, image=image, ground=scene.meet(image))
 

@@ -59,9 +59,10 @@ def write_product(
     """
     if not SMALLEST <= pixel <= LARGEST or seed < 0:
         raise InputError(
-            f"pixels of {pixel} m and seed {seed} are not possible", field="pixel, seed",
+            f"pixels of {pixel} m and seed {seed} are not possible",
+            field="pixel, seed",
             remedy=f"whole metres from {SMALLEST} to {LARGEST} and a seed from 0",
-        )  # fmt: skip
+        )
     out, coast = Path(folder), simulated.Coast()
     ground = simulated.places(simulated.POINTS, coast, seed)
     believed = {name: simulated.scanner(name, shrink=pixel) for name in simulated.SCENES}
@@ -97,17 +98,27 @@ def label(camera: simulated.Scanner, rpc: RPC, coast: simulated.Coast, name: str
     places = [
         line
         for corner, (lon, lat, height) in zip(CORNERS, corners.tolist(), strict=True)
-        for line in _group(corner, [("latitude", f"{lat:.10f}"), ("longitude", f"{lon:.10f}"),
-                                    ("height", f"{height:.7f}")])
-    ]  # fmt: skip
+        for line in _group(
+            corner, [("latitude", f"{lat:.10f}"), ("longitude", f"{lon:.10f}"), ("height", f"{height:.7f}")]
+        )
+    ]
     product = [
-        *_lines([("distributionMediaType", '"Simulated"'), ("productCloudCoverPercentage", 999), ("bytesPerPixel", 2),
-                 ("bitsPerPixel", 11), ("spacingUnits", '"meters"'), ("numScanLines", camera.height),
-                 ("pixelsPerScanLine", camera.width), ("lineSpacing", spacing[0][1]),
-                 ("pixelSpacing", spacing[1][1])]),
+        *_lines(
+            [
+                ("distributionMediaType", '"Simulated"'),
+                ("productCloudCoverPercentage", 999),
+                ("bytesPerPixel", 2),
+                ("bitsPerPixel", 11),
+                ("spacingUnits", '"meters"'),
+                ("numScanLines", camera.height),
+                ("pixelsPerScanLine", camera.width),
+                ("lineSpacing", spacing[0][1]),
+                ("pixelSpacing", spacing[1][1]),
+            ]
+        ),
         *_block("geodeticCorners", places),
         *_block("rationalFunctions", _rational_functions(rpc)),
-    ]  # fmt: skip
+    ]
     image = [
         ("firstLineAcquisitionDateTime", ACQUIRED[name]),
         ("circularError", f"{CIRCULAR_ERROR[name]:.10f}"),
@@ -189,7 +200,5 @@ def _truth(cameras: dict[str, simulated.Scanner], ground: Array, seed: int, pixe
             }
             for name, camera in cameras.items()
         },
-        "points": [
-            {"id": f"P{k + 1:02d}", "lon_lat_h": point} for k, point in enumerate(ground.tolist())
-        ],
-    }  # fmt: skip
+        "points": [{"id": f"P{k + 1:02d}", "lon_lat_h": point} for k, point in enumerate(ground.tolist())],
+    }

@@ -292,9 +292,16 @@ def scanner(name: str, *, shrink: int = 1) -> Scanner:
     """
     middle, east = SCENES[name]
     camera = Scanner(
-        COLUMNS // shrink, LINES // shrink, *orbit(ALTITUDE, SIDE), middle, (float(east), 0.0),
-        LINES_PER_SECOND * PIXEL, shrink / LINES_PER_SECOND, shrink * PIXEL / ALTITUDE, yaw_rate=east * YAW_RATE,
-    )  # fmt: skip
+        COLUMNS // shrink,
+        LINES // shrink,
+        *orbit(ALTITUDE, SIDE),
+        middle,
+        (float(east), 0.0),
+        LINES_PER_SECOND * PIXEL,
+        shrink / LINES_PER_SECOND,
+        shrink * PIXEL / ALTITUDE,
+        yaw_rate=east * YAW_RATE,
+    )
     before, after = (np.linalg.norm(camera.target(time) - camera.flight(time)[0]) for time in np.array([[-0.5], [0.5]]))
     return replace(camera, gain=float(TURNING * camera.speed * np.log(after / before)))
 
@@ -302,9 +309,16 @@ def scanner(name: str, *, shrink: int = 1) -> Scanner:
 def quickbird() -> Scanner:
     """Return QuickBird's camera over the same area, which scans against the flight with its 6900 lines a second."""
     return Scanner(
-        27_000, 27_000, *orbit(QUICKBIRD["altitude"], QUICKBIRD["side"]), 0.0, (0.0, 1.0), 6900.0 * 0.61,
-        1 / 6900.0, 0.61 / QUICKBIRD["altitude"], flight_line=False,
-    )  # fmt: skip
+        27_000,
+        27_000,
+        *orbit(QUICKBIRD["altitude"], QUICKBIRD["side"]),
+        0.0,
+        (0.0, 1.0),
+        6900.0 * 0.61,
+        1 / 6900.0,
+        0.61 / QUICKBIRD["altitude"],
+        flight_line=False,
+    )
 
 
 @dataclass(frozen=True, eq=False)
