@@ -19,7 +19,7 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
                      source, facts={"band": int(band)})
 
 Files beside an image are found from ``ortho_pipeline.plugin.place(dataset.GetDescription())``, which has the methods of
-`pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+`pathlib.Path` for an image on disk and for one in an archive (docs/plugin-reference.md).
 
 The host tries every scene at a few points before it works with it (`ortho_pipeline.host.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.

@@ -1,8 +1,8 @@
 """Everything that a plugin is made of: its author imports from here alone.
 
 The hooks and what they return, errors and messages, files, the ellipsoid, sensor models, points, fits, and the parts of
-commands. docs/plugins.md lists the names by purpose and shows how to write a plugin; `ortho_pipeline.hookspecs` states
-the hooks. The names are public: docs/plugins.md says how long a name lives.
+commands. docs/plugins.md shows how to write a plugin; `ortho_pipeline.hookspecs` states the hooks.
+docs/plugin-reference.md lists the names by purpose, and says how long a public name lives.
 
 Each name is loaded when it is first used: ``from ortho_pipeline.plugin import Subcommand, hookimpl`` loads neither
 NumPy nor GDAL.
