@@ -75,8 +75,12 @@ class _Place:
         return _sources(self._function.__module__)
 
     def get_disambiguator(self) -> str:
-        """Return what tells the kernel from those of the same name in other modules."""
-        return hashlib.sha256(os.fsencode(os.path.abspath(self._path))).hexdigest()[:16]
+        """Return what tells the kernel from those of the same name in other modules, and in other versions.
+
+        An index names the types of arguments: that of a version with other types could not be read.
+        """
+        place = os.fsencode(os.path.abspath(self._path))
+        return hashlib.sha256(place + self.get_source_stamp().encode()).hexdigest()[:16]
 
 
 class _Kept(NullCache):
