@@ -21,7 +21,7 @@ _MOST_LISTED = 1_000_000
 Place: TypeAlias = Path | VsiPath
 
 
-class Places:
+class PipelinePaths:
     """What names in a pipeline file stand for.
 
     Names are relative to the file. Of a file on this machine they stay in its root wherever links lead; a file on

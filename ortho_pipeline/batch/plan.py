@@ -17,7 +17,7 @@ import pyproj
 
 from ortho_pipeline import host
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
-from ortho_pipeline.batch.places import Place, Places
+from ortho_pipeline.batch.places import PipelinePaths, Place
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
@@ -163,7 +163,7 @@ def plan(
         For a wrong file, a path outside of the root, a pattern without a match, or two scenes of one name.
     """
     file = place(located(path, allow_network=allow_network))
-    return _Planner(file, read_config(file), Places(path, root, allow_network)).plan()
+    return _Planner(file, read_config(file), PipelinePaths(path, root, allow_network)).plan()
 
 
 @functools.cache
@@ -179,7 +179,7 @@ def versions() -> dict[str, Any]:
 
 
 class _Planner:
-    def __init__(self, path: Place, config: Config, places: Places) -> None:
+    def __init__(self, path: Place, config: Config, places: PipelinePaths) -> None:
         self.path, self.config, self.places = path, config, places
         if config.root is not None:
             places.root = places.inside(config.root, "root of the file")

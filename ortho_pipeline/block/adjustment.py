@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ortho_pipeline.block.common_error import CommonError
+from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.datum import HOLD, by_control, with_datum, with_start_errors
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.cofactors import Cofactors
@@ -99,7 +99,7 @@ def adjust(
     refuse_too_few(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
-    common = CommonError.of(problem, state, selection)
+    common = BlockCommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
     # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
@@ -268,8 +268,8 @@ def _started(problem: BlockProblem, state: State, selection: Selection) -> Block
 
 
 def _weighed(
-    solved: Solved, selection: Selection, common: CommonError | None
-) -> tuple[Solved, Posterior, CommonError | None]:
+    solved: Solved, selection: Selection, common: BlockCommonError | None
+) -> tuple[Solved, Posterior, BlockCommonError | None]:
     """Return the solution with the sigmas that the observations have, what is known of these, and the common error."""
     if common is not None:
         solved, common = common.settled(solved, selection)
@@ -312,7 +312,7 @@ def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
 def _result(
     solved: Solved,
     found: Posterior,
-    common: CommonError | None,
+    common: BlockCommonError | None,
     selection: Selection,
     points: BlockPoints,
     order: Index,
@@ -375,7 +375,7 @@ def _result(
 
 
 def _covariances(
-    solved: Solved, found: Posterior, common: CommonError | None
+    solved: Solved, found: Posterior, common: BlockCommonError | None
 ) -> tuple[Cofactors, Array, Mapping[str, SharedErrors]]:
     """Return covariances of parameters and ground without what all known points share, and what neighbours share."""
     shared = SharedByImage.of(solved, common)
@@ -390,7 +390,7 @@ def _covariances(
     return covariance, ground, {} if shared is None else shared.images
 
 
-def _with_common(covariance: Cofactors, common: CommonError | None) -> tuple[Cofactors, Array]:
+def _with_common(covariance: Cofactors, common: BlockCommonError | None) -> tuple[Cofactors, Array]:
     """Return the covariance of the parameters with the part of a common error, and its part in that of the ground."""
     if common is None:
         return covariance, np.zeros((1, 3, 3))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from ortho_pipeline.block.common_error import CommonError
+from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import sigmas_of
@@ -180,7 +180,7 @@ class BlockFit:
     rejected: tuple[GrossError, ...] = ()
     outlying: tuple[ContradictedPoint, ...] = ()
     warnings: tuple[Notice, ...] = ()
-    common_error: CommonError | None = None
+    common_error: BlockCommonError | None = None
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
     iterations: int = 0

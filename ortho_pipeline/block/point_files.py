@@ -22,7 +22,7 @@ from ortho_pipeline.points.image_errors import (
     groups_of,
     sigmas_of,
 )
-from ortho_pipeline.points.rows import OF_GROUND, Row, Table, origin_shift
+from ortho_pipeline.points.rows import OF_GROUND, PointRow, Table, origin_shift
 
 
 @reads("see docs/formats.md for what stands in a file of points")
@@ -99,7 +99,7 @@ def _placed(
     return ground_of(path, table, crs, vertical)
 
 
-def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
+def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> None:
     first: dict[str | None, str] = {}
     for row in rows:
         if first.setdefault(row.id, row.where) != row.where:
@@ -119,7 +119,11 @@ class _Joined:
         self.said: list[dict[str, tuple[Any, str]]] = []
 
     def add(
-        self, path: str | os.PathLike[str], rows: Sequence[Row], ground: Array, of: Sequence[Row] | None = None
+        self,
+        path: str | os.PathLike[str],
+        rows: Sequence[PointRow],
+        ground: Array,
+        of: Sequence[PointRow] | None = None,
     ) -> None:
         """Take in rows; `ground` belongs to all rows of a file, `of`, where these are only some."""
         place = {id(row): k for k, row in enumerate(of or rows)}
@@ -151,7 +155,9 @@ class _Joined:
                         remedy="one point has one ground, one role and one accuracy",
                     )
 
-    def points(self, path: str | os.PathLike[str], rows: Sequence[Row], shift: float, crs: pyproj.CRS) -> BlockPoints:
+    def points(
+        self, path: str | os.PathLike[str], rows: Sequence[PointRow], shift: float, crs: pyproj.CRS
+    ) -> BlockPoints:
         """Return the table of the points, with the rays of `rows`."""
         said = [{name: value for name, (value, _) in one.items()} for one in self.said]
         images = tuple(dict.fromkeys(str(row.image_name) for row in rows))

@@ -38,7 +38,7 @@ from ortho_pipeline.estimation.records import (
 )
 from ortho_pipeline.estimation.records import CommonError as CommonErrorRecord
 from ortho_pipeline.estimation.regularisation import regularised
-from ortho_pipeline.estimation.spatial.common_error import CommonError
+from ortho_pipeline.estimation.spatial.common_error import ImageCommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.json.values import json_value
@@ -91,7 +91,7 @@ class Fit:
     corner_ratio: float = 0.0
     outlying: tuple[OutlyingPoint, ...] = ()
     shared_errors: SharedErrors | None = None
-    common_error: CommonError | None = None
+    common_error: ImageCommonError | None = None
 
     @property
     def reservations(self) -> tuple[str, ...]:
@@ -348,10 +348,10 @@ def gross_errors(
 
 def _common_error(
     model: SensorModel, points: Points, raw: Array, priors: Mapping[str, Prior] | None, *, robust: bool
-) -> CommonError | None:
+) -> ImageCommonError | None:
     """Return what control points have in common, with a start from those without it, or None."""
     usable = points.control & np.isfinite(raw).all(axis=1)
-    common = CommonError.of(model, points, usable)
+    common = ImageCommonError.of(model, points, usable)
     others = usable & (points.sigma_common == 0)
     if common is None or not others.any():
         return common
@@ -363,7 +363,7 @@ def _common_error(
     return common.seen_by(first.model, points.select(others))
 
 
-def _without(common: CommonError | None, model: SensorModel, points: Points) -> Points:
+def _without(common: ImageCommonError | None, model: SensorModel, points: Points) -> Points:
     """Return points as they were measured, but for what they have in common."""
     if common is None or not common.value.any():
         return points
@@ -437,7 +437,7 @@ def _result(
     name: str | None,
     strength: float | None,
     priors: Mapping[str, Prior],
-    common: CommonError | None,
+    common: ImageCommonError | None,
 ) -> Fit:
     predicted = solution.model.ground_to_image(points.ground)
     loo = np.full((len(points), 2), np.nan)

@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.points import Points, points_of
 from ortho_pipeline.points.image_errors import read_image_errors, says_more
-from ortho_pipeline.points.rows import CSV_ERRORS, Row, Table, number, role_of, sigma_of
+from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, Table, number, role_of, sigma_of
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -131,7 +131,7 @@ def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
     return table, sigmas
 
 
-def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
+def _row(source: str, where: str, record: dict[str, Any], place: Any) -> PointRow:
     def cell(name: str) -> float:
         return number(_plain(record[name]), source, f"{where}, {name}")
 
@@ -150,7 +150,7 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
         sigma_image,
     )
     name = _plain(record.get("id"))
-    return Row(
+    return PointRow(
         where=where,
         id=None if name is None else str(name),
         image=(cell("col"), cell("row")),

@@ -21,9 +21,9 @@ from ortho_pipeline.points.rows import (
     OF_GROUND,
     OF_HEIGHTS,
     OWN_IMAGE,
-    Columns,
+    ColumnRules,
     Placement,
-    Row,
+    PointRow,
     Table,
     load_text,
     short,
@@ -41,7 +41,7 @@ class _Format(NamedTuple):
     reader: Callable[..., Table]
     wanted: str
     known: Callable[[str, str, str], object]
-    of_block: tuple[Columns, ...] = ()
+    of_block: tuple[ColumnRules, ...] = ()
 
 
 #: In the order in which they are tried: content tells them apart, then the suffix.
@@ -124,7 +124,7 @@ def read_table(
     return _of_image(path, table, image_name, pieces or {})
 
 
-def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK) -> Table:
+def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BLOCK) -> Table:
     """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
 
     Raises
@@ -147,7 +147,7 @@ def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK)
     return table
 
 
-def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: Columns) -> Table:
+def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: ColumnRules) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
     with completed(path, remedy=kind.wanted):
         table = kind.reader(path, text, *expected)
@@ -192,7 +192,7 @@ def _of_image(
         )
     if image_name is None or not named:
         return table
-    kept: list[Row] = []
+    kept: list[PointRow] = []
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
         # A point that was measured in several of the images counts once: where it was measured first, this image ahead.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.points.rows import CSV_ERRORS, Row, number, short, sigma_of
+from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, number, short, sigma_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -216,7 +216,7 @@ def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
     return int(found)
 
 
-def covariance_of(rows: Sequence[Row], sigma: Array) -> Array:
+def covariance_of(rows: Sequence[PointRow], sigma: Array) -> Array:
     """Return covariances ``(N, 2, 2)`` px^2 of the rows of a file, from `sigma` where they give none."""
     found = reconciled(sigma, None)[1]
     for k, row in enumerate(rows):
@@ -226,12 +226,12 @@ def covariance_of(rows: Sequence[Row], sigma: Array) -> Array:
     return found
 
 
-def groups_of(rows: Sequence[Row]) -> Index:
+def groups_of(rows: Sequence[PointRow]) -> Index:
     """Return the groups ``(N,)`` of the rows of a file."""
     return np.array([-1 if row.group is None else row.group for row in rows], dtype=np.int64)
 
 
-def common_of(rows: Sequence[Row]) -> dict[str, Array]:
+def common_of(rows: Sequence[PointRow]) -> dict[str, Array]:
     """Return the standard deviations ``(N,)`` of what points have in common, by name, of the rows of a file."""
     return {
         name: np.array([getattr(row, name) or 0.0 for row in rows], dtype=np.float64)
@@ -239,7 +239,7 @@ def common_of(rows: Sequence[Row]) -> dict[str, Array]:
     }
 
 
-def sigmas_of(rows: Sequence[Row], default: float) -> Array:
+def sigmas_of(rows: Sequence[PointRow], default: float) -> Array:
     """Return standard deviations ``(N,)`` px of the rows of a file; `default` for those that give nothing."""
     found = np.empty(len(rows))
     for k, row in enumerate(rows):

@@ -8,7 +8,7 @@ import re
 
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.points.rows import Line, Row, Table, cells_of, lines_of, number, short, sigma_of
+from ortho_pipeline.points.rows import Line, PointRow, Table, cells_of, lines_of, number, short, sigma_of
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------
 
@@ -44,7 +44,7 @@ def read_qgis(path: str | os.PathLike[str], text: str) -> Table:
 _QGIS_NAMES = {"pixelx": "sourcex", "pixely": "sourcey"}
 
 
-def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells: list[str]) -> Row | None:
+def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells: list[str]) -> PointRow | None:
     where = f"line {line.number}"
     if len(cells) != len(names):
         raise InputError(
@@ -58,7 +58,7 @@ def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells:
     )
     if given.get("enable", "1") == "0":
         return None
-    return Row(where=where, id=None, image=(column, -minus_line), ground=(x, y, math.nan))
+    return PointRow(where=where, id=None, image=(column, -minus_line), ground=(x, y, math.nan))
 
 
 # -- OpenDroneMap ----------------------------------------------------------------------------------------------------
@@ -95,7 +95,7 @@ def read_odm(path: str | os.PathLike[str], text: str) -> Table:
         )
         z = math.nan if unknown_height else number(cells[2], path, f"{where}, column z")
         label = " ".join(cells[6:]) or None
-        table.rows.append(Row(where, label, (column, row), (x, y, z), image_name=cells[5]))
+        table.rows.append(PointRow(where, label, (column, row), (x, y, z), image_name=cells[5]))
     return table
 
 
@@ -153,7 +153,7 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
         at = (value["image x"] - 1.0, value["image y"] - 1.0)
         ground = (value["x"], value["y"], value.get("elev", math.nan))
         name = None if image is None else re.split(r"[\\/]", images[image])[-1]
-        table.rows.append(Row(where, None, at, ground, image_name=name))
+        table.rows.append(PointRow(where, None, at, ground, image_name=name))
     return table
 
 
@@ -210,7 +210,7 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         for k in range(7, len(cells), 5):
             column, at_row = (number(cells[k + i], path, f"{where}, {name}") for i, name in ((1, "column"), (2, "row")))
             spread = max(sigma_of(cells[k + i], path, f"{where}, pixel sigma", zero=False) for i in (3, 4))
-            row = Row(where, cells[0], (column + 0.5, at_row + 0.5), (lon, lat, height), image_name=cells[k])
+            row = PointRow(where, cells[0], (column + 0.5, at_row + 0.5), (lon, lat, height), image_name=cells[k])
             row.sigma_image, row.sigma_xy, row.sigma_h = spread, max(sigmas[:2]), sigmas[2]
             table.rows.append(row)
     return table
@@ -247,5 +247,5 @@ def read_links(path: str | os.PathLike[str], text: str) -> Table:
                 "minus the row, or give the points as CSV with the columns Pixel and Line",
             )
         label = cells[0] if len(cells) == 5 else None
-        table.rows.append(Row(where, label, (x, -minus_row), (to[0], to[1], math.nan)))
+        table.rows.append(PointRow(where, label, (x, -minus_row), (to[0], to[1], math.nan)))
     return table

@@ -44,9 +44,9 @@ from ortho_pipeline.points.rows import (
     CSV_ERRORS,
     ROLES,
     Placement,
-    Point,
-    Row,
+    PointRow,
     Table,
+    TablePoint,
     is_writable,
     numbered_ids,
     origin_shift,
@@ -178,7 +178,7 @@ class Points:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __iter__(self) -> Iterator[Point]:
+    def __iter__(self) -> Iterator[TablePoint]:
         columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
         sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
         shared = self.groups.tolist(), self.sigma_common.tolist(), self.sigma_alike.tolist()
@@ -186,7 +186,7 @@ class Points:
             self.ids, *columns, *sigmas, self.covariance_image.tolist(), *shared, strict=True
         ):
             covariance = tuple(both[0]), tuple(both[1])
-            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, *others)
+            yield TablePoint(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, *others)
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
@@ -350,7 +350,7 @@ def gcps_of_dataset(
     named = all(names) and len(set(names)) == len(gcps)
     flat = all(gcp.GCPZ == 0 for gcp in gcps)
     rows = [
-        Row(
+        PointRow(
             where=f"GCP {count}",
             id=gcp.Id if named else str(count),
             image=(float(gcp.GCPPixel), float(gcp.GCPLine)),

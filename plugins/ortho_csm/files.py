@@ -18,7 +18,7 @@ import numpy as np
 
 from ortho_csm.frame import frame_fields, read_frame
 from ortho_csm.line_scanner import line_scanner_fields, read_line_scanner
-from ortho_csm.state import REMEDY, State
+from ortho_csm.state import REMEDY, StateFields
 from ortho_pipeline.plugin import (
     FrameCamera,
     InputError,
@@ -73,7 +73,7 @@ def read_csm(path: str | PathLike[str]) -> SensorModel:
     fields = parse_json(body, path, REMEDY)
     if not isinstance(fields, dict):
         raise InputError("a state is a JSON object", file=path, remedy=REMEDY)
-    state = State(fields, path)
+    state = StateFields(fields, path)
     state.require_earth()
     try:
         return read_line_scanner(state) if name.strip().decode() == LINE_SCANNER else read_frame(state)
@@ -93,11 +93,11 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
     """
     if isinstance(model, Pushbroom):
         name, fields = LINE_SCANNER, line_scanner_fields(model)
-        again: SensorModel = read_line_scanner(State(fields, "state"))
+        again: SensorModel = read_line_scanner(StateFields(fields, "state"))
         size = model.camera.size
     elif isinstance(model, FrameCamera):
         name, fields = FRAME, frame_fields(model)
-        again, size = read_frame(State(fields, "state")), (model.interior.width, model.interior.height)
+        again, size = read_frame(StateFields(fields, "state")), (model.interior.width, model.interior.height)
     else:
         raise InputError(
             f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one",

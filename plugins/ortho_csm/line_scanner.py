@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_csm.state import State
+from ortho_csm.state import StateFields
 from ortho_pipeline.plugin import (
     ECCENTRICITY_SQUARED,
     SEMI_MAJOR,
@@ -43,7 +43,7 @@ _COLUMNS, _EXACT = 33, 1e-7
 _QUATERNIONS, _POSITIONS = "m_quaternions", "m_positions"
 
 
-def read_line_scanner(state: State) -> Pushbroom:
+def read_line_scanner(state: StateFields) -> Pushbroom:
     """Make a line scanner of a state; free are offsets and drifts of its attitude."""
     columns, rows = state.size()
     if state.numbers("m_currentParameterValue").any():
@@ -66,7 +66,7 @@ def read_line_scanner(state: State) -> Pushbroom:
     return model
 
 
-def _times(state: State) -> tuple[float, float]:
+def _times(state: StateFields) -> tuple[float, float]:
     """Return the time of the upper edge of the first row and seconds per row."""
     lines, starts, periods = (state.numbers(name) for name in ("m_intTimeLines", "m_intTimeStartTimes", "m_intTimes"))
     if not 1 <= len(lines) == len(starts) == len(periods) <= 100_000 or not (np.diff(lines) > 0).all():
@@ -81,7 +81,7 @@ def _times(state: State) -> tuple[float, float]:
     return float(starts[0] + period * (0.5 - lines[0])), period
 
 
-def _camera(state: State, columns: int, rows: int) -> tuple[Array, LineCamera]:
+def _camera(state: StateFields, columns: int, rows: int) -> tuple[Array, LineCamera]:
     """Return the rotation from our axes (x along growing columns) to the camera of the state, and the line camera."""
     sample, line = state.numbers("m_iTransS", 3), state.numbers("m_iTransL", 3)
     plane = np.array([line[1:], sample[1:]])
@@ -110,7 +110,7 @@ def _camera(state: State, columns: int, rows: int) -> tuple[Array, LineCamera]:
     return turn, LineCamera.of_table(columns, rows, at, look[:, 0], look[:, 1])
 
 
-def _table(state: State, field: str, width: int, what: str) -> tuple[Array, Array]:
+def _table(state: StateFields, field: str, width: int, what: str) -> tuple[Array, Array]:
     values = state.numbers(field)
     step = state.number(f"m_dt{what}")
     if len(values) % width or len(values) < 4 * width or not 0 < step < 1e4:

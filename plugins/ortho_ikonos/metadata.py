@@ -31,7 +31,7 @@ PIXELS = ("", "pixel", "pixels")
 
 
 @dataclass(frozen=True)
-class Entry:
+class MetadataLine:
     """One line ``key: value`` and the headings above it."""
 
     line: int
@@ -41,12 +41,12 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Record:
+class SectionRecord:
     """The entries of one record of a section, looked up by key wherever they are nested."""
 
     file: str
     name: str
-    entries: tuple[Entry, ...]
+    entries: tuple[MetadataLine, ...]
 
     def text(self, *keys: str) -> str | None:
         """Return the value of the first of these keys that is there and not empty; None without.
@@ -128,7 +128,7 @@ class SourceImage:
 
 
 @dataclass(frozen=True)
-class Placement:
+class MapPlacement:
     """How an image lies on the map; None for what the file does not say.
 
     `upper_left` is the map position of the *centre* of the first pixel, `size` columns and rows.
@@ -139,9 +139,9 @@ class Placement:
     size: tuple[int, int] | None
     reference_height: float | None = None
 
-    def completed_by(self, other: Placement) -> Placement:
+    def completed_by(self, other: MapPlacement) -> MapPlacement:
         """Return this placement with what it does not say taken from another."""
-        return Placement(
+        return MapPlacement(
             self.upper_left or other.upper_left,
             self.pixel or other.pixel,
             self.size or other.size,
@@ -155,7 +155,7 @@ class Component:
 
     component: str
     product_image: str
-    placement: Placement
+    placement: MapPlacement
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Delivery:
     bits: int | None
     projection: str | None
     crs: str | None
-    product: Placement
+    product: MapPlacement
     sources: tuple[SourceImage, ...]
     components: tuple[Component, ...]
     notes: tuple[Notice, ...] = ()
@@ -268,7 +268,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
 
 
 @reads("copy the _hdr.txt again from the delivery")
-def read_header(path: str | PathLike[str]) -> Placement:
+def read_header(path: str | PathLike[str]) -> MapPlacement:
     """Read how an image lies on the map from its ``_hdr.txt``; its keys are those of a component.
 
     Raises
@@ -277,7 +277,7 @@ def read_header(path: str | PathLike[str]) -> Placement:
         As `read_metadata`.
     """
     entries = tuple(_entries(_lines(str(path), _text(path))))
-    return _placement(Record(str(path), "header", entries))
+    return _placement(SectionRecord(str(path), "header", entries))
 
 
 # -- text ------------------------------------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:
             yield number, line.expandtabs(3)
 
 
-def _sections(path: str, text: str) -> dict[str, list[Record]]:
+def _sections(path: str, text: str) -> dict[str, list[SectionRecord]]:
     """Return by title the records of each section; the first is what stands before any record."""
     blocks: list[list[tuple[int, str]]] = [[]]
     for number, line in _lines(path, text):
@@ -316,7 +316,7 @@ def _sections(path: str, text: str) -> dict[str, list[Record]]:
                 blocks.append([])
         else:
             blocks[-1].append((number, line))
-    sections: dict[str, list[Record]] = {}
+    sections: dict[str, list[SectionRecord]] = {}
     for block in blocks:
         if not block or ":" in block[0][1]:
             continue
@@ -332,7 +332,7 @@ def _sections(path: str, text: str) -> dict[str, list[Record]]:
     return sections
 
 
-def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[Entry]:
+def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[MetadataLine]:
     above: list[tuple[int, str]] = []
     for number, line in lines:
         depth = len(line) - len(line.lstrip())
@@ -340,20 +340,20 @@ def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[Entry]:
             above.pop()
         key, colon, value = (" ".join(part.split()) for part in line.partition(":"))
         if colon:
-            yield Entry(number, tuple(name for _, name in above), key, value)
+            yield MetadataLine(number, tuple(name for _, name in above), key, value)
         above.append((depth, " ".join(line.split())))
 
 
-def _split(path: str, title: str, entries: list[Entry]) -> list[Record]:
+def _split(path: str, title: str, entries: list[MetadataLine]) -> list[SectionRecord]:
     starts = [0, *(k for k, entry in enumerate(entries) if entry.key in RECORDS and not entry.groups), len(entries)]
     records = []
     for k, (start, end) in enumerate(itertools.pairwise(starts)):
         name = title if k == 0 else f"{title}, {entries[start].key} {entries[start].value[:40]}"
-        records.append(Record(path, name, tuple(entries[start:end])))
+        records.append(SectionRecord(path, name, tuple(entries[start:end])))
     return records
 
 
-def _records(path: str | PathLike[str], sections: dict[str, list[Record]], title: str) -> list[Record]:
+def _records(path: str | PathLike[str], sections: dict[str, list[SectionRecord]], title: str) -> list[SectionRecord]:
     if title not in sections:
         raise InputError(
             "this section is missing",
@@ -364,13 +364,17 @@ def _records(path: str | PathLike[str], sections: dict[str, list[Record]], title
     return sections[title]
 
 
-def _head(path: str | PathLike[str], sections: dict[str, list[Record]], title: str, *, needed: bool = True) -> Record:
+def _head(
+    path: str | PathLike[str], sections: dict[str, list[SectionRecord]], title: str, *, needed: bool = True
+) -> SectionRecord:
     if not needed and title not in sections:
-        return Record(str(path), title, ())
+        return SectionRecord(str(path), title, ())
     return _records(path, sections, title)[0]
 
 
-def _check_counts(path: str | PathLike[str], sections: dict[str, list[Record]], sources: int, components: int) -> None:
+def _check_counts(
+    path: str | PathLike[str], sections: dict[str, list[SectionRecord]], sources: int, components: int
+) -> None:
     for title, key, found in (
         (SOURCES, "Number of Source Images", sources),
         (COMPONENTS, "Number of Components", components),
@@ -388,7 +392,7 @@ def _check_counts(path: str | PathLike[str], sections: dict[str, list[Record]], 
 # -- meaning ---------------------------------------------------------------------------------------------------------
 
 
-def _source(record: Record) -> SourceImage:
+def _source(record: SectionRecord) -> SourceImage:
     time = record.text("Acquisition Date/Time")
     match = _TIME.fullmatch(time) if time else None
     return SourceImage(
@@ -405,7 +409,7 @@ def _source(record: Record) -> SourceImage:
     )
 
 
-def _component(record: Record) -> Component:
+def _component(record: SectionRecord) -> Component:
     return Component(
         component=_identity(record, "Component ID", "Tile ID"),
         product_image=_identity(record, "Product Image ID"),
@@ -413,7 +417,7 @@ def _component(record: Record) -> Component:
     )
 
 
-def _identity(record: Record, *keys: str) -> str:
+def _identity(record: SectionRecord, *keys: str) -> str:
     value = record.text(*keys)
     if value is None:
         raise InputError(
@@ -425,7 +429,7 @@ def _identity(record: Record, *keys: str) -> str:
     return value
 
 
-def _placement(record: Record) -> Placement:
+def _placement(record: SectionRecord) -> MapPlacement:
     x = record.number("UL Map X (Easting)", "UL Map X", units=METRES)
     y = record.number("UL Map Y (Northing)", "UL Map Y", units=METRES)
     dx = record.number("Pixel Size X", units=METRES, low=0.01, high=1000)
@@ -443,7 +447,7 @@ def _placement(record: Record) -> Placement:
                 field=f"{record.name}: {key}",
                 remedy="the file is cut off or was edited: copy it again",
             )
-    return Placement(
+    return MapPlacement(
         upper_left=None if x is None or y is None else (x, y),
         pixel=None if dx is None or dy is None else (dx, dy),
         size=None if columns is None or rows is None else (columns, rows),
@@ -451,13 +455,13 @@ def _placement(record: Record) -> Placement:
     )
 
 
-def _bits(order: Record) -> int | None:
+def _bits(order: SectionRecord) -> int | None:
     text = order.text("Bits per Pixel per Band")
     match = re.match(r"\d{1,3}\b", text, re.ASCII) if text else None
     return int(match[0]) if match else None
 
 
-def _projection(order: Record) -> tuple[str | None, str | None]:
+def _projection(order: SectionRecord) -> tuple[str | None, str | None]:
     """Return what the file calls its map projection, and its CRS where that is UTM on WGS84."""
     name, datum = order.text("Map Projection"), order.text("Datum")
     if name is None:

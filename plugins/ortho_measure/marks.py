@@ -32,7 +32,7 @@ MOST_MARKS, LONGEST_ID, LONGEST_NOTE = 20_000, 64, 500
 _SIGMAS, _GROUPS = (1e-6, 1e6), 1 << 31
 
 
-class Ray(Record):
+class RayMark(Record):
     """A point as it was measured in one of several images: as `Mark` has it of a single one."""
 
     image: tuple[float, float]
@@ -71,7 +71,7 @@ class Mark(Record):
     how: Literal["manual", "matched", "file"] = "manual"
     ground_from: Literal["reference", "typed", "file"] | None = None
     score: float | None = None
-    rays: dict[str, Ray] = pydantic.Field(default_factory=dict)
+    rays: dict[str, RayMark] = pydantic.Field(default_factory=dict)
     note: str = ""
     at: str = ""
 
@@ -113,7 +113,7 @@ def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) 
     return np.array([[column, both], [both, row]])
 
 
-def errors_of(measured: Sequence[Mark | Ray]) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(measured: Sequence[Mark | RayMark]) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviations ``(N,)`` and covariances ``(N, 2, 2)`` of measurements, as a file of them says."""
     covariance = np.array([one.matrix for one in measured], dtype=float).reshape(-1, 2, 2)
     sigma = sigma_of_covariance(covariance)
@@ -152,7 +152,7 @@ def checked(mark: Mark) -> Mark:
     return mark
 
 
-def _check_measurement(one: Mark | Ray, where: str) -> None:
+def _check_measurement(one: Mark | RayMark, where: str) -> None:
     if one.image is not None and max(map(abs, one.image)) > 1e8:
         raise InputError("this is no place in an image", field=f"{where}image")
     least, most = _SIGMAS

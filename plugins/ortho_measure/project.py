@@ -16,13 +16,13 @@ import numpy as np
 from ortho_measure.journal import REMEDY as JOURNAL_REMEDY
 from ortho_measure.journal import Journal
 from ortho_measure.marks import GROUND_CRS, History, Mark, Marks, Written
-from ortho_measure.places import Geometry, Places, Sheet, ground_typed, linked
+from ortho_measure.places import Geometry, SceneGeometry, Sheet, ground_typed, linked
 from ortho_measure.planning import Next
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.json.values import json_position, json_value
-from ortho_pipeline.imaging.matching import View
+from ortho_pipeline.imaging.matching import SceneView
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.runtime.process_limits import Progress
@@ -37,7 +37,7 @@ _MOVED = 0.2
 class _Shown(abc.ABC):
     """What a page is shown of a project: its points, their places in every view, and the figures."""
 
-    views: tuple[View, ...]
+    views: tuple[SceneView, ...]
     sheets: tuple[Sheet, ...]
     surface: Surface
     _history: History
@@ -58,7 +58,7 @@ class _Shown(abc.ABC):
         """Number of the models that references are rendered with now."""
 
     @abc.abstractmethod
-    def places_of(self, number: int) -> Places:
+    def places_of(self, number: int) -> SceneGeometry:
         """Return the geometry of an image as it is adjusted now."""
 
     @abc.abstractmethod
@@ -168,7 +168,7 @@ class Project(_Shown):
         The GeoJSON of the points; its journal lies beside it.
     surface : Surface
         The heights.
-    views : sequence of View
+    views : sequence of SceneView
         The images.
     sheets : sequence of Sheet
         The references as maps.
@@ -182,7 +182,7 @@ class Project(_Shown):
     _solution: Any
     rendered: list[Any]
 
-    def __init__(self, output: Path, surface: Surface, views: Sequence[View], sheets: Sequence[Sheet]) -> None:
+    def __init__(self, output: Path, surface: Surface, views: Sequence[SceneView], sheets: Sequence[Sheet]) -> None:
         self.output, self.surface, self.views, self.sheets = output, surface, tuple(views), tuple(sheets)
         self._lock = threading.RLock()
         self._saved = -1
@@ -222,7 +222,7 @@ class Project(_Shown):
         """Return all geometries by their names."""
 
     @abc.abstractmethod
-    def rendering(self, name: str, version: int) -> Places | None:
+    def rendering(self, name: str, version: int) -> SceneGeometry | None:
         """Return what a view is rendered from by a model; None if it is the raster itself.
 
         Raises

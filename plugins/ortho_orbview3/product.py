@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ortho_orbview3.label import Group, read_label
+from ortho_orbview3.label import LabelGroup, read_label
 from ortho_pipeline.plugin import (
     RPC,
     Array,
@@ -214,21 +214,21 @@ def _box(rpc: RPC) -> Array:
     return centre + signs * half
 
 
-def _positive(group: Group, key: str) -> float:
+def _positive(group: LabelGroup, key: str) -> float:
     value = group.number(key)
     if not value > 0:
         raise InputError(f"{value:g} is not a spacing", file=group.file, field=group.place(key))
     return value
 
 
-def _known(group: Group, key: str) -> float | None:
+def _known(group: LabelGroup, key: str) -> float | None:
     if not group.has(key):
         return None
     value = group.number(key)
     return None if value < 0 or value == UNKNOWN else value
 
 
-def _time(group: Group, key: str) -> datetime.datetime | None:
+def _time(group: LabelGroup, key: str) -> datetime.datetime | None:
     if not group.has(key):
         return None
     text = group.text(key)
@@ -239,7 +239,7 @@ def _time(group: Group, key: str) -> datetime.datetime | None:
     return time if time.tzinfo is not None else time.replace(tzinfo=datetime.UTC)
 
 
-def _corners(product: Group) -> Array:
+def _corners(product: LabelGroup) -> Array:
     group = product.group("geodeticCorners")
     found = np.array(
         [[group.group(name).number(key) for key in ("longitude", "latitude", "height")] for name in CORNERS]
@@ -252,7 +252,7 @@ def _corners(product: Group) -> Array:
     return found
 
 
-def _rpc(group: Group) -> RPC:
+def _rpc(group: LabelGroup) -> RPC:
     fields = {key: repr(group.number(name)) for key, name in SCALAR_KEYS.items()}
     for key, name in COEFFICIENT_KEYS.items():
         fields[key] = " ".join(map(repr, group.numbers(name, 20)))

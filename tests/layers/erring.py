@@ -76,7 +76,7 @@ def scene_of(sensor: str, seed: int, count: int, *, bent: bool) -> Truth:
         points = points.with_roles(["control"] * count)
         return Truth(vendor_rpc(scene), points, (scene.columns, scene.rows), scene.meet, scene.terrain, zone)
     if sensor == "cartosat":
-        bias = cartosat.Bias(*random.normal(0, 5, 2), *(random.normal(0, 2e-4, 3) if bent else (0.0, 0.0, 0.0)))
+        bias = cartosat.RpcBias(*random.normal(0, 5, 2), *(random.normal(0, 2e-4, 3) if bent else (0.0, 0.0, 0.0)))
         pair = cartosat.StereoPair.make(seed=seed, points=count)
         camera, sigma = pair.cameras["fore"], 0.3
         points = pair.measure(seed, sigma_column=sigma, sigma_row={"fore": sigma, "aft": sigma})["fore"]

@@ -37,7 +37,7 @@ class Rows(NamedTuple):
     of_ground: Array
 
 
-class Point(NamedTuple):
+class FactoredPoint(NamedTuple):
     """The rows of one point, factored: B = Q R, with `q` ``(3, rows)``, and `turned` ``(3, k p)``, which is Q' A.
 
     What has a column for each parameter of the images of a point has some more, which are zero, so that loops over them
@@ -62,7 +62,7 @@ def _room(rows, begin, end):
     for t in range(begin, end):
         most = max(most, rows.starts[t + 1] - rows.starts[t])
     wide = _padded(most * rows.by_params.shape[2])
-    return Point(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, wide))), most, wide
+    return FactoredPoint(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, wide))), most, wide
 
 
 @inlined

@@ -19,7 +19,7 @@ from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
-    from ortho_pipeline.commands.survey.folder import Kind, Survey
+    from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind
 
 #: What belongs to a scene.
 _KINDS: tuple[Kind, ...] = ("dem", "points", "map image")
@@ -129,7 +129,7 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
     return None
 
 
-def next_steps(seen: Survey) -> list[str]:
+def next_steps(seen: FolderSurvey) -> list[str]:
     """Return what to do next with what lies in a folder: sentences, and commands that work when they are pasted."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
 

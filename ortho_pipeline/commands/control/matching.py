@@ -41,7 +41,7 @@ from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
-    from ortho_pipeline.imaging.matching import Matches, Reference, View
+    from ortho_pipeline.imaging.matching import Matches, Reference, SceneView
 
 #: How far a model may be off (m) of which nothing is known, and at most this part of the scene's shorter side.
 DEFAULT_SEARCH, _PART = 100.0, 0.25
@@ -278,7 +278,7 @@ def match_scene(
 
 def open_reference_views(
     scene: Scene, options: MatchOptions, surface: Surface | None, opened: SceneOptions = SceneOptions()
-) -> tuple[View, tuple[Reference, ...]]:
+) -> tuple[SceneView, tuple[Reference, ...]]:
     """Open a scene and its references as a matcher sees them.
 
     Raises
@@ -286,7 +286,7 @@ def open_reference_views(
     InputError
         For references that are none, and a scene without model or heights.
     """
-    from ortho_pipeline.imaging.matching import View, open_references
+    from ortho_pipeline.imaging.matching import SceneView, open_references
 
     if surface is None:
         raise InputError(
@@ -312,7 +312,7 @@ def open_reference_views(
     for one in references:
         _refuse_scene(scene, one)
     rasters = scene.rasters or (scene.path,)
-    return View(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
+    return SceneView(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
 
 
 @contextmanager

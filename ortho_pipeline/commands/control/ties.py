@@ -131,7 +131,7 @@ def tie_scenes(
     InputError
         For a scene without a model, fewer than two scenes, and scenes that cannot be tied together.
     """
-    from ortho_pipeline.imaging.matching import View
+    from ortho_pipeline.imaging.matching import SceneView
     from ortho_pipeline.imaging.matching.targets import metres_per_pixel
     from ortho_pipeline.imaging.ties import TieSettings, tie
 
@@ -146,7 +146,7 @@ def tie_scenes(
                 remedy="measure tie points by hand",
             )
     views = [
-        View(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
+        SceneView(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
         for scene in (on_surface(one, surface) for one in scenes.values())
     ]
     searches = [

@@ -58,7 +58,7 @@ class SurveyedFile:
 
 
 @dataclass(frozen=True)
-class Survey:
+class FolderSurvey:
     """What lies in a folder."""
 
     folder: Path
@@ -90,7 +90,7 @@ class Survey:
         return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": json_value(self.found)}
 
 
-def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Survey:
+def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> FolderSurvey:
     """Look at the files of a folder and of those in it; outputs of this program are left out.
 
     Raises
@@ -109,7 +109,7 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
             remedy="give the folder of one delivery, or write the file of the run by hand (docs/run.md)",
         )
     found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
-    return Survey(place, tuple(_without_parts(found)))
+    return FolderSurvey(place, tuple(_without_parts(found)))
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:

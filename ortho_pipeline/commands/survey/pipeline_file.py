@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.commands.survey.folder import Kind, Survey, survey
+from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind, survey
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import allowed, write_text
 from ortho_pipeline.options import SceneOptions
@@ -71,7 +71,7 @@ def init(
     return Result({"pipeline": target}, document, "\n".join(lines))
 
 
-def text(seen: Survey, prefix: str = ".") -> str:
+def text(seen: FolderSurvey, prefix: str = ".") -> str:
     """Return the file: what was found as settings, what was not as comments."""
 
     def at(name: str) -> str:

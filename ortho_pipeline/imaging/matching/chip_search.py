@@ -13,7 +13,7 @@ from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.imaging.matching.correlation import Peaks, orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.targets import Reference, Target, View
+from ortho_pipeline.imaging.matching.targets import Reference, SceneView, Target
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.runtime.process_limits import side_by_side
@@ -84,7 +84,7 @@ def in_batches(work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_]
 
 
 def in_each_band(
-    view: View,
+    view: SceneView,
     targets: Sequence[Target],
     origins: NDArray[np.int_],
     scene: Chips,
@@ -96,7 +96,7 @@ def in_each_band(
 
     Parameters
     ----------
-    view : View
+    view : SceneView
         With the model as the matches corrected it.
     origins : (n, 2)
         First pixels of chips that were matched.

@@ -31,8 +31,8 @@ from ortho_pipeline.imaging.matching.search import Level, place, refuse_accident
 from ortho_pipeline.imaging.matching.sight import HEIGHTS, Chips, across, displacement, placed_along_sight
 from ortho_pipeline.imaging.matching.targets import (
     SAMPLES,
+    SceneView,
     Target,
-    View,
     chip_factor,
     metres_per_pixel,
     near,
@@ -153,7 +153,7 @@ class Matches:
     bands: tuple[BandShift, ...] = ()
 
 
-def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Matches:
+def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -> Matches:
     """Match a scene with targets.
 
     Raises
@@ -179,7 +179,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     # The targets may show a part of that rectangle only.
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
-    corrected = View(view.intensity, correction, view.surface)
+    corrected = SceneView(view.intensity, correction, view.surface)
     origins, cells = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
     tried = _Tried(view, targets, origins, cells, base, threads, displaced)
     tried.search(correction)
@@ -193,7 +193,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     return replace(found, coverage=len(shown) / SAMPLES**2, bands=bands, points=points)
 
 
-def _shown(view: View, targets: Sequence[Target]) -> Array:
+def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
     """Return those of points ``(n, 2)`` spread over the scene that a target shows, as the model has it.
 
     Raises
@@ -213,7 +213,7 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
     return image[inside]
 
 
-def _region(view: View, shown: Array) -> tuple[int, int, int, int]:
+def _region(view: SceneView, shown: Array) -> tuple[int, int, int, int]:
     """Return the rectangle (left, top, right, bottom) of the scene about points ``(n, 2)`` that a target shows."""
     half = np.array(view.size) / (2 * SAMPLES)
     low = np.maximum(np.floor(shown.min(axis=0) - half), 0).astype(int)
@@ -221,7 +221,7 @@ def _region(view: View, shown: Array) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
+def _inside(view: SceneView, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
     """Tell which image points ``(n,)`` fall into a target."""
     ground = meet_surface(view.model, image, view.surface)
     # Where the model is off, the surface may end too soon: its reference height stands in.
@@ -231,7 +231,7 @@ def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.b
 
 
 def _cells_shown(
-    view: View, targets: Sequence[Target], region: tuple[int, int, int, int], grid: tuple[int, int]
+    view: SceneView, targets: Sequence[Target], region: tuple[int, int, int, int], grid: tuple[int, int]
 ) -> NDArray[np.bool_]:
     """Return the cells ``(rows, columns)`` of a region whose centre a target shows."""
     steps = [
@@ -246,7 +246,7 @@ class _Tried:
 
     def __init__(
         self,
-        view: View,
+        view: SceneView,
         targets: Sequence[Target],
         origins: NDArray[np.int_],
         cells: NDArray[np.int_],
@@ -273,7 +273,7 @@ class _Tried:
         """Return what single bands say of the matches that are kept, measured with the last correction."""
         good = np.flatnonzero(self.reason == "")
         return in_each_band(
-            View(self.view.intensity, correction, self.view.surface),
+            SceneView(self.view.intensity, correction, self.view.surface),
             self.targets,
             self.origins[good] + self.whole[good],
             self.scene[good],
@@ -283,14 +283,14 @@ class _Tried:
         )
 
     def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
-        seen = View(self.view.intensity, correction, self.view.surface)
+        seen = SceneView(self.view.intensity, correction, self.view.surface)
         origins = self.origins[index] + self.whole[index] - radius * self.factor
         return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
 
     def search(self, correction: SensorModel) -> None:
         """Find each chip to a chip px about where the correction puts it, or along the line of sight."""
         if self.displaced:
-            seen, reach = View(self.view.intensity, correction, self.view.surface), 2 * HEIGHTS * self.displaced
+            seen, reach = SceneView(self.view.intensity, correction, self.view.surface), 2 * HEIGHTS * self.displaced
             chips = Chips(
                 seen, self.targets, self.centres.astype(int), self.factor, reach + 2 * self.factor, self.threads
             )

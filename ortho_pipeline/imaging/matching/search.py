@@ -29,7 +29,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.agreement import affine_step, agreed, followed_by, shifted
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
-from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pixel
+from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_per_pixel
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -89,7 +89,7 @@ class Level:
 
 
 def place(
-    view: View, targets: Sequence[Target], reach: float, base: int, region: Region, rotation_deg: float = 0.0
+    view: SceneView, targets: Sequence[Target], reach: float, base: int, region: Region, rotation_deg: float = 0.0
 ) -> tuple[ImageCorrection, list[Level]]:
     """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
 
@@ -129,7 +129,7 @@ def place(
 
 
 def _turned(
-    view: View,
+    view: SceneView,
     targets: Sequence[Target],
     region: Region,
     start: ImageCorrection,
@@ -157,7 +157,7 @@ def _turned(
 
 
 def _settled(
-    view: View, targets: Sequence[Target], region: Region, correction: ImageCorrection, factor: int
+    view: SceneView, targets: Sequence[Target], region: Region, correction: ImageCorrection, factor: int
 ) -> ImageCorrection:
     """Return what a correction leads to where its chips agree on a better one, step by step.
 
@@ -198,7 +198,7 @@ def _apart(one: ImageCorrection, other: ImageCorrection, region: Region) -> floa
 
 
 def _refined(
-    view: View,
+    view: SceneView,
     targets: Sequence[Target],
     reach: float,
     base: int,
@@ -288,7 +288,9 @@ def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def _correlated(view: View, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int) -> _Shown:
+def _correlated(
+    view: SceneView, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int
+) -> _Shown:
     """Correlate chips spread over a region with the targets, each with the first that shows enough there."""
     origins = _spread(region, side, factor)
     wide = side + 2 * radius

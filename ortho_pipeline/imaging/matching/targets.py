@@ -29,7 +29,7 @@ _RATIO = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SceneView:
     """A scene as a matcher sees it.
 
     Parameters
@@ -219,14 +219,14 @@ def open_references(
     return tuple(Reference.open(path, bands, **access) for path in paths)
 
 
-def spread_over(view: View) -> Array:
+def spread_over(view: SceneView) -> Array:
     """Return points ``(SAMPLES**2, 2)`` spread over a scene."""
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     columns, rows = np.meshgrid(steps * view.size[0], steps * view.size[1])
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def near(view: View, targets: Sequence[Target], reach: float) -> Sequence[Target]:
+def near(view: SceneView, targets: Sequence[Target], reach: float) -> Sequence[Target]:
     """Return the targets that may show something of a scene whose model is off by `reach` px; all, if none may.
 
     Of a country's many orthoimages a scene needs few, and each of the others would be asked for every chip.
@@ -258,7 +258,7 @@ def shown_by(targets: Sequence[Target], ground: Array, crs: str) -> NDArray[np.b
     return found
 
 
-def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
+def chip_factor(view: SceneView, targets: Sequence[Target], shown: Array) -> int:
     """Return how many pixels of a scene make one of a chip, where targets show points ``(n, 2)`` of it; at least 1.
 
     Raises
@@ -280,7 +280,7 @@ def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
     return max(2 if view.intensity.enlarged else 1, round(1 / ratio / _FINER))
 
 
-def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
+def _resolution_ratio(view: SceneView, target: Target, image: Array) -> Array:
     """Return pixels of the target per pixel of the scene ``(n,)`` at image points; NaN where it shows nothing."""
     heights = np.full(len(image), view.model.reference_height)
     around = [
@@ -291,7 +291,7 @@ def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
     return np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
 
 
-def metres_per_pixel(view: View) -> float:
+def metres_per_pixel(view: SceneView) -> float:
     """Return the size (m) of a pixel on the ground in the middle of a scene."""
     middle = np.array(view.size) / 2
     image = middle + np.array([(0.0, 0.0), (8.0, 0.0), (0.0, 8.0)])

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
-from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, View, metres_per_pixel
-from ortho_pipeline.imaging.ties.pairs import Matched, Pair, PairSummary, TieSettings, shared, shows
+from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, SceneView, metres_per_pixel
+from ortho_pipeline.imaging.ties.pairs import Pair, PairMatches, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.caching.block_cache import limit_cache
@@ -58,7 +58,7 @@ class Ties:
         return np.intersect1d(self.track[self.image == first], self.track[self.image == second])
 
 
-def tie(views: Sequence[View], settings: TieSettings) -> Ties:
+def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
     """Tie scenes together.
 
     Raises
@@ -103,7 +103,7 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
     return block.ties()
 
 
-def _overlaps(views: Sequence[View], targets: Sequence[OtherScene]) -> dict[tuple[int, int], Array]:
+def _overlaps(views: Sequence[SceneView], targets: Sequence[OtherScene]) -> dict[tuple[int, int], Array]:
     """Return the pairs of scenes that show the same ground, and points ``(n, 2)`` of the first that the second does."""
     found = {}
     for first, second in itertools.combinations(range(len(views)), 2):
@@ -124,12 +124,12 @@ class _Track:
 class _Block:
     """Tracks as they grow, home by home."""
 
-    def __init__(self, views: Sequence[View], targets: Sequence[OtherScene], settings: TieSettings) -> None:
+    def __init__(self, views: Sequence[SceneView], targets: Sequence[OtherScene], settings: TieSettings) -> None:
         self.views, self.targets, self.settings = views, targets, settings
         self.tracks: list[_Track] = []
         self.pairs: list[PairSummary] = []
 
-    def tie_home(self, home: int, view: View, partners: Mapping[int, Array]) -> None:
+    def tie_home(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> None:
         """Measure chips of a scene in the scenes after it."""
         placed = self._placed(home, view, partners)
         if not placed:
@@ -153,7 +153,7 @@ class _Block:
         self._take(home, asking, found, placed)
         self.tracks += [track for track in begun if len(track.places) > 1]
 
-    def _placed(self, home: int, view: View, partners: Mapping[int, Array]) -> dict[int, Pair]:
+    def _placed(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> dict[int, Pair]:
         """Return the pairs of a home whose relative position was found; the others are said."""
         placed = {}
         search = self.settings.search / metres_per_pixel(view)
@@ -165,7 +165,12 @@ class _Block:
         return placed
 
     def _begun(
-        self, home: int, view: View, placed: Mapping[int, Pair], partners: Mapping[int, Array], grown: Sequence[_Track]
+        self,
+        home: int,
+        view: SceneView,
+        placed: Mapping[int, Pair],
+        partners: Mapping[int, Array],
+        grown: Sequence[_Track],
     ) -> tuple[list[_Track], list[set[int]]]:
         """Return new tracks, one in each cell that lacks a tie with a scene after it, and these scenes of each."""
         share = min(len(partners[other]) for other in placed) / SAMPLES**2
@@ -190,7 +195,7 @@ class _Block:
         self,
         home: int,
         asking: Sequence[_Track],
-        found: Mapping[int, tuple[NDArray[np.int_], Matched]],
+        found: Mapping[int, tuple[NDArray[np.int_], PairMatches]],
         placed: Mapping[int, Pair],
     ) -> None:
         """Add what was found to the tracks."""
@@ -227,7 +232,7 @@ class _Block:
         )
 
 
-def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], Matched]]) -> None:
+def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], PairMatches]]) -> None:
     """Take the worse of two matches of one chip away that put the ground at different heights."""
     for (first_index, first), (second_index, second) in itertools.combinations(found.values(), 2):
         _, rows, others = np.intersect1d(first_index, second_index, return_indices=True)

@@ -16,7 +16,7 @@ from ortho_measure.block.proposals import TieSearch
 from ortho_measure.block.solution import BlockSolution, figures, solve
 from ortho_measure.block.table import block_points, document, marks_of_block
 from ortho_measure.marks import GROUND_CRS, Mark
-from ortho_measure.places import Geometry, Places, Sheet
+from ortho_measure.places import Geometry, SceneGeometry, Sheet
 from ortho_measure.planning import Next
 from ortho_measure.project import Project, moved, now, points_file
 from ortho_pipeline.block.start import Start
@@ -33,7 +33,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.imaging.matching import Reference, View, open_references
+from ortho_pipeline.imaging.matching import Reference, SceneView, open_references
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
@@ -55,7 +55,7 @@ class BlockImages:
     labels: tuple[str, ...]
     names: tuple[str, ...]
     scenes: tuple[Scene, ...]
-    places: tuple[Places, ...]
+    places: tuple[SceneGeometry, ...]
 
 
 class BlockSession(Project):
@@ -105,7 +105,7 @@ class BlockSession(Project):
         self._begin()
 
     @staticmethod
-    def _spread(places: Places) -> Array:
+    def _spread(places: SceneGeometry) -> Array:
         """Return ground in the CRS of the model, all over an image."""
         width, height = places.view.size
         columns, rows = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
@@ -210,10 +210,10 @@ class BlockSession(Project):
 
     # -- places ------------------------------------------------------------------------------------------------------
 
-    def places_of(self, number: int) -> Places:
+    def places_of(self, number: int) -> SceneGeometry:
         return self.images.places[number].by(self._solution.models[self.images.labels[number]])
 
-    def at(self, version: int, number: int = 0) -> Places:
+    def at(self, version: int, number: int = 0) -> SceneGeometry:
         """Return the geometry that references were rendered with for an image."""
         if not 0 <= version < len(self.rendered):
             raise InputError("there is no such rendering", field="version")
@@ -226,7 +226,7 @@ class BlockSession(Project):
             found[f"reference-{number}"] = self.at(version, number)
         return found | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
 
-    def rendering(self, name: str, version: int) -> Places | None:
+    def rendering(self, name: str, version: int) -> SceneGeometry | None:
         kind, number = name.split("-")
         return self.at(version, int(number)) if kind == "reference" else None
 
@@ -335,7 +335,9 @@ def open_block_session(
     bands = match.reference_bands or ()
     references = open_references(match.reference, bands, **access) if match.reference else ()
     places = tuple(
-        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights), references)
+        SceneGeometry(
+            SceneView(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights), references
+        )
         for one in scenes
     )
     known = BlockImages(tuple(os.fspath(image) for image in images), tuple(labels), tuple(names), scenes, places)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_measure.block.left_out import LeftOut
+from ortho_measure.block.left_out import LeftOutResiduals
 from ortho_measure.solution import LEAST_CHECK_POINTS, SUSPICIOUS
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
@@ -34,14 +34,14 @@ class BlockSolution:
     fit : BlockFit, optional
     error : str
         What keeps it from being made, as people read it.
-    left_out : LeftOut, optional
+    left_out : LeftOutResiduals, optional
         What each measurement is off by had it taken no part.
     """
 
     models: Mapping[str, SensorModel]
     fit: BlockFit | None = None
     error: str = ""
-    left_out: LeftOut | None = None
+    left_out: LeftOutResiduals | None = None
 
 
 def solve(
@@ -57,7 +57,7 @@ def solve(
     try:
         priors = {label: start.priors for label, start in starts.items()}
         fit = adjust(models, points, priors=priors, robust=robust, hold=hold)
-        left_out = LeftOut.of(fit, starts, hold)
+        left_out = LeftOutResiduals.of(fit, starts, hold)
     except OrthoError as error:
         return BlockSolution(models, None, error.message)
     except np.linalg.LinAlgError as error:
@@ -135,7 +135,7 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     return told
 
 
-def _left_out_in_turn(fit: BlockFit, without: LeftOut, to: str, checks: int) -> dict[str, Any]:
+def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks: int) -> dict[str, Any]:
     """Return the accuracy at control points whose ground was left out in turn, where others tell of all of it."""
     apart = without.ground[fit.used_ground]
     apart = apart[np.isfinite(apart).all(axis=1)]

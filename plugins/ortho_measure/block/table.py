@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_measure.marks import GROUND_CRS, Mark, Marks, Ray, checked, errors_of
+from ortho_measure.marks import GROUND_CRS, Mark, Marks, RayMark, checked, errors_of
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.points.geojson import feature_of
@@ -87,7 +87,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
         rays = {}
         for ray in np.flatnonzero(points.point == k).tolist():
             (column, both), (_, row) = covariance[ray].tolist()
-            rays[points.images[points.image[ray]]] = Ray(
+            rays[points.images[points.image[ray]]] = RayMark(
                 image=tuple(points.measured[ray].tolist()),
                 how="file",
                 sigma_image=None if more[ray] else float(points.sigma_image[ray]),

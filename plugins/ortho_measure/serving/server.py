@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_measure.block.session import BlockSession
 from ortho_measure.project import Project
-from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.entry import PageEntry
 from ortho_measure.serving.guard import REPORT_POLICY, Admit, App, Guard
 from ortho_measure.serving.listener import LOOPBACK, QUEUE, Listener
 from ortho_measure.serving.log import repetitions_counted
 from ortho_measure.serving.making import PICTURES, Making
-from ortho_measure.serving.tiles import MOST, SIDE, Tiles
+from ortho_measure.serving.tiles import MOST, SIDE, TileServer
 from ortho_measure.session import Session
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
@@ -72,7 +72,7 @@ class Windows:
 class _Answers:
     """What is answered to each request; methods of the same names as paths."""
 
-    def __init__(self, session: Project, tiles: Tiles) -> None:
+    def __init__(self, session: Project, tiles: TileServer) -> None:
         self._session, self._tiles, self._windows = session, tiles, Windows()
         self.making = Making(session)
 
@@ -210,13 +210,17 @@ class _Answers:
 
 
 def application(
-    session: Project, entry: Entry, hosts: set[str], opened: SceneOptions = SceneOptions(), admit: Admit | None = None
+    session: Project,
+    entry: PageEntry,
+    hosts: set[str],
+    opened: SceneOptions = SceneOptions(),
+    admit: Admit | None = None,
 ) -> App:
     """Return the ASGI application of a session."""
     from starlette.applications import Starlette
     from starlette.routing import Route
 
-    given = _Given(session, Tiles(session, opened))
+    given = _Given(session, TileServer(session, opened))
     routes = [
         Route("/", given.page),
         Route("/api/{what}", given.answer, methods=["POST"]),
@@ -230,7 +234,7 @@ def application(
 class _Given:
     """What a request is given: parts of the page, tiles, answers, and what was made; work is done by threads."""
 
-    def __init__(self, session: Project, tiles: Tiles) -> None:
+    def __init__(self, session: Project, tiles: TileServer) -> None:
         self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
         room = resources.files("ortho_measure")
         self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
@@ -325,7 +329,7 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     """
     import uvicorn
 
-    entry, listener = Entry(), Listener(port)
+    entry, listener = PageEntry(), Listener(port)
     number = listener.getsockname()[1]
     hosts = {f"{LOOPBACK}:{number}", f"localhost:{number}"}
     limit_cache(OutputOptions.memory, os.cpu_count() or 1)

@@ -27,7 +27,7 @@ MOST = 1 << 16
 Pixels = NDArray[np.float32]
 
 
-class Tiles:
+class TileServer:
     """Tiles of one project, by the names of its views (`Project`).
 
     Parameters

@@ -129,7 +129,7 @@ NAIVE = (
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperRow:
     """One row of a table: model, choice of control points, and what the paper found (None: not given)."""
 
     table: int
@@ -143,16 +143,16 @@ class Row:
         return f"{self.model} {self.selection}"
 
 
-def _row3(count: int, *paper: float) -> Row:
-    return Row(3, RIGOROUS, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
+def _row3(count: int, *paper: float) -> PaperRow:
+    return PaperRow(3, RIGOROUS, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
 
 
-def _row4(count: int, group: int, control: float, check: float) -> Row:
-    return Row(4, RIGOROUS, f"cluster:{count}:{group}", (None, None, control, None, None, check))
+def _row4(count: int, group: int, control: float, check: float) -> PaperRow:
+    return PaperRow(4, RIGOROUS, f"cluster:{count}:{group}", (None, None, control, None, None, check))
 
 
-def _row5(model: str, count: int, *paper: float) -> Row:
-    return Row(5, model, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
+def _row5(model: str, count: int, *paper: float) -> PaperRow:
+    return PaperRow(5, model, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
 
 
 ROWS = (
@@ -203,7 +203,7 @@ def reproduce(
     off_nadir_deg: float = OFF_NADIR_DEG,
     sigma_image: float = SIGMA_IMAGE,
     sigma_ground: float = SIGMA_GROUND,
-    rows: tuple[Row, ...] = ROWS,
+    rows: tuple[PaperRow, ...] = ROWS,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
     """Run the experiment and return the document of ``ortho reproduce bilsat --json``.
@@ -251,7 +251,7 @@ def reproduce(
     )
 
 
-def naive(row: Row, k: int) -> float | None:
+def naive(row: PaperRow, k: int) -> float | None:
     """Guess a number of a row from the paper's row of the same model with all points (`NAIVE`)."""
     count = int(row.selection.split(":")[1])
     if count == POINTS:
@@ -290,7 +290,7 @@ def _rigorous(points: Points, position: np.ndarray) -> Fit:
     return fit(start, points, robust=False, name=RIGOROUS)
 
 
-def _fit(row: Row, points: Points, position: np.ndarray) -> Fit | None:
+def _fit(row: PaperRow, points: Points, position: np.ndarray) -> Fit | None:
     # All points stand for all: there is nothing to select.
     chosen = points if row.selection == f"even:{len(points)}" else select_control(points, row.selection)
     try:

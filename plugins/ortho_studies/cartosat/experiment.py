@@ -51,7 +51,7 @@ COUNTS = (4, 6, 9, 15, 30)
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperColumn:
     """One column of the paper's tables: model, control points, coordinates of its X, Y, Z, and what the paper found.
 
     Attributes
@@ -75,7 +75,7 @@ class Row:
 
 
 ROWS = (
-    Row(
+    PaperColumn(
         2,
         "affine3d geocentric",
         "affine3d geocentric",
@@ -83,7 +83,7 @@ ROWS = (
         True,
         (0.32, 0.55, 0.32, 0.41, 1.20, 0.96, 1.33, 0.42, -5.1, 2.3, -3.5, 3.2, -5.4, 2.5),
     ),
-    Row(
+    PaperColumn(
         2,
         "affine3d geographic",
         "affine3d geographic",
@@ -91,7 +91,7 @@ ROWS = (
         False,
         (0.54, 0.56, 0.55, 0.54, 1.43, 1.17, 1.81, 0.53, -4.0, 3.5, -4.0, 2.8, -4.3, 7.0),
     ),
-    Row(
+    PaperColumn(
         2,
         "affine3d UTM",
         "affine3d utm",
@@ -99,7 +99,7 @@ ROWS = (
         False,
         (0.33, 0.53, 0.33, 0.42, 0.80, 1.00, 1.81, 0.41, -1.4, 2.5, -4.1, 2.4, -4.2, 7.1),
     ),
-    Row(
+    PaperColumn(
         3,
         "original RPC",
         "rpc",
@@ -107,7 +107,7 @@ ROWS = (
         False,
         (0.91, 33.27, 15.92, 26.80, 2.7, 72.6, 25.9, 22.46, -4.2, -0.3, 69.3, 74.6, -33.0, -18.2),
     ),
-    Row(
+    PaperColumn(
         4,
         "RPC shift",
         "rpc shift",
@@ -115,7 +115,7 @@ ROWS = (
         False,
         (0.25, 0.78, 0.26, 0.44, 0.66, 1.12, 2.23, 0.59, -1.4, 2.3, -3.3, 2.0, -6.6, 8.2),
     ),
-    Row(
+    PaperColumn(
         4,
         "RPC shift + drift",
         "rpc shift-drift",
@@ -123,7 +123,7 @@ ROWS = (
         False,
         (0.25, 0.74, 0.26, 0.46, 0.66, 1.16, 1.99, 0.47, -1.3, 2.3, -4.3, 2.9, -4.8, 7.5),
     ),
-    Row(
+    PaperColumn(
         4,
         "RPC affine",
         "rpc affine",
@@ -131,7 +131,7 @@ ROWS = (
         False,
         (0.25, 0.52, 0.26, 0.40, 0.65, 0.95, 1.67, 0.38, -1.3, 2.3, -3.6, 2.3, -4.4, 6.8),
     ),
-    Row(
+    PaperColumn(
         5,
         "RPC shift, 1 GCP",
         "rpc shift",
@@ -139,7 +139,7 @@ ROWS = (
         False,
         (0.46, 0.79, 0.47, 0.46, 1.17, 1.11, 2.44, 0.38, -2.5, 1.3, -3.3, 2.1, -8.3, 6.5),
     ),
-    Row(
+    PaperColumn(
         5,
         "RPC shift + drift, 3 GCPs",
         "rpc shift-drift",
@@ -147,7 +147,7 @@ ROWS = (
         False,
         (0.27, 1.03, 0.28, 0.62, 0.77, 1.61, 2.24, 0.35, -1.1, 2.7, -4.7, 4.8, -5.4, 5.5),
     ),
-    Row(
+    PaperColumn(
         6,
         "pushbroom, 9 GCPs",
         "pushbroom",
@@ -155,7 +155,7 @@ ROWS = (
         True,
         (0.27, 0.54, 0.30, 0.41, 1.29, 0.81, 1.35, 0.38, -5.6, 2.7, -2.1, 3.3, -5.6, 2.9),
     ),
-    Row(
+    PaperColumn(
         6,
         "pushbroom, 15 GCPs",
         "pushbroom",
@@ -286,7 +286,7 @@ CURVES = {
 def reproduce(
     realisations: int = 50,
     *,
-    rows: tuple[Row, ...] = ROWS,
+    rows: tuple[PaperColumn, ...] = ROWS,
     counts: tuple[int, ...] = COUNTS,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
@@ -462,12 +462,12 @@ def error_vectors(model: str, seed: int = 0) -> tuple[Array, Array]:
 # -- the document ----------------------------------------------------------------------------------------------------
 
 
-def _numbers(rows: tuple[Row, ...]) -> list[Number]:
+def _numbers(rows: tuple[PaperColumn, ...]) -> list[Number]:
     """Return the numbers of `RMS` of all rows, then those of `OTHERS`."""
     papers = {row.label: row.paper for row in ROWS}
     split = len(RMS)
 
-    def number(row: Row, k: int) -> Number:
+    def number(row: PaperColumn, k: int) -> Number:
         name = (*RMS, *OTHERS)[k]
         label = row.label if k < split else f"{'s0' if name == 's0' else 'extremes'} of {row.label}"
         guess = papers[GUESSED[row.label]][k] if row.label in GUESSED else None

@@ -95,7 +95,7 @@ class Slope:
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class IkonosPass:
     """A satellite that flies and scans: where it is, and which plane it sees, at each time (s); ECEF metres.
 
     Attributes
@@ -215,7 +215,7 @@ class GeoScene:
         Size of a pixel (m), and size of the image.
     """
 
-    scan: Scan
+    scan: IkonosPass
     terrain: Slope
     attitude_error: Array
     west: float
@@ -248,7 +248,7 @@ class GeoScene:
         """
         random = np.random.default_rng([seed, 6])
         azimuth = random.uniform(0.0, 360.0) if azimuth_deg is None else azimuth_deg
-        scan = Scan.over_tehran(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth, reverse=reverse)
+        scan = IkonosPass.over_tehran(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth, reverse=reverse)
         columns, rows = (round(EXTENT / pixel) if size is None else size for size in (columns, rows))
         x, y = to_map().transform(LON, LAT)
         west, north = round(x - columns * pixel / 2), round(y + rows * pixel / 2)
@@ -404,7 +404,7 @@ def _enu_axes(lon: float, lat: float) -> tuple[Array, Array, Array]:
     return east, north, np.cross(east, north)
 
 
-def _attitude_error(scan: Scan, random: np.random.Generator) -> Array:
+def _attitude_error(scan: IkonosPass, random: np.random.Generator) -> Array:
     """Return a small rotation (rad) that moves the line of sight by a length within `BIAS` at the ground."""
     look = scan.aim - scan.satellite(np.zeros(1))[0]
     distance = float(np.linalg.norm(look))

@@ -245,7 +245,7 @@ def _quickbird_numbers(product: simulated.Rectified, rpc: RPC, coast: simulated.
 # -- geometry and curves ---------------------------------------------------------------------------------------------
 
 
-def _geometry(cameras: dict[str, simulated.Scanner]) -> dict[str, float]:
+def _geometry(cameras: dict[str, simulated.TurningScanner]) -> dict[str, float]:
     """Return what the paper tells of the acquisition, as the cameras have it."""
     first, second = cameras.values()
     now = np.zeros(1)

@@ -88,7 +88,7 @@ def write_product(
     return files
 
 
-def label(camera: simulated.Scanner, rpc: RPC, coast: simulated.Coast, name: str) -> str:
+def label(camera: simulated.TurningScanner, rpc: RPC, coast: simulated.Coast, name: str) -> str:
     """Return the label of a scene in the layout of the USGS, with what the vendor believes of the camera."""
     last = np.array([camera.width - 1, camera.height - 1])
     corners = camera.meet(np.array(list(CORNERS.values())) * last + 0.5, coast)
@@ -158,7 +158,7 @@ def _block(name: str, lines: list[str]) -> list[str]:
     return [f"BEGIN_GROUP = {name};", *(f"  {line}" for line in lines), f"END_GROUP = {name};"]
 
 
-def _spacing(camera: simulated.Scanner) -> tuple[float, float]:
+def _spacing(camera: simulated.TurningScanner) -> tuple[float, float]:
     """Return the distance (m) of neighbouring pixel centres along and across the line, in the middle of the scene."""
     middle = np.array([camera.width / 2, camera.height / 2])
     seen = camera.meet(middle + np.array([[0, 0], [1, 0], [0, 1]]), simulated.level(simulated.LEVEL))
@@ -176,7 +176,9 @@ def _write_image(pixels: NDArray[np.uint16], path: Path) -> None:
             dataset.GetRasterBand(1).WriteArray(pixels)
 
 
-def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast, step: float, path: Path) -> None:
+def _write_heights(
+    cameras: dict[str, simulated.TurningScanner], coast: simulated.Coast, step: float, path: Path
+) -> None:
     seen = np.concatenate([camera.outline(h) for camera in cameras.values() for h in simulated.RPC_HEIGHTS])
     xy = np.stack(simulated.to_map().transform(seen[:, 0], seen[:, 1]), axis=1)
     margin = 500.0 + step
@@ -184,7 +186,7 @@ def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast
     write_terrain(path, coast, box, step, simulated.MAP_CRS, GEOID)
 
 
-def _truth(cameras: dict[str, simulated.Scanner], ground: Array, seed: int, pixel: int) -> dict[str, Any]:
+def _truth(cameras: dict[str, simulated.TurningScanner], ground: Array, seed: int, pixel: int) -> dict[str, Any]:
     return {
         "about": "truth of two simulated OrbView-3 scenes",
         "seed": seed,
