@@ -108,7 +108,7 @@ class PipelinePaths:
     def _located(self, address: str, field: str) -> VsiPath:
         if not self.allow_network:
             raise InputError(
-                f"{address!r} lies on another machine, of which nothing is opened unasked",
+                f"network access is off by default, and {address!r} is on another machine",
                 file=self.file,
                 field=field,
                 remedy=Text("allow it with ", Setting("scene.allow_network"), ", or give a file"),
