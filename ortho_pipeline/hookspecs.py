@@ -311,12 +311,15 @@ class Subcommand:
         ``package.module:name`` of the command or group of click.
     examples : tuple of (str, str)
         What each is for, and its command line (``ortho coverage ...``): they end the command's help.
+    group : str
+        The heading of ``ortho --help`` under which it is listed.
     """
 
     name: str
     summary: str
     target: str
     examples: tuple[tuple[str, str], ...] = ()
+    group: str = "More commands"
 
 
 @hookspec

@@ -54,11 +54,12 @@ def measure(
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
-    """Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.
+    """Measure control points in the browser.
 
-    A click is matched to a part of a pixel, the fit is solved after every point, and the page says where the next one
-    tells most. Everything stays on this machine; Ctrl-C ends. The file of points is for --gcps of 'ortho fit',
-    'rectify', 'compare' and 'export'; of several images, such as a stereo pair, for --points of 'ortho adjust'.
+    The page shows IMAGE beside its reference, in the geometry of the image. A click is matched to a fraction of a
+    pixel, the fit is updated after every point, and the page proposes the best next point. Everything stays on this
+    machine; Ctrl-C ends the command. Give the file of points to 'ortho fit', 'rectify', 'compare' or 'export' with
+    --gcps. Points of several images, such as a stereo pair, are for --points of 'ortho adjust'.
     """
     if not match.reference and len(images) == 1:
         raise InputError(

@@ -44,12 +44,15 @@ def _offered() -> dict[str, Study]:
 
 @click.group(cls=_Studies)
 def simulate() -> None:
-    """Make scenes of known truth."""
+    """Write scenes of known truth."""
 
 
 @click.group(cls=_Studies)
 def reproduce() -> None:
-    """Compute the tables of the papers that this package implements, beside the papers' numbers."""
+    """Recompute the tables of four papers.
+
+    Each table shows the paper's numbers beside ours.
+    """
 
 
 def _simulation(study: Study) -> click.Command:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import UTM, Case, SceneView, Setting
+from scenes import UTM, Case, Setting, View
 
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.fit import Fit, fit
@@ -163,8 +163,8 @@ def drawn(seed: int, kinds: Sequence[str]) -> Setting:
         "clear": {}, "haze": {"haze": 0.5}, "shadows": {"shadows": 0.25}, "clouds": {"clouds": 0.25},
         "noise": {"noise": 0.05}, "holes": {"holes": 0.1}, "8 bit": {"dtype": "uint8"},
     }  # fmt: skip
-    scene = SceneView(**{"noise": 0.015, **weather[str(random.choice(list(weather)))]})
-    reference = SceneView(**{"noise": 0.01, **weather[str(random.choice(list(weather)))]})
+    scene = View(**{"noise": 0.015, **weather[str(random.choice(list(weather)))]})
+    reference = View(**{"noise": 0.01, **weather[str(random.choice(list(weather)))]})
     change = random.choice(["none", "none", "season", "band"])
     if change == "season":
         reference = replace(reference, season=int(random.integers(1, 3)))
@@ -237,7 +237,7 @@ def coverage(count: int) -> list[Setting]:
         found.append(Setting(
             ground=kinds[k * len(kinds) // count], seed=5000 + k, gsd=gsd, error=8.0, kind="shift",
             off_nadir_deg=float(random.uniform(-25, 25)), heading_deg=float(random.uniform(0, 360)),
-            scene=SceneView(noise=0.02), reference=SceneView(noise=0.02),
+            scene=View(noise=0.02), reference=View(noise=0.02),
             dem_sigma=(0.0, 2.0, 4.0)[k % 3], dem_length=(60.0, 120.0)[k % 2], dem_noise=0.5,
             reference_sigma=(0.0, 0.3, 0.0, 0.6)[k % 4], reference_length=100.0,
         ))  # fmt: skip
@@ -292,7 +292,7 @@ def to_refuse(what: str, count: int) -> list[tuple[Setting, float]]:
             angle, far = random.uniform(0, 2 * np.pi), search + 200.0 + 20 * setting.gsd
             setting = replace(setting, offset=(far * np.cos(angle), far * np.sin(angle)))
         else:
-            setting = replace(setting, ground=what, scene=SceneView(noise=0.02), reference=SceneView(noise=0.02))
+            setting = replace(setting, ground=what, scene=View(noise=0.02), reference=View(noise=0.02))
         if what == "water":
             waves = replace(setting.scene, haze=0.2, noise=0.03)
             setting = replace(setting, scene=waves, reference=waves)

@@ -39,7 +39,7 @@ STEPS = (
 def print_steps() -> None:
     """Print the five things that one does."""
     wide = max(len(what) for what, _ in STEPS)
-    say("Orthorectify satellite scenes, and say honestly how good the result is.\n")
+    say("Orthorectify satellite images and report how accurate the result is.\n")
     for what, line in STEPS:
         say(f"  {what:<{wide}}   {line}")
     say(
@@ -52,10 +52,10 @@ def print_steps() -> None:
 @scene_options
 @json_option
 def info(image: str, scene: SceneOptions, as_json: bool) -> None:
-    """Describe an image: sensor, model and where it was read from, position, ground sample distance.
+    """Describe an image, a DEM, an ortho or a folder.
 
-    Of a DEM or an ortho: what it is, and which option takes it. Of a FOLDER: which scenes, DEMs and points lie there,
-    and what to do next.
+    For an image: sensor, model and its file, position, ground sample distance. For a DEM or an ortho: what it is, and
+    which option takes it. For a FOLDER: its scenes, DEMs and points, and the next command.
     """
     from ortho_pipeline import commands
 
@@ -193,7 +193,10 @@ def next_steps(seen: FolderSurvey) -> list[str]:
 @scene_options
 @json_option
 def init(folder: str, path: str | None, overwrite: bool, scene: SceneOptions, as_json: bool) -> None:
-    """Write the file of a run over the scenes of FOLDER, with comments, for 'ortho run'."""
+    """Write a pipeline file for the scenes of FOLDER.
+
+    The file has comments and is for 'ortho run'.
+    """
     from ortho_pipeline.commands.survey.pipeline_file import init as write
 
     print_result(write(folder, path, options=scene, overwrite=overwrite), as_json)
