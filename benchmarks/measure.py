@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 from ortho_measure.block.session import open_block_session
-from ortho_measure.serving.tiles import Tiles
+from ortho_measure.serving.tiles import TileServer
 from ortho_measure.session import open_session
 from ortho_studies.simulation.scanner import LineScanner
 from osgeo import gdal, gdal_array, osr
@@ -147,7 +147,7 @@ def main(side: int) -> None:
             raster(folder, "scene"), folder / "p.geojson", surface=SurfaceOptions(dem=folder / "dem.tif"),
             match=MatchOptions(reference=(str(raster(folder, "reference")),)),
         )  # fmt: skip
-        tiles = Tiles(session)
+        tiles = TileServer(session)
         limits = [tiles.limits("scene-0", 0, None, 0)]
         print(f"open, with the contrast of the scene         {time.perf_counter() - begin:8.2f} s")
         random = np.random.default_rng(2)

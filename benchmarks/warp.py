@@ -43,9 +43,9 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp.engine import rectify
 from ortho_pipeline.warp.job import WarpJob
-from ortho_pipeline.warp.layers.accuracy import Budget, write_accuracy
-from ortho_pipeline.warp.layers.hiding import Hiding
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.accuracy import Budget, write_accuracy
+from ortho_pipeline.warp.quality.hiding import Hiding
+from ortho_pipeline.warp.quality.sight import Sight
 
 gdal.UseExceptions()
 _T = TypeVar("_T")

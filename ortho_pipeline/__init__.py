@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
+
+from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.adjustment import adjust as adjust
@@ -106,21 +107,8 @@ _HOMES = {
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
 
-def _lazily(door: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return `__getattr__` for the module `door`: it loads each name from its home when the name is first used."""
-
-    def load(name: str) -> Any:
-        if name not in homes:
-            raise AttributeError(f"module {door!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"ortho_pipeline.{homes[name]}"), name)
-        setattr(sys.modules[door], name, value)
-        return value
-
-    return load
-
-
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-    _load = _lazily(__name__, _HOMES)
+    _load = lazily(__name__, _HOMES)
 
     def __getattr__(name: str) -> Any:
         if name == "__version__":
@@ -132,9 +120,12 @@ if not TYPE_CHECKING:  # a checker knows the names from above, and no others
 
 #: What a notebook shows as a table: module and name of each type.
 _SHOWN = (
-    ("hookspecs", "Scene"), ("points.table", "Points"), ("estimation.fit", "Fit"), ("block.fit", "BlockFit"),
+    ("hookspecs", "Scene"),
+    ("points.table", "Points"),
+    ("estimation.fit", "Fit"),
+    ("block.fit", "BlockFit"),
     ("estimation.choice.comparison", "ComparisonRecord"),
-)  # fmt: skip
+)
 
 
 def _html(result: Any) -> str:

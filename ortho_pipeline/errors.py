@@ -9,10 +9,10 @@
             CrsError          a coordinate system or a transformation between two is missing or wrong
             DatumError        a height datum is missing, contradicts itself, or its grid is not installed
             CoverageError     the DEM does not cover the scene
-        ModelError            the mathematics failed
-            NotConverged      an iteration did not come to an end
+        ModelError            the computation failed
+            NotConverged      an iteration did not converge
         PluginError           a plugin broke the contract
-        StorageError          a store of objects or a server failed, after requests were repeated
+        StorageError          a store of objects or a server failed, also after retries
         ReportError           the report could not be made; the other outputs are complete (exit code 3)
 
 A bad point is NaN; a bad request is one of these.
@@ -38,18 +38,18 @@ class OrthoError(Exception):
     Parameters
     ----------
     message : str
-        What is wrong, in one sentence; a `Text` where it names options, as in `remedy`.
+        What is wrong, in one sentence. A `Text` if it names options, as `remedy` is.
     file : path, optional
-        The file that it was found in.
+        File that has the error.
     field : str, optional
-        The field, key, column or option.
+        Field, key, column or option that has the error.
     remedy : str, optional
         What the user can do about it.
 
     Attributes
     ----------
     choices : tuple of (Setting, str)
-        Options of which one decides, each with what it says; the command line prints a command of each.
+        Alternative options, each with its meaning. The command line prints one command for each.
     """
 
     choices: tuple[tuple[Any, str], ...] = ()
@@ -69,7 +69,7 @@ class OrthoError(Exception):
         super().__init__(message)
 
     def complete(self, file: object, field: str | None, remedy: str | None) -> None:
-        """Add what the error does not say itself."""
+        """Add file, field and remedy where the error has none."""
         if self.file is None and isinstance(file, str | PathLike):
             self.file = str(fspath(file))
         self.field = self.field or field
@@ -89,10 +89,10 @@ class OrthoError(Exception):
 def completed(
     file: object = None, *, field: str | None = None, remedy: str | None = None, of: str | None = None
 ) -> Iterator[None]:
-    """Give a refusal that comes from within what it does not say itself: file, field and remedy.
+    """Complete an error that is raised inside with file, field and remedy, where it has none.
 
-    A reader knows its file and what a sound one looks like; the line that finds a fault in it need not. With `of` only
-    what is refused because of that field is completed.
+    A reader knows its file and what a valid one looks like; the line that finds a fault may not. With `of`, only
+    errors about that field are completed.
     """
     try:
         yield
@@ -104,7 +104,7 @@ def completed(
 
 @contextlib.contextmanager
 def of_option(name: str) -> Iterator[None]:
-    """Name the option whose value is refused, by what knows of values and not where they come from."""
+    """Set the option as the field of an error that is raised inside and names no file."""
     try:
         yield
     except OrthoError as error:
@@ -114,7 +114,7 @@ def of_option(name: str) -> Iterator[None]:
 
 
 def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
-    """Decorate a function whose first argument is the file that it reads: its refusals are `completed`."""
+    """Decorate a function whose first argument is the file that it reads: complete its errors (see `completed`)."""
 
     def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
         @functools.wraps(function)
@@ -137,11 +137,11 @@ def _rebuild(
 
 
 class InputError(OrthoError):
-    """Something that the user gave is wrong; the message says what to do."""
+    """The input is wrong. The message says what to do."""
 
 
 class TooFewPoints(InputError):
-    """There are fewer points than the model has to have."""
+    """There are fewer points than the model needs."""
 
 
 class DegeneratePoints(InputError):
@@ -149,7 +149,7 @@ class DegeneratePoints(InputError):
 
 
 class CrsError(InputError):
-    """A coordinate reference system, or the way between two, is missing or wrong."""
+    """A coordinate reference system, or a transformation between two, is missing or wrong."""
 
 
 class DatumError(InputError):
@@ -161,7 +161,7 @@ class CoverageError(InputError):
 
 
 class ModelError(OrthoError):
-    """The mathematics failed on input that looked right."""
+    """The computation failed although the input looked right."""
 
 
 class NotConverged(ModelError):
@@ -173,7 +173,7 @@ class PluginError(OrthoError):
 
 
 class StorageError(OrthoError):
-    """A store of objects or a server failed, after requests were repeated."""
+    """A store of objects or a server failed, also after retries."""
 
 
 class ReportError(OrthoError):
@@ -181,7 +181,7 @@ class ReportError(OrthoError):
 
 
 def described(error: BaseException, culprit: object) -> str:
-    """Return kind, text and place of an error: the last line that it passed of the plugin that `culprit` is from.
+    """Return kind, text and place of an error. The place is the last line of the plugin in the traceback.
 
     `culprit` is a function or class of the plugin, or the name of its module.
     """
@@ -197,10 +197,15 @@ def described(error: BaseException, culprit: object) -> str:
 
 
 def error_document(error: BaseException) -> dict[str, Any]:
-    """Return an error as JSON values: kind, message, file, field and remedy; of an unforeseen one the trace too."""
+    """Return an error as JSON values: kind, message, file, field, remedy. Unexpected errors also have the traceback."""
     kind = type(error).__name__
     if isinstance(error, OrthoError):
-        return {"kind": kind, "message": error.message, "file": error.file, "field": error.field,
-                "remedy": error.remedy}  # fmt: skip
+        return {
+            "kind": kind,
+            "message": error.message,
+            "file": error.file,
+            "field": error.field,
+            "remedy": error.remedy,
+        }
     trace = "".join(traceback.format_exception(error))
     return {"kind": kind, "message": str(error) or kind, "file": None, "field": None, "remedy": None, "trace": trace}

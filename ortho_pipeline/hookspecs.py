@@ -19,7 +19,7 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
                      source, facts={"band": int(band)})
 
 Files beside an image are found from ``ortho_pipeline.plugin.place(dataset.GetDescription())``, which has the methods of
-`pathlib.Path` for an image on disk and for one in an archive (docs/plugins.md).
+`pathlib.Path` for an image on disk and for one in an archive (docs/plugin-reference.md).
 
 The host tries every scene at a few points before it works with it (`ortho_pipeline.host.contract`). Test more with
 `ortho_pipeline.testing.check_sensor`.
@@ -311,12 +311,15 @@ class Subcommand:
         ``package.module:name`` of the command or group of click.
     examples : tuple of (str, str)
         What each is for, and its command line (``ortho coverage ...``): they end the command's help.
+    group : str
+        The heading of ``ortho --help`` under which it is listed.
     """
 
     name: str
     summary: str
     target: str
     examples: tuple[tuple[str, str], ...] = ()
+    group: str = "More commands"
 
 
 @hookspec

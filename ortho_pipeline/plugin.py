@@ -1,8 +1,8 @@
 """Everything that a plugin is made of: its author imports from here alone.
 
 The hooks and what they return, errors and messages, files, the ellipsoid, sensor models, points, fits, and the parts of
-commands. docs/plugins.md lists the names by purpose and shows how to write a plugin; `ortho_pipeline.hookspecs` states
-the hooks. The names are public: docs/plugins.md says how long a name lives.
+commands. docs/plugins.md shows how to write a plugin; `ortho_pipeline.hookspecs` states the hooks.
+docs/plugin-reference.md lists the names by purpose, and says how long a public name lives.
 
 Each name is loaded when it is first used: ``from ortho_pipeline.plugin import Subcommand, hookimpl`` loads neither
 NumPy nor GDAL.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ortho_pipeline import _lazily
+from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.cli.machine.terminal import say as say
@@ -292,4 +292,4 @@ _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-    __getattr__ = _lazily(__name__, _HOMES)
+    __getattr__ = lazily(__name__, _HOMES)

@@ -27,6 +27,7 @@ from ortho_pipeline.testing import check_sensor_model
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLE = ROOT / "examples" / "ortho_tinysat"
 TUTORIAL = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+REFERENCE = (ROOT / "docs" / "plugin-reference.md").read_text(encoding="utf-8")
 
 
 def run(*command, **options) -> str:
@@ -160,14 +161,14 @@ def test_its_study_is_a_command_of_simulate_and_reproduce(fresh, tmp_path):
 # -- the tutorial ----------------------------------------------------------------------------------------------------
 
 
-def blocks_of(name: str) -> list[str]:
-    """Return the parts of a file that the tutorial prints."""
-    return re.findall(rf"<!-- {re.escape(name)} -->\n```\w*\n(.*?)```", TUTORIAL, re.DOTALL)
+def blocks_of(name: str, page: str = TUTORIAL) -> list[str]:
+    """Return the parts of a file that a page prints."""
+    return re.findall(rf"<!-- {re.escape(name)} -->\n```\w*\n(.*?)```", page, re.DOTALL)
 
 
-def test_the_camera_of_the_tutorial_looks_where_it_says():
+def test_the_camera_of_the_reference_looks_where_it_says():
     found = {}
-    exec(blocks_of("frame")[0], found)
+    exec(blocks_of("frame", REFERENCE)[0], found)
     model = found["model"]
     centre, half = model.domain
     check_sensor_model(model, centre + np.array([[0, 0, 0], [0.5, 0.3, 0.9], [-0.5, -0.4, -0.9]]) * half)
@@ -188,13 +189,13 @@ def test_the_tutorial_is_the_example():
 KINDS = (hookspecs.Sensor, hookspecs.Scene, hookspecs.Format, Export, hookspecs.Subcommand, of_studies.Study)
 
 
-def test_everything_that_an_author_can_use_is_in_the_tutorial():
+def test_everything_that_an_author_can_use_is_in_the_reference():
     hooks = [name for name, value in vars(hookspecs).items() if hasattr(value, "ortho_pipeline_spec")]
     hooks += [name for name, value in vars(of_studies).items() if hasattr(value, "ortho_studies_spec")]
     assert len(hooks) == 5
     fields = [field.name for kind in KINDS for field in dataclasses.fields(kind)]
     for name in hooks + fields:
-        assert f"`{name}`" in TUTORIAL, f"{name} is not explained in docs/plugins.md"
+        assert f"`{name}`" in REFERENCE, f"{name} is not explained in docs/plugin-reference.md"
 
 
 def described(name: str) -> str | None:
@@ -207,7 +208,7 @@ def described(name: str) -> str | None:
 
 
 def test_every_name_for_plugins_is_documented():
-    rows = re.search(r"\n## What you can import\n(.*?)\n## ", TUTORIAL, re.DOTALL)[1].splitlines()
+    rows = re.search(r"\n## What you can import\n(.*?)\n## ", REFERENCE, re.DOTALL)[1].splitlines()
     listed = [name for row in rows if row[:1] == "|" for name in re.findall(r"`(\w+)`", row.split("|")[1])]
     assert set(listed) == set(plugin.__all__)
     assert not [name for name in plugin.__all__ if not described(name)]

@@ -21,7 +21,7 @@ def test_headers_of_impossible_sizes_are_refused_before_anything_is_allocated(tm
     dataset = gdal.GetDriverByName("GTiff").Create(str(path), *size, 1, gdal.GDT_Byte, ["SPARSE_OK=YES"])
     dataset = None
     assert dataset is None
-    with pytest.raises(InputError, match="the header claims"):
+    with pytest.raises(InputError, match="the header states"):
         open_dataset(path)
 
 

@@ -209,9 +209,12 @@ for _kind, _pattern, _first in (
     ("null", r"|~|null|Null|NULL", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("int", r"[-+]?[0-9]+", list("-+0123456789")),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-     list("-+.0123456789")),
-):  # fmt: skip
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(f"^(?:{_pattern})$"), _first)
 
 
@@ -343,9 +346,15 @@ def _allowed(place: Place) -> str:
         if isinstance(part, int):
             continue
         model = {
-            "scenes": Entry, "defaults": Settings, "mosaic": MosaicSettings, "scene": SceneSettings,
-            "points": PointSettings, "surface": SurfaceSettings, "match": MatchSettings, "output": OutputSettings,
-        }.get(str(part), model)  # fmt: skip
+            "scenes": Entry,
+            "defaults": Settings,
+            "mosaic": MosaicSettings,
+            "scene": SceneSettings,
+            "points": PointSettings,
+            "surface": SurfaceSettings,
+            "match": MatchSettings,
+            "output": OutputSettings,
+        }.get(str(part), model)
     names = list(model.model_fields)
     close = difflib.get_close_matches(str(place[-1]), names, 1)
     return f"did you mean {close[0]!r}?" if close else f"one of {', '.join(names)}"

@@ -28,9 +28,13 @@ def check_scenes(
         one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
         try:
             one |= commands.check(
-                asked.image, scene=asked.scene, points=asked.points, surface=asked.surface, match=asked.match,
+                asked.image,
+                scene=asked.scene,
+                points=asked.points,
+                surface=asked.surface,
+                match=asked.match,
                 output=asked.output,
-            )  # fmt: skip
+            )
         except OrthoError as error:
             one["error"] = error_document(error)
         checked.append(one)

@@ -97,9 +97,11 @@ class Processes:
             require_memory()
             startable_threads(2)
             self._pool = ProcessPoolExecutor(
-                min(self.workers, ahead), mp_context=_Spawning(self._spawned),
-                initializer=start_worker, initargs=(self.threads,),
-            )  # fmt: skip
+                min(self.workers, ahead),
+                mp_context=_Spawning(self._spawned),
+                initializer=start_worker,
+                initargs=(self.threads,),
+            )
             for job, future in _completed(self._pool, ahead, work, jobs):
                 broken = broken or isinstance(future.exception(), BrokenExecutor)
                 yield job, future
@@ -328,9 +330,10 @@ def dask_executor(scheduler: str) -> Any:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})", field="scheduler",
+            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})",
+            field="scheduler",
             remedy="give its address, for example tcp://host:8786",
-        ) from error  # fmt: skip
+        ) from error
     return client, client.get_executor(pure=False)
 
 
@@ -349,8 +352,9 @@ def crew_of(
         yield executor, threads or 1
     elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
         if scheduler is None:
-            raise InputError("dask needs the address of its scheduler", field="scheduler",
-                             remedy="for example tcp://host:8786")  # fmt: skip
+            raise InputError(
+                "dask needs the address of its scheduler", field="scheduler", remedy="for example tcp://host:8786"
+            )
         client, pool = dask_executor(scheduler)
         with client:
             yield InGroups(pool, sum(client.nthreads().values())), threads or 1

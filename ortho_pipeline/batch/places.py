@@ -21,7 +21,7 @@ _MOST_LISTED = 1_000_000
 Place: TypeAlias = Path | VsiPath
 
 
-class Places:
+class PipelinePaths:
     """What names in a pipeline file stand for.
 
     Names are relative to the file. Of a file on this machine they stay in its root wherever links lead; a file on
@@ -54,16 +54,22 @@ class Places:
         except (OSError, RuntimeError, ValueError) as error:
             # Names longer than the file system's, links in a circle, surrogates.
             reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{text[:60]!r} is not a path of a file ({reason})", file=self.file, field=field,
-                             remedy="check the name, and the links on its way") from error  # fmt: skip
+            raise InputError(
+                f"{text[:60]!r} is not a path of a file ({reason})",
+                file=self.file,
+                field=field,
+                remedy="check the name, and the links on its way",
+            ) from error
         if not resolved.is_relative_to(self.root):
             raise InputError(
-                f"{text} lies outside of the root {self.root}", file=self.file, field=field,
+                f"{text} lies outside of the root {self.root}",
+                file=self.file,
+                field=field,
                 remedy=Text(
                     "move it there, or allow a folder that holds both with ",
-                    Setting("root", str(self._common(path.resolve())))
+                    Setting("root", str(self._common(path.resolve()))),
                 ),
-            )  # fmt: skip
+            )
         return path
 
     def of(self, text: str, field: str) -> Place:
@@ -84,9 +90,11 @@ class Places:
         if len(os.fsencode(pattern)) > _PATTERN_BYTES or pattern.split("/").count("**") > _WALKS:
             # Every ** walks all folders below each that the one before it found.
             raise InputError(
-                f"{pattern[:60]!r} is too long a search", file=self.file, field=field,
+                f"{pattern[:60]!r} is too long a search",
+                file=self.file,
+                field=field,
                 remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
-            )  # fmt: skip
+            )
         if Location(pattern).is_address or self.far:
             text = pattern if Location(pattern).is_address else self._address(pattern, field)
             return [self._located(address, field) for address in self._listed(text, field)]
@@ -100,9 +108,11 @@ class Places:
     def _located(self, address: str, field: str) -> VsiPath:
         if not self.allow_network:
             raise InputError(
-                f"{address!r} lies on another machine, of which nothing is opened unasked", file=self.file, field=field,
+                f"network access is off by default, and {address!r} is on another machine",
+                file=self.file,
+                field=field,
                 remedy=Text("allow it with ", Setting("scene.allow_network"), ", or give a file"),
-            )  # fmt: skip
+            )
         place = located(address, allow_network=self.allow_network)
         assert isinstance(place, VsiPath)
         return place
@@ -112,9 +122,11 @@ class Places:
         parts = text.split("/")
         if "\0" in text or "://" in text or text.startswith("/") or ".." in parts:
             raise InputError(
-                f"{text[:200]!r} is no file below the folder of the pipeline file", file=self.file, field=field,
+                f"{text[:200]!r} is no file below the folder of the pipeline file",
+                file=self.file,
+                field=field,
                 remedy="name it from there on, or give its whole address",
-            )  # fmt: skip
+            )
         return "/".join([self.address, *(part for part in parts if part not in ("", "."))])
 
     def _listed(self, pattern: str, field: str) -> list[str]:
@@ -126,9 +138,11 @@ class Places:
         fixed = list(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
         if Location(pattern).is_on_web or not fixed:
             raise InputError(
-                "a web server is not searched", file=self.file, field=field,
+                "a web server is not searched",
+                file=self.file,
+                field=field,
                 remedy="name the images one by one, or by a pattern in a store (s3, gs, az)",
-            )  # fmt: skip
+            )
         wanted = parts[len(fixed) :]
         folder = f"{scheme}://{'/'.join(fixed)}"
         names = Objects(folder, allow_network=self.allow_network).names()

@@ -17,7 +17,7 @@ import pyproj
 
 from ortho_pipeline import host
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
-from ortho_pipeline.batch.places import Place, Places
+from ortho_pipeline.batch.places import PipelinePaths, Place
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
@@ -32,13 +32,19 @@ from ortho_pipeline.options import (
     SurfaceOptions,
 )
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.surface.mosaic import matching_files
+from ortho_pipeline.surface.dem_mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
 STATE = ".run"
 #: Files of a run beside the folders of the scenes, by what they are.
-RUN_FILES = {"log": "run.jsonl", "summary": "run.json", "catalog": "catalog.json", "seams": "mosaic.json",
-             "page": "mosaic.html", "index": "index.html"}  # fmt: skip
+RUN_FILES = {
+    "log": "run.jsonl",
+    "summary": "run.json",
+    "catalog": "catalog.json",
+    "seams": "mosaic.json",
+    "page": "mosaic.html",
+    "index": "index.html",
+}
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
 #: How names of files end that are told from other words in a file on another machine.
@@ -121,8 +127,12 @@ class Plan:
         known = {job.name: job for job in self.jobs}
         for name in only:
             if name not in known:
-                raise InputError(f"no scene is called {name!r}", file=self.path, field="only",
-                                 remedy="'ortho run FILE --list' lists the names")  # fmt: skip
+                raise InputError(
+                    f"no scene is called {name!r}",
+                    file=self.path,
+                    field="only",
+                    remedy="'ortho run FILE --list' lists the names",
+                )
         jobs = tuple(known[name] for name in dict.fromkeys(only)) if only else self.jobs
         if shard is None:
             return jobs
@@ -153,7 +163,7 @@ def plan(
         For a wrong file, a path outside of the root, a pattern without a match, or two scenes of one name.
     """
     file = place(located(path, allow_network=allow_network))
-    return _Planner(file, read_config(file), Places(path, root, allow_network)).plan()
+    return _Planner(file, read_config(file), PipelinePaths(path, root, allow_network)).plan()
 
 
 @functools.cache
@@ -169,7 +179,7 @@ def versions() -> dict[str, Any]:
 
 
 class _Planner:
-    def __init__(self, path: Place, config: Config, places: Places) -> None:
+    def __init__(self, path: Place, config: Config, places: PipelinePaths) -> None:
         self.path, self.config, self.places = path, config, places
         if config.root is not None:
             places.root = places.inside(config.root, "root of the file")
@@ -179,8 +189,12 @@ class _Planner:
 
     def plan(self) -> Plan:
         if self.output == self.places.base:
-            raise InputError("the outputs would lie among the inputs", file=self.path, field="output",
-                             remedy="choose a folder of their own, for example out")  # fmt: skip
+            raise InputError(
+                "the outputs would lie among the inputs",
+                file=self.path,
+                field="output",
+                remedy="choose a folder of their own, for example out",
+            )
         found: dict[Place, list[tuple[int, Entry]]] = {}
         for number, entry in enumerate(self.config.scenes):
             for image in self._images(entry, number):
@@ -197,15 +211,18 @@ class _Planner:
         if entry.image is not None:
             return [self.places.of(entry.image, f"scenes[{number}].image")]
         found: dict[Place, None] = {}
-        excluded = {image for pattern in _listed(entry.exclude)
-                    for image in self._matches(pattern, f"scenes[{number}].exclude")}  # fmt: skip
+        excluded = {
+            image for pattern in _listed(entry.exclude) for image in self._matches(pattern, f"scenes[{number}].exclude")
+        }
         for pattern in _listed(entry.images):
             matches = [image for image in self._matches(pattern, f"scenes[{number}].images") if image not in excluded]
             if not matches:
                 raise InputError(
-                    f"nothing matches {pattern!r}", file=self.path, field=f"scenes[{number}].images",
+                    f"nothing matches {pattern!r}",
+                    file=self.path,
+                    field=f"scenes[{number}].images",
                     remedy=f"check the pattern, which is relative to {self.places.address or self.places.base}",
-                )  # fmt: skip
+                )
             for image in matches:
                 place = self.places.inside(str(image), f"scenes[{number}].images") if isinstance(image, Path) else image
                 found[place] = None
@@ -228,10 +245,13 @@ class _Planner:
             asset, scene = resolved(image, scene)
             shown = self.places.of(str(asset), f"{where}.image")
         request = Request(
-            shown, scene, points=self._points(settings, image, where),
-            surface=self._surface(settings, image, where, scene), match=self._match(settings, image, where),
+            shown,
+            scene,
+            points=self._points(settings, image, where),
+            surface=self._surface(settings, image, where, scene),
+            match=self._match(settings, image, where),
             output=self._ortho(settings, image, where),
-        )  # fmt: skip
+        )
         return Job(self._checked_name(name, image, where), request, self.output, versions())
 
     def _scene(self, settings: Settings, image: Place, where: str) -> SceneOptions:
@@ -243,9 +263,14 @@ class _Planner:
         rpc = given.rpc if given.rpc in ("tag", "sidecar") else self._file(given.rpc, image, f"{where}.scene.rpc")
         model = self._file(given.model, image, f"{where}.scene.model")
         return SceneOptions(
-            sensor=given.sensor, rpc=rpc, model=model, sensor_options=options, crop_offset=given.crop_offset,
-            roots=() if self.places.far else (str(self.places.root),), allow_network=self.places.allow_network,
-        )  # fmt: skip
+            sensor=given.sensor,
+            rpc=rpc,
+            model=model,
+            sensor_options=options,
+            crop_offset=given.crop_offset,
+            roots=() if self.places.far else (str(self.places.root),),
+            allow_network=self.places.allow_network,
+        )
 
     def _points(self, settings: Settings, image: Place, where: str) -> PointOptions:
         values: dict[str, Any] = dict(settings.points)
@@ -309,8 +334,10 @@ class _Planner:
         if _exists(Path(text)):
             raise InputError(
                 f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
-                file=self.path, field=field, remedy=f"give its path relative to {self.places.base}",
-            )  # fmt: skip
+                file=self.path,
+                field=field,
+                remedy=f"give its path relative to {self.places.base}",
+            )
         return text
 
     def _filled(self, text: str, image: Place, field: str) -> str:
@@ -329,9 +356,11 @@ class _Planner:
         bad = not name or name.startswith(".") or name != name.strip() or len(os.fsencode(name)) > _NAME_BYTES
         if bad or any(letter in "/\\:\0" or not letter.isprintable() for letter in name):
             raise InputError(
-                f"{name!r} is not a name of a folder (for {image.name})", file=self.path, field=f"{where}.name",
+                f"{name!r} is not a name of a folder (for {image.name})",
+                file=self.path,
+                field=f"{where}.name",
                 remedy="letters, digits, blanks, dashes; not first a dot",
-            )  # fmt: skip
+            )
         return name
 
     def _check_names(self, jobs: Sequence[Job]) -> None:
@@ -340,14 +369,20 @@ class _Planner:
             # Some file systems do not tell upper from lower case, or one way of writing é from another.
             key = unicodedata.normalize("NFC", job.name).casefold()
             if key in (*RUN_FILES.values(), "mosaic.vrt", "mosaic.tif"):
-                raise InputError(f"{job.name!r} is a file of the run itself", file=self.path, field="name",
-                                 remedy="give the scene another name")  # fmt: skip
+                raise InputError(
+                    f"{job.name!r} is a file of the run itself",
+                    file=self.path,
+                    field="name",
+                    remedy="give the scene another name",
+                )
             other = taken.setdefault(key, job)
             if other is not job:
                 raise InputError(
-                    f"{other.image} and {job.image} would both be the scene {job.name!r}", file=self.path,
-                    field="scenes.name", remedy="tell them apart, for example with name: '{folder}_{stem}'",
-                )  # fmt: skip
+                    f"{other.image} and {job.image} would both be the scene {job.name!r}",
+                    file=self.path,
+                    field="scenes.name",
+                    remedy="tell them apart, for example with name: '{folder}_{stem}'",
+                )
 
     def _check_mosaic(self, jobs: Sequence[Job]) -> None:
         if self.config.mosaic is None:
@@ -356,9 +391,11 @@ class _Planner:
             for field in ("crs", "resolution"):
                 if getattr(job.request.output, field) is None:
                     raise InputError(
-                        "the scenes of a mosaic share a grid", file=self.path, field=f"defaults.output.{field}",
+                        "the scenes of a mosaic share a grid",
+                        file=self.path,
+                        field=f"defaults.output.{field}",
                         remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
-                    )  # fmt: skip
+                    )
 
 
 def for_run(
@@ -370,9 +407,10 @@ def for_run(
 
 def _within(request: Request, memory: int, threads: int | None, allow_network: bool) -> Request:
     return replace(
-        request, output=replace(request.output, memory=memory, threads=threads),
+        request,
+        output=replace(request.output, memory=memory, threads=threads),
         scene=replace(request.scene, allow_network=allow_network),
-    )  # fmt: skip
+    )
 
 
 def _exists(path: Path) -> bool:

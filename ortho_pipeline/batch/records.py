@@ -112,9 +112,12 @@ class RunRecord(Record):
     def text(self) -> str:
         """Return the record as one line of JSON."""
         document = {
-            "document": DOCUMENT, "schema_version": SCHEMA_VERSION, **vars(self),
-            "inputs": [vars(one) for one in self.inputs], "outputs": [vars(one) for one in self.outputs],
-        }  # fmt: skip
+            "document": DOCUMENT,
+            "schema_version": SCHEMA_VERSION,
+            **vars(self),
+            "inputs": [vars(one) for one in self.inputs],
+            "outputs": [vars(one) for one in self.outputs],
+        }
         # On one line: the encoder of many is written in Python, and takes as long as the rest of the record.
         return json.dumps(document, allow_nan=False) + "\n"
 
@@ -261,14 +264,18 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
         with path.open("rb") as file:
             holder = file.read(500).decode(errors="replace").strip() or "another run"
         raise InputError(
-            f"{holder} works in this output folder", file=path.parent.parent, field="output",
+            f"{holder} works in this output folder",
+            file=path.parent.parent,
+            field="output",
             remedy="wait for its end, or choose another output folder",
-        ) from error  # fmt: skip
+        ) from error
     except OSError as error:
         raise InputError(
-            f"cannot write here ({error.strerror})", file=path.parent, field="output",
+            f"cannot write here ({error.strerror})",
+            file=path.parent,
+            field="output",
             remedy="choose a folder that you may write to, on a file system that has locks",
-        ) from error  # fmt: skip
+        ) from error
     with contextlib.closing(lock):
         if not wait:
             owner = f"{owner} (process {os.getpid()} on {socket.gethostname()})".strip()

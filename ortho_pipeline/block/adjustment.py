@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ortho_pipeline.block.common_error import CommonError
+from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.datum import HOLD, by_control, with_datum, with_start_errors
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.cofactors import Cofactors
@@ -110,7 +110,7 @@ def adjust(
     refuse_too_few(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
-    common = CommonError.of(problem, state, selection)
+    common = BlockCommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
     solved, inside, dem_heights = _first(problem, state, selection, whole, dem_heights, robust)
@@ -278,9 +278,10 @@ def pseudo_of(
         for name, prior in priors.get(image, {}).items():
             if name not in names:
                 raise InputError(
-                    f"a prior names the parameter {name!r}, which the model of {image!r} does not have", field="priors",
+                    f"a prior names the parameter {name!r}, which the model of {image!r} does not have",
+                    field="priors",
                     remedy=f"its parameters are {', '.join(names) or 'none'}",
-                )  # fmt: skip
+                )
             found.append(Pseudo(begin + names.index(name), prior.mean, prior.sigma))
         begin += len(names)
     return tuple(found)
@@ -296,8 +297,8 @@ def _started(problem: BlockProblem, state: State, selection: Selection) -> Block
 
 
 def _weighed(
-    solved: Solved, selection: Selection, common: CommonError | None, dem_heights: Heights | None
-) -> tuple[Solved, Posterior, CommonError | None, Heights | None]:
+    solved: Solved, selection: Selection, common: BlockCommonError | None, dem_heights: Heights | None
+) -> tuple[Solved, Posterior, BlockCommonError | None, Heights | None]:
     """Return the solution with the sigmas that the observations have, what is known of these, and common errors."""
     if common is not None:
         solved, common = common.settled(solved, selection)
@@ -334,16 +335,17 @@ def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
     if not solved.converged:
         uncertain_images(solved, solved.problem.points)
         raise NotConverged(
-            "the adjustment did not converge", file=solved.problem.points.source or None,
+            "the adjustment did not converge",
+            file=solved.problem.points.source or None,
             remedy="give more control points, spread in plan and height, or a simpler model or correction",
-        )  # fmt: skip
+        )
     return solved, solved.without_astray(selection)
 
 
 def _result(
     solved: Solved,
     found: Posterior,
-    common: CommonError | None,
+    common: BlockCommonError | None,
     dem_heights: Heights | None,
     selection: Selection,
     points: BlockPoints,
@@ -413,7 +415,7 @@ def _parameters(points: BlockPoints, models: Sequence[SensorModel]) -> tuple[tup
 
 
 def _covariances(
-    solved: Solved, found: Posterior, common: CommonError | None
+    solved: Solved, found: Posterior, common: BlockCommonError | None
 ) -> tuple[Cofactors, Array, Mapping[str, SharedErrors]]:
     """Return covariances of parameters and ground without what all known points share, and what neighbours share."""
     shared = SharedByImage.of(solved, common)
@@ -428,7 +430,7 @@ def _covariances(
     return covariance, ground, {} if shared is None else shared.images
 
 
-def _with_common(covariance: Cofactors, common: CommonError | CommonHeights | None) -> tuple[Cofactors, Array]:
+def _with_common(covariance: Cofactors, common: BlockCommonError | CommonHeights | None) -> tuple[Cofactors, Array]:
     """Return the covariance of the parameters with the part of a common error, and its part in that of the ground."""
     if common is None:
         return covariance, np.zeros((1, 3, 3))

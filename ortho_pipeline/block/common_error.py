@@ -39,7 +39,7 @@ _STANDS = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CommonError(CommonUnknown):
+class BlockCommonError(CommonUnknown):
     """What known ground has in common, and what a block tells of it.
 
     Parameters
@@ -61,7 +61,7 @@ class CommonError(CommonUnknown):
     seen: Array
 
     @classmethod
-    def of(cls, problem: BlockProblem, state: State, selection: Selection) -> CommonError | None:
+    def of(cls, problem: BlockProblem, state: State, selection: Selection) -> BlockCommonError | None:
         """Return that of the ground that a selection uses, as other ground sees it first; None without."""
         sigmas = problem.points.sigma_common
         used = selection.ground & problem.active(selection)
@@ -70,10 +70,16 @@ class CommonError(CommonUnknown):
             return None
         rays = problem.points.rays
         found = cls(
-            sigma=float(sigmas.max()), points=shared, value=np.zeros(2), told=np.zeros((2, 2)), sigmas=sigmas,
-            known=problem.known, by_params=np.zeros((problem.size, 2)), by_points=np.zeros((len(sigmas), 3, 2)),
+            sigma=float(sigmas.max()),
+            points=shared,
+            value=np.zeros(2),
+            told=np.zeros((2, 2)),
+            sigmas=sigmas,
+            known=problem.known,
+            by_params=np.zeros((problem.size, 2)),
+            by_points=np.zeros((len(sigmas), 3, 2)),
             seen=np.zeros((rays, 2, 2)),
-        )  # fmt: skip
+        )
         return found._seen_by(problem, state, selection) if (used & (sigmas == 0)).any() else found
 
     def corrected(self, known: Array) -> Array:
@@ -88,19 +94,19 @@ class CommonError(CommonUnknown):
         """Return the problem with the known ground as it lies without the estimate."""
         return replace(problem, known=self.corrected(self.known)) if self.value.any() else problem
 
-    def settled(self, solved: Solved, selection: Selection) -> tuple[Solved, CommonError]:
+    def settled(self, solved: Solved, selection: Selection) -> tuple[Solved, BlockCommonError]:
         """Return the solution with it as an unknown, from one with its present value."""
         problem = solved.problem
         shared = selection.ground & problem.active(selection) & (self.sigmas > 0)
 
-        def seen(found: CommonError, solved: Solved) -> tuple[CommonError, Array]:
+        def seen(found: BlockCommonError, solved: Solved) -> tuple[BlockCommonError, Array]:
             found, left = found._moving(solved)
             # Without anything else only rounding, and the bending of the models, would tell of it.
             if not found._is_told(solved, selection):
                 return replace(found, told=np.zeros((2, 2))), np.zeros(2)
             return replace(found, told=left.T @ left), left.T @ solved.linear.misfits.vector
 
-        def again(found: CommonError, solved: Solved) -> Solved:
+        def again(found: BlockCommonError, solved: Solved) -> Solved:
             return solve(found.applied(problem), solved.state, selection)
 
         return replace(self, points=int(shared.sum())).settled_with(solved, seen, again, _STANDS)
@@ -110,7 +116,7 @@ class CommonError(CommonUnknown):
         others = selection.ground & solved.problem.active(selection) & (self.sigmas == 0)
         return bool(others.any() or len(solved.linear.misfits.pseudo))
 
-    def _moving(self, solved: Solved) -> tuple[CommonError, Array]:
+    def _moving(self, solved: Solved) -> tuple[BlockCommonError, Array]:
         """Return it with what it moves, and what one sigma along each axis leaves of misfits ``(m, 2)``."""
         linear, problem = solved.linear, solved.problem
         params, places, left = [], [], []
@@ -137,7 +143,7 @@ class CommonError(CommonUnknown):
             found.append(Misfits(np.zeros_like(linear.misfits.rays), ground, np.zeros_like(linear.misfits.pseudo)))
         return found
 
-    def _seen_by(self, problem: BlockProblem, state: State, selection: Selection) -> CommonError:
+    def _seen_by(self, problem: BlockProblem, state: State, selection: Selection) -> BlockCommonError:
         """Return it as known ground without it sees it, ray by ray, from a block without that ground."""
         alone = replace(selection, ground=selection.ground & (self.sigmas > 0))
         try:

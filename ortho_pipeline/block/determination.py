@@ -23,9 +23,10 @@ def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
     rays = selection.rays & problem.active(selection)[points.point]
     if not rays.any():
         raise TooFewPoints(
-            "no point was measured in two images, or in one with known ground", file=points.source or None,
+            "no point was measured in two images, or in one with known ground",
+            file=points.source or None,
             remedy="points of one id are one point: check the ids and the names of the images",
-        )  # fmt: skip
+        )
     of_priors, _ = problem.columns.image_and_place([one.column for one in problem.pseudo])
     priors = np.bincount(of_priors, minlength=len(problem.models))
     for image, model in enumerate(problem.models):
@@ -49,10 +50,11 @@ def refuse_undetermined(solved: Solved) -> None:
         return
     names = _weakest(solved)
     raise DegeneratePoints(
-        f"the points do not determine {names} (condition {solved.condition:.1e})", file=problem.points.source or None,
+        f"the points do not determine {names} (condition {solved.condition:.1e})",
+        file=problem.points.source or None,
         remedy="give control points that are spread over the images, take a simpler model or correction, or hold the "
         "orientation near its start values",
-    )  # fmt: skip
+    )
 
 
 def _weakest(solved: Solved) -> str:
@@ -91,9 +93,10 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         if inside > EXTRAPOLATION_LIMIT and not held:
             raise DegeneratePoints(
                 f"the points do not determine the image {name!r}: at its own points it is {inside:.0f} times less "
-                "certain than these were measured", file=problem.points.source or None,
+                "certain than these were measured",
+                file=problem.points.source or None,
                 remedy="give more control points in it, spread in plan and height, or take a simpler model",
-            )  # fmt: skip
+            )
         at_corners = model.param_partials(model.corners)
         at_corners = at_corners[np.isfinite(at_corners).all(axis=(1, 2))]
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from ortho_pipeline.block.common_error import CommonError
+from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.settling import HeightsRecord
@@ -182,7 +182,7 @@ class BlockFit:
     rejected: tuple[GrossError, ...] = ()
     outlying: tuple[ContradictedPoint, ...] = ()
     warnings: tuple[Notice, ...] = ()
-    common_error: CommonError | None = None
+    common_error: BlockCommonError | None = None
     heights: HeightsRecord | None = None
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
@@ -251,16 +251,21 @@ class BlockFit:
             return None
         east, north, up = np.sqrt((values**2).mean(axis=0)).tolist()
         return ObjectRms(
-            x=east, y=north, h=up, plan=math.hypot(east, north), n=len(values), min=values.min(axis=0).tolist(),
+            x=east,
+            y=north,
+            h=up,
+            plan=math.hypot(east, north),
+            n=len(values),
+            min=values.min(axis=0).tolist(),
             max=values.max(axis=0).tolist(),
-        )  # fmt: skip
+        )
 
     @property
     def record(self) -> BlockAdjustment:
         """What is published of it (docs/engineering/formats.md)."""
-        shared: dict[str, Any] = {} if self.common_error is None else {
-            "common_error": CommonErrorRecord.of(self.common_error)
-        }  # fmt: skip
+        shared: dict[str, Any] = (
+            {} if self.common_error is None else {"common_error": CommonErrorRecord.of(self.common_error)}
+        )
         if self.shared_errors:
             shared["shared_errors"] = dict(self.shared_errors)
         if self.heights is not None:
@@ -311,7 +316,13 @@ class BlockFit:
         columns = json_value([points.measured, self.residuals, self.back_projected])
         rows = zip(points.point, points.image, self.used_rays, *columns, strict=True)
         return tuple(
-            Ray(id=points.ids[point], image=points.images[image], used=bool(used), measured=measured, residual=residual,
-                back_projected=projected)
+            Ray(
+                id=points.ids[point],
+                image=points.images[image],
+                used=bool(used),
+                measured=measured,
+                residual=residual,
+                back_projected=projected,
+            )
             for point, image, used, measured, residual, projected in rows
-        )  # fmt: skip
+        )

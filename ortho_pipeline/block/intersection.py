@@ -100,9 +100,10 @@ def intersect(models: Mapping[str, SensorModel], points: BlockPoints, *, scaled:
     counts = np.bincount(points.point, minlength=len(points))
     if not (counts >= 2).any():
         raise TooFewPoints(
-            "no point was measured in two images", file=points.source or None,
+            "no point was measured in two images",
+            file=points.source or None,
             remedy="a point needs rays of two images to be intersected; points of one id are one point",
-        )  # fmt: skip
+        )
     frame = frame_of(chosen, points)
     local = meet(frame, chosen, points, np.ones(points.rays, dtype=bool))
     places = frame.places(local)
@@ -142,9 +143,11 @@ def models_of(models: Mapping[str, SensorModel], points: BlockPoints) -> tuple[S
         missing = sorted(set(here) - set(there))
         if missing:
             raise InputError(
-                f"{what} {missing[0]!r}", file=points.source or None, field="image",
+                f"{what} {missing[0]!r}",
+                file=points.source or None,
+                field="image",
                 remedy=f"images of the points: {', '.join(points.images)}; models: {', '.join(models)}",
-            )  # fmt: skip
+            )
     return tuple(models[name] for name in points.images)
 
 

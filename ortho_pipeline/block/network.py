@@ -68,15 +68,18 @@ def network_of(fit: BlockFit, joins: Sequence[Join] = (), limit: float = math.in
     return NetworkRecord(
         pairs=tuple(
             ImagePairRecord(
-                first=first, second=second, points=int((which.ravel() == k).sum()),
-                angle_deg=np.median(angles[which.ravel() == k]), **relative.get((first, second), {}),
+                first=first,
+                second=second,
+                points=int((which.ravel() == k).sum()),
+                angle_deg=np.median(angles[which.ravel() == k]),
+                **relative.get((first, second), {}),
             )
             for k, (first, second) in enumerate((points.images[a], points.images[b]) for a, b in found.tolist())
         ),
         angles=_angles(largest[np.isfinite(largest)]),
         parts=_parts(points.images, found),
         largest_deg=json_value(largest),
-    )  # fmt: skip
+    )
 
 
 def _angles(known: Array) -> Angles | None:

@@ -22,7 +22,7 @@ from ortho_pipeline.points.image_errors import (
     groups_of,
     sigmas_of,
 )
-from ortho_pipeline.points.rows import OF_GROUND, Row, Table, origin_shift
+from ortho_pipeline.points.rows import OF_GROUND, PointRow, Table, origin_shift
 
 
 @reads("see docs/formats.md for what stands in a file of points")
@@ -67,9 +67,11 @@ def read_block_points(
         joined.add(gcps, [row for row in known.rows if row.id in joined.index], ground, known.rows)
         if not any(row.id in joined.index for row in known.rows):
             raise InputError(
-                "none of these points was measured in an image", file=gcps, field="id",
+                "none of these points was measured in an image",
+                file=gcps,
+                field="id",
                 remedy=f"the ids have to be those of {os.fspath(path)}",
-            )  # fmt: skip
+            )
     return joined.points(path, rays.rows, shift, pyproj.CRS.from_epsg(4326) if plane is None else plane)
 
 
@@ -97,14 +99,16 @@ def _placed(
     return ground_of(path, table, crs, vertical)
 
 
-def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[Row]) -> None:
+def _refuse_twice(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> None:
     first: dict[str | None, str] = {}
     for row in rows:
         if first.setdefault(row.id, row.where) != row.where:
             raise InputError(
-                f"the id {row.id!r} stands twice, first in {first[row.id]}", file=path, field=row.where,
+                f"the id {row.id!r} stands twice, first in {first[row.id]}",
+                file=path,
+                field=row.where,
                 remedy="give each point once",
-            )  # fmt: skip
+            )
 
 
 class _Joined:
@@ -115,7 +119,11 @@ class _Joined:
         self.said: list[dict[str, tuple[Any, str]]] = []
 
     def add(
-        self, path: str | os.PathLike[str], rows: Sequence[Row], ground: Array, of: Sequence[Row] | None = None
+        self,
+        path: str | os.PathLike[str],
+        rows: Sequence[PointRow],
+        ground: Array,
+        of: Sequence[PointRow] | None = None,
     ) -> None:
         """Take in rows; `ground` belongs to all rows of a file, `of`, where these are only some."""
         place = {id(row): k for k, row in enumerate(of or rows)}
@@ -126,9 +134,14 @@ class _Joined:
             x, y, h = ground[place[id(row)]].tolist()
             where = f"{os.fspath(path)}, {row.where}"
             said = {
-                "x": x, "y": y, "h": h, "role": row.role or None, "sigma_xy": row.sigma_xy, "sigma_h": row.sigma_h,
+                "x": x,
+                "y": y,
+                "h": h,
+                "role": row.role or None,
+                "sigma_xy": row.sigma_xy,
+                "sigma_h": row.sigma_h,
                 "sigma_common": row.sigma_common,
-            }  # fmt: skip
+            }
             for name, value in said.items():
                 if value is None or (isinstance(value, float) and math.isnan(value)):
                     continue
@@ -136,13 +149,15 @@ class _Joined:
                 same = abs(before - value) <= SAME_PLACE if isinstance(value, float) else before == value
                 if not same:
                     raise InputError(
-                        f"the {name} of the point {row.id!r} is {value} here and {before} in {there}", file=path,
-                        field=row.where, remedy="one point has one ground, one role and one accuracy",
-                    )  # fmt: skip
+                        f"the {name} of the point {row.id!r} is {value} here and {before} in {there}",
+                        file=path,
+                        field=row.where,
+                        remedy="one point has one ground, one role and one accuracy",
+                    )
 
     def points(
-        self, path: str | os.PathLike[str], rows: Sequence[Row], shift: float, crs: pyproj.CRS
-    ) -> BlockPoints:  # fmt: skip
+        self, path: str | os.PathLike[str], rows: Sequence[PointRow], shift: float, crs: pyproj.CRS
+    ) -> BlockPoints:
         """Return the table of the points, with the rays of `rows`."""
         said = [{name: value for name, (value, _) in one.items()} for one in self.said]
         images = tuple(dict.fromkeys(str(row.image_name) for row in rows))
@@ -154,14 +169,21 @@ class _Joined:
         point = np.array([self.index[str(row.id)] for row in rows])
         _refuse_same(path, tuple(self.index), [row.where for row in rows], ground, measured, image, point)
         return BlockPoints(
-            ids=tuple(self.index), ground=ground, roles=np.array(roles, dtype="<U7"),
+            ids=tuple(self.index),
+            ground=ground,
+            roles=np.array(roles, dtype="<U7"),
             sigma_ground=np.array([[one.get("sigma_xy", 0.0)] * 2 + [one.get("sigma_h", 0.0)] for one in said]),
-            crs=crs, images=images, point=point, image=image, measured=measured,
-            sigma_image=(sigma := sigmas_of(rows, DEFAULT_SIGMA_IMAGE)), source=os.fspath(path),
+            crs=crs,
+            images=images,
+            point=point,
+            image=image,
+            measured=measured,
+            sigma_image=(sigma := sigmas_of(rows, DEFAULT_SIGMA_IMAGE)),
+            source=os.fspath(path),
             shape_image=shape_of(covariance_of(rows, sigma)),
             sigma_common=np.array([one.get("sigma_common", 0.0) for one in said]),
             groups=groups_of(rows),
-        )  # fmt: skip
+        )
 
 
 def _refuse_same(
@@ -179,9 +201,11 @@ def _refuse_same(
         other = places.setdefault(key, number) if math.isfinite(key[0]) else number
         if other != number:
             raise InputError(
-                f"the points {ids[other]!r} and {ids[number]!r} have the same ground", file=path, field="x, y, h",
+                f"the points {ids[other]!r} and {ids[number]!r} have the same ground",
+                file=path,
+                field="x, y, h",
                 remedy="remove one of the two",
-            )  # fmt: skip
+            )
     pixels: dict[tuple[float, ...], int] = {}
     for ray, key in enumerate(zip(image.tolist(), *np.round(measured, 6).T.tolist(), strict=True)):
         other = pixels.setdefault(key, ray)
@@ -189,5 +213,7 @@ def _refuse_same(
             raise InputError(
                 f"the same pixel of the same image as in {wheres[other]}"
                 + ("" if point[other] == point[ray] else f", but of {ids[point[other]]!r} there"),
-                file=path, field=wheres[ray], remedy="remove one of the two",
-            )  # fmt: skip
+                file=path,
+                field=wheres[ray],
+                remedy="remove one of the two",
+            )

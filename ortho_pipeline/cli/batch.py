@@ -93,11 +93,10 @@ def run(
     dry_run: bool,
     **options: Any,
 ) -> None:
-    """Make the orthos of all scenes that PIPELINE.yaml names.
+    """Make the orthos of all scenes in PIPELINE.yaml.
 
-    A scene is made once, and again only when its files, its settings or the software have changed, or outputs are
-    missing. What fails does not stop the rest; a run that was interrupted goes on where it stood. Exit code 3: some
-    scenes failed.
+    A scene is made again only if its files, its settings or the software changed, or outputs are missing. A failed
+    scene does not stop the others. An interrupted run continues where it stopped. Exit code 3: some scenes failed.
     """
     if as_schema:
         from ortho_pipeline.batch import config as batch_config
@@ -146,16 +145,21 @@ def run(
 @click.command(cls=Command)
 @click.argument("orthos", metavar="ORTHO...", nargs=-1, required=True, type=click.Path())
 @click.option(
-    "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE",
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False),
+    required=True,
+    metavar="FILE",
     help="The mosaic: .tif (a COG) or .vrt. Its record (.json) and its page (.html) lie beside it.",
-)  # fmt: skip
+)
 @mosaic_options
 @network_option
 @json_option
 def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: SceneOptions, as_json: bool) -> None:
-    """Make one raster of ORTHOs that lie on one grid, and measure how well they agree.
+    """Combine ORTHOs on one grid into one raster.
 
-    Pixels are taken over, not resampled. What one ortho leaves empty another fills.
+    Pixels are copied, not resampled. Where one ortho is empty, another fills it. The command measures how well the
+    orthos agree.
     """
     from ortho_pipeline.commands.mosaic.assembly import mosaic as command
 

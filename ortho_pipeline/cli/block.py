@@ -43,19 +43,17 @@ def adjust(
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
-    """Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a block).
+    """Adjust several IMAGEs together (bundle adjustment).
 
-    Writes a model and an RPC of each image, the ground points with their sigmas, and one report. Points with ground
-    coordinates control or check, the others tie the images together. With --models (repeated, in the order of the
-    images) the saved models, such as those of an earlier adjustment, are where it starts. With --ties auto and
-    --reference points are found by matching, without a hand; that needs heights.
+    The images may be a stereo pair or a block. The command writes a model and an RPC of each image, the ground points
+    with their sigmas, and one report. Points with ground coordinates are control or check points; the others tie the
+    images together. --models starts from saved models (repeat it, in the order of the images). --ties auto and
+    --reference find points by matching; both need heights.
     """
     from ortho_pipeline.commands import block as blocks
 
     command = click.get_current_context().meta["command"]
-    result = blocks.adjust(
-        images, folder, points, scene, models=models, match=match, surface=surface, command=command
-    )  # fmt: skip
+    result = blocks.adjust(images, folder, points, scene, models=models, match=match, surface=surface, command=command)
     print_result(result, as_json)
 
 
@@ -76,9 +74,10 @@ def intersect(
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
-    """Intersect the rays of points that were measured in several IMAGEs: ground coordinates with their sigmas.
+    """Compute ground points from rays in several IMAGEs.
 
-    With --models (repeated, in the order of the images) the saved models take the place of the images' own.
+    The points have coordinates with sigmas. --models uses saved models instead of the images' own (repeat it, in the
+    order of the images).
     """
     from ortho_pipeline.commands import block as blocks
 

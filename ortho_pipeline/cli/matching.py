@@ -27,19 +27,26 @@ from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
     "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="Points: .geojson or .csv."
 )
 @click.option(
-    "--report", type=click.Path(dir_okay=False), metavar="FILE.html",
+    "--report",
+    type=click.Path(dir_okay=False),
+    metavar="FILE.html",
     help="Page to look at the matches: chips, map, residuals; its numbers beside it as .json.",
-)  # fmt: skip
+)
 @scene_options
 @json_option
 def match(
-    image: str, match: MatchOptions, surface: SurfaceOptions, output: str, report: str | None, scene: SceneOptions,
+    image: str,
+    match: MatchOptions,
+    surface: SurfaceOptions,
+    output: str,
+    report: str | None,
+    scene: SceneOptions,
     as_json: bool,
-) -> None:  # fmt: skip
-    """Find control points of IMAGE by matching it with orthoimages of the same place.
+) -> None:
+    """Find control points of IMAGE in an orthoimage.
 
-    Every fifth cell of the image is kept apart to check. The points carry covariances, which 'ortho fit', 'rectify',
-    'compare' and 'export' take with --gcps; these commands also match by themselves, with --reference.
+    One match in five is reserved as a check point. The points carry covariances; give them to 'ortho fit', 'rectify',
+    'compare' or 'export' with --gcps. These commands also match by themselves, with --reference.
     """
     from ortho_pipeline.commands.control import command
 
@@ -64,10 +71,11 @@ def ties(
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
-    """Find tie points between overlapping IMAGEs: places that two of them or more show, with their covariances.
+    """Find tie points between overlapping IMAGEs.
 
-    The heights bring the images into one geometry, and may be wrong: --dem-sigma says by how much. 'ortho adjust' takes
-    the ties with --points, or finds them by itself with --ties auto.
+    A tie point is a place that two or more images show; it carries covariances. Heights bring the images into one
+    geometry and may be wrong: state their accuracy with --dem-sigma. Give the ties to 'ortho adjust' with --points, or
+    let it find them itself with --ties auto.
     """
     from ortho_pipeline.commands.control import ties as command
 

@@ -208,8 +208,9 @@ def _of_each(*names: str) -> Decorator:
         grouped = _grouped("scene", SceneOptions, *names)(chosen)
         made: Callable[..., Any] = wrapper
         for field, metavar, text in (
-            ("crop_offset", "IMAGE=COL,ROW", _OFFSET_OF_EACH), ("rpc", "tag|sidecar|IMAGE=FILE", _RPC_OF_EACH)
-        ):  # fmt: skip
+            ("crop_offset", "IMAGE=COL,ROW", _OFFSET_OF_EACH),
+            ("rpc", "tag|sidecar|IMAGE=FILE", _RPC_OF_EACH),
+        ):
             flag = options_of(SceneOptions)[field].flags
             made = click.option(flag, f"scene_{field}", multiple=True, metavar=metavar, help=text)(made)
         return made
@@ -236,9 +237,10 @@ def _scenes(
                 continue
             elif not equals:
                 raise InputError(
-                    f"{text} is said of one image, and there are {len(images)}", field=f"scene.{field}",
+                    f"{text} is said of one image, and there are {len(images)}",
+                    field=f"scene.{field}",
                     remedy=Text("name the image: ", Setting(f"scene.{field}", f"{Path(images[0]).name}={text}")),
-                )  # fmt: skip
+                )
             number = image_named(name, images, f"scene.{field}")
             changed: dict[str, Any] = {field: value if field == "rpc" else _numbers(value, "COL,ROW")}
             scenes[number] = replace(scenes[number], **changed)
@@ -297,6 +299,12 @@ def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
 
 #: The option ``-o DIR``, which is required.
 folder_option = click.option(
-    "--output", "-o", "folder", type=click.Path(file_okay=False), required=True, metavar="DIR", callback=_folder,
+    "--output",
+    "-o",
+    "folder",
+    type=click.Path(file_okay=False),
+    required=True,
+    metavar="DIR",
+    callback=_folder,
     help="Output folder.",
-)  # fmt: skip
+)

@@ -61,18 +61,30 @@ class Command(click.Command):
         self.one = one
         self.params += [
             click.Option(
-                ["-v", "--verbose"], count=True, expose_value=False, callback=_verbose, is_eager=True,
+                ["-v", "--verbose"],
+                count=True,
+                expose_value=False,
+                callback=_verbose,
+                is_eager=True,
                 help="Verbose: log progress to stderr; -vv also shows GDAL's messages.",
             ),
             click.Option(
-                ["-q", "--quiet"], is_flag=True, expose_value=False, callback=_quiet, is_eager=True,
+                ["-q", "--quiet"],
+                is_flag=True,
+                expose_value=False,
+                callback=_quiet,
+                is_eager=True,
                 help="Quiet: print only warnings and errors (and the document of --json).",
             ),
             click.Option(
-                ["--debug"], is_flag=True, expose_value=False, callback=_debug, is_eager=True,
+                ["--debug"],
+                is_flag=True,
+                expose_value=False,
+                callback=_debug,
+                is_eager=True,
                 help="Show the traceback of an error.",
             ),
-        ]  # fmt: skip
+        ]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the words of the command line; what is left over is an error that says what was meant."""

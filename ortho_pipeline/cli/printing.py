@@ -94,10 +94,14 @@ def print_fit(result: FitResult) -> None:
         say(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
     labels = {"control": "control", "check": "check", "loo": "leave-one-out", "matched": "matched"}
     for which, rmse in document["rmse"].items():
-        text = "no points" if rmse is None else (
-            f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
-            f"({counted(rmse['n'], 'point')})"
-        )  # fmt: skip
+        text = (
+            "no points"
+            if rmse is None
+            else (
+                f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
+                f"({counted(rmse['n'], 'point')})"
+            )
+        )
         say(f"RMSE {labels[which]:<14} {text}")
     if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
         say(f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})")
@@ -148,9 +152,11 @@ def view_text(view: Mapping[str, Any] | None) -> str:
     if view is None:
         return "the middle of the image does not meet the ground"
     azimuth = view["sensor_azimuth_deg"]
-    place = "straight down" if azimuth is None else (
-        f"{view['incidence_deg']:.1f} deg off the vertical, sensor in azimuth {azimuth:.0f} deg"
-    )  # fmt: skip
+    place = (
+        "straight down"
+        if azimuth is None
+        else (f"{view['incidence_deg']:.1f} deg off the vertical, sensor in azimuth {azimuth:.0f} deg")
+    )
     along, across = view["pixel_m"]["along_view"], view["pixel_m"]["across_view"]
     return f"{place}; a pixel is {along:.3g} m along the view, {across:.3g} m across"
 

@@ -23,38 +23,42 @@ if TYPE_CHECKING:
     from ortho_pipeline.cli.machine.added import AddedCommands
 
 FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
-#: Every command of the host: the module of this room that holds it, and the first sentence of its help.
-COMMANDS = {
-    "adjust": ("block", "Adjust several IMAGEs and the points that they share (bundle adjustment of a stereo pair or a "
-                        "block)."),
-    "cache": ("machine.cache", "Show, check or remove what is kept of the network: cells of DEMs."),
-    "compare": ("scene.fitting", "Fit many models to the same points of IMAGE and recommend one."),
-    "dem-check": ("scene.heights", "Compare a DEM with check heights: bias, RMSE, NMAD and LE90, also by the slope of "
-                                   "the terrain."),
-    "doctor": ("machine.doctor", "Show what is installed: GDAL, PROJ, geoid grids, plugins."),
-    "edge": ("scene.bands", "Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, "
-                            "width in pixels)."),
-    "export": ("scene.rectifying", "Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps or a "
-                                   "--reference are given."),
-    "fit": ("scene.fitting", "Adjust the model of IMAGE to control points and show every residual (measured minus "
-                             "predicted, pixels)."),
-    "info": ("survey.first_use", "Describe an image: sensor, model and where it was read from, position, ground sample "
-                                 "distance."),
-    "init": ("survey.first_use", "Write the file of a run over the scenes of FOLDER, with comments, for 'ortho run'."),
-    "intersect": ("block", "Intersect the rays of points that were measured in several IMAGEs: ground coordinates with "
-                           "their sigmas."),
-    "match": ("matching", "Find control points of IMAGE by matching it with orthoimages of the same place."),
-    "models": ("machine.installed", "List the models that can be fitted to points alone."),
-    "mosaic": ("batch", "Make one raster of ORTHOs that lie on one grid, and measure how well they agree."),
-    "rectify": ("scene.rectifying", "Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."),
-    "register": ("scene.bands", "Bring single bands IMAGES onto one of them and write one image of all, which opens as "
-                                "the reference did."),
-    "report": ("scene.rectifying", "Write the plots of a report, each as a picture of its own."),
-    "run": ("batch", "Make the orthos of all scenes that PIPELINE.yaml names."),
-    "sensors": ("machine.installed", "List the sensors that are installed."),
-    "ties": ("matching", "Find tie points between overlapping IMAGEs: places that two of them or more show, with their "
-                         "covariances."),
-}  # fmt: skip
+#: Every command of the host, by what people want to do: its module in this room, and the first sentence of its help.
+GROUPS = {
+    "Make orthos": {
+        "rectify": ("scene.rectifying", "Make the ortho of IMAGE, with its accuracy report."),
+        "mosaic": ("batch", "Combine ORTHOs on one grid into one raster."),
+        "export": ("scene.rectifying", "Write the model of IMAGE for other programs."),
+        "register": ("scene.bands", "Align the bands of separate cameras in one image."),
+    },
+    "Control points": {
+        "fit": ("scene.fitting", "Adjust the model of IMAGE to control points."),
+        "compare": ("scene.fitting", "Compare models on the same points and recommend one."),
+        "match": ("matching", "Find control points of IMAGE in an orthoimage."),
+    },
+    "Blocks": {
+        "adjust": ("block", "Adjust several IMAGEs together (bundle adjustment)."),
+        "ties": ("matching", "Find tie points between overlapping IMAGEs."),
+        "intersect": ("block", "Compute ground points from rays in several IMAGEs."),
+    },
+    "Inspect": {
+        "info": ("survey.first_use", "Describe an image, a DEM, an ortho or a folder."),
+        "dem-check": ("scene.heights", "Compare a DEM with check heights."),
+        "edge": ("scene.bands", "Measure how sharp IMAGE is, from straight edges."),
+        "report": ("scene.rectifying", "Write the plots of a report as pictures."),
+    },
+    "Many scenes": {
+        "init": ("survey.first_use", "Write a pipeline file for the scenes of FOLDER."),
+        "run": ("batch", "Make the orthos of all scenes in PIPELINE.yaml."),
+    },
+    "Set-up": {
+        "doctor": ("machine.doctor", "Show versions, drivers, geoid grids and plugins."),
+        "sensors": ("machine.installed", "List the installed sensors."),
+        "models": ("machine.installed", "List the models that can be fitted to points."),
+        "cache": ("machine.cache", "List, verify or clear the downloaded DEM cells."),
+    },
+}
+COMMANDS = {name: known for group in GROUPS.values() for name, known in group.items()}
 
 
 class _Commands(click.Group):
@@ -106,11 +110,13 @@ class _Commands(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands by what is known of them, without loading any."""
-        told = {name: said for name, (_, said) in COMMANDS.items()}
-        told |= {name: offer.summary for name, offer in self.added.offers.items()}
-        known = {name: click.Command(name, help=said) for name, said in told.items()}
-        click.Group(self.name, known).format_commands(ctx, formatter)
+        """List the commands in their groups by what is known of them, without loading any."""
+        groups = {title: {name: said for name, (_, said) in group.items()} for title, group in GROUPS.items()}
+        for name, offer in self.added.offers.items():
+            groups.setdefault(offer.group, {})[name] = offer.summary
+        for title, group in groups.items():
+            with formatter.section(title):
+                formatter.write_dl(list(group.items()))
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> click.Context:
         command = shlex.join([info_name or "ortho", *args])
@@ -235,7 +241,7 @@ def _begin() -> None:
 @click.version_option(package_name="ortho-pipeline", prog_name="ortho")
 @click.pass_context
 def cli(ctx: click.Context) -> None:
-    """Orthorectify satellite scenes, and say honestly how good the result is.
+    """Orthorectify satellite images and report how accurate the result is.
 
     Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done, 130 interrupted.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ortho_pipeline import _lazily
+from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.fitting import compare as compare
@@ -49,4 +49,4 @@ _HOMES = {name: f"commands.{module}" for module, names in _NAMES.items() for nam
 __all__ = sorted(_HOMES)  # noqa: PLE0605
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-    __getattr__ = _lazily(__name__, _HOMES)
+    __getattr__ = lazily(__name__, _HOMES)

@@ -113,10 +113,12 @@ def adjust(
         for label, image, own in zip(labels, images, scenes, strict=True)
     }
     fit = adjust_block(
-        {label: start.model for label, start in starts.items()}, table,
-        priors={label: start.priors for label, start in starts.items()}, hold=points.hold,
+        {label: start.model for label, start in starts.items()},
+        table,
+        priors={label: start.priors for label, start in starts.items()},
+        hold=points.hold,
         heights=observed(points, surface, gathered.heights),
-    )  # fmt: skip
+    )
     if fit.heights is not None:
         # The block has the last word on the accuracy of the DEM.
         notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
@@ -197,9 +199,11 @@ def intersect(
     if writer is not None and output is not None:
         write_text(output, writer(rows))
     document = {
-        "points": rows, "sigma0": found.sigma0, **to_document([*notes, *_left_open(found)]),
+        "points": rows,
+        "sigma0": found.sigma0,
+        **to_document([*notes, *_left_open(found)]),
         "median_residual_px": _median_residual(found),
-    }  # fmt: skip
+    }
     return Result(files, document, _intersection_text(document))
 
 
@@ -214,9 +218,11 @@ def _heights(table: BlockPoints) -> tuple[float, float] | None:
 def _own(scene: Any, name: str | None) -> SensorModel:
     if name is not None and name not in scene.models:
         raise InputError(
-            f"this image has no model {name!r}", file=scene.path, field="points.model",
+            f"this image has no model {name!r}",
+            file=scene.path,
+            field="points.model",
             remedy=f"its models are {', '.join(scene.models)}",
-        )  # fmt: skip
+        )
     model: SensorModel = scene.model if name is None else scene.models[name]
     return model
 
@@ -226,9 +232,11 @@ def _own(scene: Any, name: str | None) -> SensorModel:
 
 def _files(labels: Sequence[str], folder: Path) -> dict[str, Path]:
     files = {
-        "report": folder / "block_report.json", "html": folder / "block_report.html",
-        "points": folder / "block_points.geojson", "points-csv": folder / "block_points.csv",
-    }  # fmt: skip
+        "report": folder / "block_report.json",
+        "html": folder / "block_report.html",
+        "points": folder / "block_points.geojson",
+        "points-csv": folder / "block_points.csv",
+    }
     for label in labels:
         files[f"{label} model"] = folder / f"{label}_model.json"
         files[f"{label} rpc"] = folder / f"{label}_RPC.TXT"
@@ -271,9 +279,13 @@ def _record(
     matched = options.ties is not None or bool(match.reference)
     asked = ({"match": match} if matched else {}) | ({"surface": surface} if matched or heights is not None else {})
     whole = provenance(
-        Request(images[0]), first, None, ledgers[0].joined(*ledgers[1:]).hashed(), command,
+        Request(images[0]),
+        first,
+        None,
+        ledgers[0].joined(*ledgers[1:]).hashed(),
+        command,
         {"block": options, "scene": replace(scenes[0], model=None), **asked},
-    )  # fmt: skip
+    )
     return {key: whole[key] for key in ("command", "inputs", "options", "software")}
 
 
@@ -341,9 +353,12 @@ def _write(
         scene = start.scene
         adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **made.adjustment.images[label].to_json()}
         saved = SavedModel(
-            _plain(fit.models[label]), scene.sensor, start.source, (scene.width, scene.height),
+            _plain(fit.models[label]),
+            scene.sensor,
+            start.source,
+            (scene.width, scene.height),
             {**record, "adjustment": adjustment},
-        )  # fmt: skip
+        )
         write_model_file(saved, files[f"{label} model"])
         if label in exported:
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
@@ -362,9 +377,13 @@ def _ground_rows(
     rows = []
     for k, name in enumerate(points.ids):
         row = {
-            "id": name, "role": str(points.roles[k]), "rays": int(rays[k]), "ground": json_position(ground[k]),
-            "sigma": json_position(sigmas[k]), "residual": json_position(residuals[k]),
-        }  # fmt: skip
+            "id": name,
+            "role": str(points.roles[k]),
+            "rays": int(rays[k]),
+            "ground": json_position(ground[k]),
+            "sigma": json_position(sigmas[k]),
+            "residual": json_position(residuals[k]),
+        }
         if angles_deg is not None:
             row["angle_deg"] = json_value(angles_deg[k])
         rows.append(row)

@@ -68,10 +68,12 @@ def scenes_of(
         if given and len(given) != len(images):
             what = counted(len(given), field.removesuffix("s"))
             raise InputError(
-                f"{what} for {counted(len(images), 'image')}", field=field,
+                f"{what} for {counted(len(images), 'image')}",
+                field=field,
                 remedy=f"give one {field.removesuffix('s')} file for each image, in their order"
-                if field == "models" else "give one for each image, in their order",
-            )  # fmt: skip
+                if field == "models"
+                else "give one for each image, in their order",
+            )
     return [replace(one, model=model) for one, model in zip(scenes, models, strict=True)] if models else scenes
 
 
@@ -87,9 +89,10 @@ def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str)
     if len(meant) != 1:
         which = " or ".join(os.fspath(images[number]) for number in meant)
         raise InputError(
-            f"{name!r} could mean {which}" if meant else f"no image is called {name!r}", field=field,
+            f"{name!r} could mean {which}" if meant else f"no image is called {name!r}",
+            field=field,
             remedy=f"name one of {', '.join(labels_of(images))}",
-        )  # fmt: skip
+        )
     return meant[0]
 
 
@@ -115,9 +118,10 @@ def points_of_images(
         if len(meant) > 1:
             raise InputError(
                 f"the name {name!r} could mean {' or '.join(os.fspath(images[k]) for k in meant)}",
-                file=points.source, field="image",
+                file=points.source,
+                field="image",
                 remedy="write the folder in the points file too, such as aft/BAND.tif",
-            )  # fmt: skip
+            )
         if meant:
             owner[number] = meant[0]
         else:
@@ -126,13 +130,16 @@ def points_of_images(
     if without and (whole or not owner):
         raise InputError(
             f"no point was measured in {without[0]}; there are points of {', '.join(points.images[:5])}",
-            file=points.source, field="image", remedy="use the names of the images in the points file",
-        )  # fmt: skip
+            file=points.source,
+            field="image",
+            remedy="use the names of the images in the points file",
+        )
     of_images = points.of_rays(np.isin(points.image, list(owner)))
     kept = replace(
-        of_images, images=tuple(labels),
+        of_images,
+        images=tuple(labels),
         image=np.array([owner[number] for number in of_images.image.tolist()], dtype=np.int64),
-    )  # fmt: skip
+    )
     return kept.select(np.bincount(kept.point, minlength=len(kept)) > 0), strangers
 
 
@@ -173,22 +180,27 @@ def start_of(
         return _family_start(opened, str(name), options, table, heights)
     if options.model_crs is not None:
         raise InputError(
-            Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"), field="points.model_crs",
+            Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"),
+            field="points.model_crs",
             remedy=Text("give ", Setting("points.model"), f" with one of {', '.join(sorted(named))}"),
-        )  # fmt: skip
+        )
     if name is not None and name not in opened.models:
         raise InputError(
-            f"this image has no model {name!r}", file=image, field="points.model",
+            f"this image has no model {name!r}",
+            file=image,
+            field="points.model",
             remedy=f"its models are {', '.join(opened.models)}; models fitted to points are {', '.join(sorted(named))}",
-        )  # fmt: skip
+        )
     own = name if name is not None else next(iter(opened.models))
     model = opened.models[own]
     correction = options.correction or (OWN if model.param_names else "shift")
     if correction == OWN and not model.param_names:
         raise InputError(
-            f"the model {own!r} has no parameters of its own to adjust", file=image, field="points.correction",
+            f"the model {own!r} has no parameters of its own to adjust",
+            file=image,
+            field="points.correction",
             remedy="take shift, shift-drift or affine",
-        )  # fmt: skip
+        )
     first = own == next(iter(opened.models))
     source = opened.model_source if first else f"metadata of {Path(opened.path).name}"
     if correction != OWN:

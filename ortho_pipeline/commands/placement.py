@@ -57,11 +57,13 @@ class Placement(NamedTuple):
             "rmse_px": {which: one and one["total"] for which, one in fit.rmses.given().items()},
             "coverage": self.footprint.coverage,
             "grid": {
-                "crs": crs_text(grid.crs), "size": [grid.width, grid.height],
-                "resolution": [grid.dx, grid.dy], "extent": list(grid.extent),
+                "crs": crs_text(grid.crs),
+                "size": [grid.width, grid.height],
+                "resolution": [grid.dx, grid.dy],
+                "extent": list(grid.extent),
             },
             **to_document([*self.adjusted.warnings(self.surface), *self.footprint.notes()]),
-        }  # fmt: skip
+        }
 
 
 def place_scene(resolved: Resolved) -> Placement:
@@ -96,6 +98,9 @@ def open_rasters(scene: Scene, request: Request) -> RasterSource:
     """Open the rasters of a scene with the bands and in the type that a request says."""
     image, output = request.image, request.output
     return RasterSource(
-        *(scene.rasters or (image,)), **request.scene.access, bands=output.bands, dtype=output.dtype,
+        *(scene.rasters or (image,)),
+        **request.scene.access,
+        bands=output.bands,
+        dtype=output.dtype,
         memory=output.memory,
-    )  # fmt: skip
+    )

@@ -41,7 +41,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
-from ortho_pipeline.raster.block_cache import cache_restored, limit_cache
+from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.output import checked_options, require_whole
 from ortho_pipeline.report import document as report
@@ -51,7 +51,7 @@ from ortho_pipeline.surface import footprint
 
 if TYPE_CHECKING:
     from ortho_pipeline.warp.job import WarpRecord
-    from ortho_pipeline.warp.layers.hiding import Hiding
+    from ortho_pipeline.warp.quality.hiding import Hiding
 
 
 # -- commands --------------------------------------------------------------------------------------------------------

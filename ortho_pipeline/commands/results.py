@@ -271,6 +271,9 @@ def write_report(
         del files["residuals"], files["style"]
     report.write_report_json(made, files["report"])
     report.write_report_html(
-        made, files["html"], ortho=staged(files["ortho"]) if "ortho" in files else None,
-        matches=None if matched is None else matched.matches, pixels=pixels,
-    )  # fmt: skip
+        made,
+        files["html"],
+        ortho=staged(files["ortho"]) if "ortho" in files else None,
+        matches=None if matched is None else matched.matches,
+        pixels=pixels,
+    )

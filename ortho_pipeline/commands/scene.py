@@ -216,12 +216,17 @@ def dem_check(
     found = dem_accuracy.check_dem(heights, ground, plane, ids)
     if not found.overall.count:
         raise InputError(
-            f"none of the {counted(len(ids), 'check point')} has a height in this DEM", file=dem_file, field="points",
+            f"none of the {counted(len(ids), 'check point')} has a height in this DEM",
+            file=dem_file,
+            field="points",
             remedy="check the CRS of the points, and whether they lie on the DEM",
-        )  # fmt: skip
+        )
     document = {
-        "dem": str(dem_file), "check_points": str(points), "surface": dict(heights.provenance), **found.to_json()
-    }  # fmt: skip
+        "dem": str(dem_file),
+        "check_points": str(points),
+        "surface": dict(heights.provenance),
+        **found.to_json(),
+    }
     return Result({}, document, dem_accuracy.summary(document))
 
 

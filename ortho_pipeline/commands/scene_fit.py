@@ -124,11 +124,14 @@ class Adjusted:
         told = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
         return left + [
             Notice(
-                "contradicting-point", f"{one.role} point {one.id} contradicts the others: {one.reason}",
-                point=one.id, role=one.role,
+                "contradicting-point",
+                f"{one.role} point {one.id} contradicts the others: {one.reason}",
+                point=one.id,
+                role=one.role,
             )
-            for one in self.fit.outlying if one.role == "control" or one.id not in told
-        ]  # fmt: skip
+            for one in self.fit.outlying
+            if one.role == "control" or one.id not in told
+        ]
 
     def _elsewhere(self) -> list[Notice]:
         """Return a warning if the points say that the model, as delivered, shows quite another place."""
@@ -173,12 +176,14 @@ def adjustable(request: Request) -> Resolved:
         other = "scene.model" if scene.model is not None else "points.correction"
         raise InputError(
             Text(
-                Setting("points.fit_model"), " takes the place of the image's own model, ", Setting(other),
-                " starts from it"
+                Setting("points.fit_model"),
+                " takes the place of the image's own model, ",
+                Setting(other),
+                " starts from it",
             ),
             field="points.fit_model",
             remedy=Text("leave out one of ", Setting("points.fit_model"), " and ", Setting(other)),
-        )  # fmt: skip
+        )
     if not request.has_control:
         raise InputError(
             "a model is fitted to points",
@@ -187,9 +192,10 @@ def adjustable(request: Request) -> Resolved:
         )
     if points.fit_model not in {family.name for family in families()}:
         raise InputError(
-            f"no model is called {points.fit_model!r}", field="points.fit_model",
+            f"no model is called {points.fit_model!r}",
+            field="points.fit_model",
             remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
-        )  # fmt: skip
+        )
     return resolve(request, needs_model=False)
 
 
@@ -211,9 +217,11 @@ def adjust(resolved: Resolved) -> Adjusted:
     if matched is not None and options.correction is options.fit_model is None and is_delivered:
         correction, note = by_matches(scene, matched.matches.points)
         options, notes = dataclasses.replace(options, correction=correction), (note,)
-    done = _from_points(scene, options, points, surface) if options.fit_model else _corrected(
-        scene, options, is_delivered, points, surface
-    )  # fmt: skip
+    done = (
+        _from_points(scene, options, points, surface)
+        if options.fit_model
+        else _corrected(scene, options, is_delivered, points, surface)
+    )
     warnings = *done.fit.warnings, *relative_to_reference(done.fit, match)
     adjusted = dataclasses.replace(done.fit, significance=options.significance, warnings=warnings)
     done = dataclasses.replace(done, fit=adjusted, matched=matched, notes=notes)
@@ -247,9 +255,13 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
         east, north = common.value * common.sigma
         text += f"; the other points put the reference {east:+.2f} m along x and {north:+.2f} m along y"
     relative = Notice(
-        "relative-to-reference", text, reference_sigma_m=sigma, matched=count, control=control,
+        "relative-to-reference",
+        text,
+        reference_sigma_m=sigma,
+        matched=count,
+        control=control,
         in_sigmas=common is not None,
-    )  # fmt: skip
+    )
     off = _reference_off(adjusted) if count == control else None
     if off is None:
         return [relative]
@@ -282,9 +294,7 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     own = scene.shared_model
     kinds = [name for name in comparing.CORRECTIONS if name != "none"] + ([OWN] if own.param_names else [])
     names = {comparing.own_name(own, kind): kind for kind in kinds}
-    compared = comparing.compare(
-        points, tuple(names), own=own, priors=scene.priors, size=(scene.width, scene.height)
-    )  # fmt: skip
+    compared = comparing.compare(points, tuple(names), own=own, priors=scene.priors, size=(scene.width, scene.height))
     chosen = "shift" if compared.recommended is None else names[compared.recommended]
     text = Text(
         "the correction was chosen by the matches (",
@@ -340,9 +350,14 @@ def _from_points(scene: Scene, options: PointOptions, points: Points, surface: S
     name = str(options.fit_model)
     points = heights_where_wanted(points, surface, name)
     adjusted = fit_family(
-        name, points, crs=options.model_crs, size=(scene.width, scene.height), heights=heights_around(points, surface),
-        ridge=ridge_of(options.ridge), params=params_of(options),
-    )  # fmt: skip
+        name,
+        points,
+        crs=options.model_crs,
+        size=(scene.width, scene.height),
+        heights=heights_around(points, surface),
+        ridge=ridge_of(options.ridge),
+        params=params_of(options),
+    )
     source = f"{counted(int(adjusted.used.sum()), 'control point')} of {Path(points.source).name or scene.path}"
     fitted = dataclasses.replace(scene, models={name: adjusted.model}, model_source=source)
     return Adjusted(fitted, adjusted)

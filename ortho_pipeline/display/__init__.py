@@ -1,4 +1,4 @@
-"""Presentation, whatever it is of: numbers as people read them, notices, SVG drawings.
+"""Presentation: numbers as people read them, notices, SVG drawings, pages.
 
 Knows no result and imports nothing above `files`.
 """

@@ -174,9 +174,10 @@ class Drawing:
             from matplotlib.figure import Figure
         except ImportError as error:
             raise InputError(
-                "PNG needs matplotlib, which is not installed", field="kind",
-                remedy=Text("pip install 'ortho-pipeline[plots]', or take ", Setting("kind", "svg")),
-            ) from error  # fmt: skip
+                "PNG output needs matplotlib, which is not installed",
+                field="kind",
+                remedy=Text("pip install 'ortho-pipeline[plots]', or use ", Setting("kind", "svg")),
+            ) from error
         figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set_xlim(0, self.width)
@@ -257,11 +258,19 @@ def _paint(axes: Any, what: str, order: int, **given: Any) -> None:
         return
     if what == "text":
         axes.text(
-            given["x"], given["y"], given["text"], fontsize=12 * 0.72, color=_COLOURS["ink"], zorder=order,
-            ha={"start": "left", "middle": "center", "end": "right"}[given["anchor"]], va="baseline",
-            alpha=0.65 if given["quiet"] else 1.0, rotation=90 if given["turn"] else 0, rotation_mode="anchor",
+            given["x"],
+            given["y"],
+            given["text"],
+            fontsize=12 * 0.72,
+            color=_COLOURS["ink"],
+            zorder=order,
+            ha={"start": "left", "middle": "center", "end": "right"}[given["anchor"]],
+            va="baseline",
+            alpha=0.65 if given["quiet"] else 1.0,
+            rotation=90 if given["turn"] else 0,
+            rotation_mode="anchor",
             parse_math=False,
-        )  # fmt: skip
+        )
         return
     look = LOOKS[given["kind"]]
     style: dict[str, Any] = {
@@ -294,7 +303,7 @@ def _rgba(name: str | None, opacity: float) -> Any:
 
 
 class Axes:
-    """A frame (x, y, width, height) in a drawing, and the values that its sides stand for."""
+    """A frame (x, y, width, height) in a drawing, and the values at its sides."""
 
     def __init__(
         self, drawing: Drawing, frame: tuple[float, ...], x: tuple[float, float], y: tuple[float, float]

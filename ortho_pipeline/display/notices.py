@@ -20,18 +20,24 @@ FROM_SENSOR = "from-sensor"
 
 
 class Notice(Text):
-    """A warning: the text itself, and with it a code and what it is about.
+    """A warning: a text that also has a code and fields.
 
-    What only shows warnings treats it as the text that it is; two notices of one text are equal.
+    A notice is a string, so that code which only shows it needs nothing else. Notices with the same text are equal.
 
     Parameters
     ----------
     code : str
-        Which notice it is, in lower case with hyphens. Texts may change between versions, codes do not.
+        Kind of notice, in lower case with hyphens. Texts may change between versions, codes do not.
     text : str
-        The sentence for people.
+        Sentence for people.
     **fields
-        What it is about: numbers, names and lists of them.
+        Its numbers and names, and lists of them.
+
+    Examples
+    --------
+    >>> notice = Notice("dem-covers-part", "the DEM covers 83 % of the scene", coverage=0.83)
+    >>> notice.code, notice.fields["coverage"]
+    ('dem-covers-part', 0.83)
     """
 
     __slots__ = ("code", "fields")
@@ -42,7 +48,7 @@ class Notice(Text):
     def __new__(cls, code: str, text: str, **fields: Any) -> Notice:
         """Make a notice of a code, a text and fields."""
         if not _CODE.fullmatch(code):
-            raise ValueError(f"{code!r} is not a code: lower case with hyphens")
+            raise ValueError(f"{code!r} is not a notice code; use lower case and hyphens")
         notice = super().__new__(cls, text)
         object.__setattr__(notice, "code", code)
         object.__setattr__(notice, "fields", MappingProxyType(fields))

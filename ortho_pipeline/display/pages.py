@@ -70,12 +70,22 @@ def _environment(package: str) -> Any:
                 temporary.replace(place)
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(package, ""), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, bytecode_cache=Kept(),
-    )  # fmt: skip
+        loader=jinja2.PackageLoader(package, ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        bytecode_cache=Kept(),
+    )
     environment.filters |= {
         "coded": _coded,
-        "px": px, "m": metres, "signed": signed, "share": share, "fixed": fixed, "number": short, "plain": plain_size,
+        "px": px,
+        "m": metres,
+        "signed": signed,
+        "share": share,
+        "fixed": fixed,
+        "number": short,
+        "plain": plain_size,
         "counted": counted,
-    }  # fmt: skip
+    }
     return environment

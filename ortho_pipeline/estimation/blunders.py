@@ -153,9 +153,17 @@ def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
         # The common solution was so far off that the model is not linear on the way: look again from the clean one.
         jacobian = found.model.param_partials(problem.ground)
         solution = Solution(
-            found.model, jacobian, residuals, problem.started(found.model).errors, found.cofactors, found.freedom,
-            found.effective, found.sigma0, found.condition, problem.points.groups,
-        )  # fmt: skip
+            found.model,
+            jacobian,
+            residuals,
+            problem.started(found.model).errors,
+            found.cofactors,
+            found.freedom,
+            found.effective,
+            found.sigma0,
+            found.condition,
+            problem.points.groups,
+        )
         again = _median_subset(solution, len(problem.priors))
         if (again == keep).all():
             return keep
@@ -435,10 +443,18 @@ def checks_apart(
     )
     return [
         Notice(
-            "checks-apart", text, count=len(ids), off=int(off.sum()), rmse=rms(sizes), expected=rms(usual),
-            points=ids[far].tolist(), rest=rest, alike=are_alike(miss[off]), beyond_control=int(beyond.sum()),
+            "checks-apart",
+            text,
+            count=len(ids),
+            off=int(off.sum()),
+            rmse=rms(sizes),
+            expected=rms(usual),
+            points=ids[far].tolist(),
+            rest=rest,
+            alike=are_alike(miss[off]),
+            beyond_control=int(beyond.sum()),
         )
-    ]  # fmt: skip
+    ]
 
 
 def are_alike(misses: Array) -> bool:

@@ -40,9 +40,10 @@ def fit_own(
     """
     if not model.param_names:
         raise InputError(
-            f"a model {model.kind!r} has no parameters of its own to adjust", field="points.correction",
+            f"a model {model.kind!r} has no parameters of its own to adjust",
+            field="points.correction",
             remedy="take shift, shift-drift or affine",
-        )  # fmt: skip
+        )
     return fit(model, points, priors=priors, robust=robust, name=f"{model.kind}+{OWN}")
 
 
@@ -81,11 +82,18 @@ def fit_family(
     if chosen.variants:
         fits = [
             fit_family(
-                name, points, crs=crs, size=size, heights=heights, ridge=ridge, priors=priors, params=params,
+                name,
+                points,
+                crs=crs,
+                size=size,
+                heights=heights,
+                ridge=ridge,
+                priors=priors,
+                params=params,
                 robust=robust,
             )
             for name in chosen.variants
-        ]  # fmt: skip
+        ]
         return min(fits, key=_leave_one_out)
     if ridge == "auto":
         ridge = "gcv" if chosen.regularised else None
@@ -127,7 +135,7 @@ def restricted(model: SensorModelT, params: Sequence[str] | None) -> SensorModel
             f"no parameter is called {', '.join(unknown)}" if unknown else "no parameter is named",
             field="points.params",
             remedy=f"some of {', '.join(model.param_names) or 'none: this model has no parameters'}",
-        )  # fmt: skip
+        )
     rest = [name for name in model.param_names if name not in params]
     return model.without(rest) if rest else model
 
@@ -147,9 +155,10 @@ def ridge_of(text: str) -> float | str | None:
     weight = number_of(text)
     if not weight > 0:
         raise InputError(
-            f"{text!r} is not a regularisation", field="points.ridge",
+            f"{text!r} is not a regularisation",
+            field="points.ridge",
             remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
-        )  # fmt: skip
+        )
     return weight
 
 

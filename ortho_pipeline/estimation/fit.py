@@ -38,7 +38,7 @@ from ortho_pipeline.estimation.records import (
 )
 from ortho_pipeline.estimation.records import CommonError as CommonErrorRecord
 from ortho_pipeline.estimation.regularisation import regularised
-from ortho_pipeline.estimation.spatial.common_error import CommonError
+from ortho_pipeline.estimation.spatial.common_error import ImageCommonError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared_errors
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.json.values import json_value
@@ -91,7 +91,7 @@ class Fit:
     corner_ratio: float = 0.0
     outlying: tuple[OutlyingPoint, ...] = ()
     shared_errors: SharedErrors | None = None
-    common_error: CommonError | None = None
+    common_error: ImageCommonError | None = None
 
     @property
     def reservations(self) -> tuple[str, ...]:
@@ -213,9 +213,11 @@ class Fit:
         }
         if self.common_error is not None:
             found["common_error"] = CommonErrorRecord.of(self.common_error)
-        return Statistics(**found) if self.shared_errors is None else GroupedStatistics(
-            **found, shared_errors=self.shared_errors
-        )  # fmt: skip
+        return (
+            Statistics(**found)
+            if self.shared_errors is None
+            else GroupedStatistics(**found, shared_errors=self.shared_errors)
+        )
 
     def __repr__(self) -> str:
         total = {role: found.total for role in ("control", "check", "loo") if (found := self.rmse(role))}
@@ -294,9 +296,10 @@ def fit(
     """
     if not isinstance(model, SensorModel):
         raise InputError(
-            f"a {type(model).__name__} is no sensor model, and has nothing to adjust", field="model",
+            f"a {type(model).__name__} is no sensor model, and has nothing to adjust",
+            field="model",
             remedy='give a model; of a scene: scene.fit(points, "shift")',
-        )  # fmt: skip
+        )
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
     known_bad = {points.ids.index(name): reason for name, reason in (exclude or {}).items() if name in points.ids}
@@ -345,10 +348,10 @@ def gross_errors(
 
 def _common_error(
     model: SensorModel, points: Points, raw: Array, priors: Mapping[str, Prior] | None, *, robust: bool
-) -> CommonError | None:
+) -> ImageCommonError | None:
     """Return what control points have in common, with a start from those without it, or None."""
     usable = points.control & np.isfinite(raw).all(axis=1)
-    common = CommonError.of(model, points, usable)
+    common = ImageCommonError.of(model, points, usable)
     others = usable & (points.sigma_common == 0)
     if common is None or not others.any():
         return common
@@ -360,7 +363,7 @@ def _common_error(
     return common.seen_by(first.model, points.select(others))
 
 
-def _without(common: CommonError | None, model: SensorModel, points: Points) -> Points:
+def _without(common: ImageCommonError | None, model: SensorModel, points: Points) -> Points:
     """Return points as they were measured, but for what they have in common."""
     if common is None or not common.value.any():
         return points
@@ -434,7 +437,7 @@ def _result(
     name: str | None,
     strength: float | None,
     priors: Mapping[str, Prior],
-    common: CommonError | None,
+    common: ImageCommonError | None,
 ) -> Fit:
     predicted = solution.model.ground_to_image(points.ground)
     loo = np.full((len(points), 2), np.nan)

@@ -168,9 +168,17 @@ class Problem:
         # Less than a whole observation too many tells nothing of weights.
         sigma0 = unit_weight(float(observed @ observed), freedom, 1 - 1e-6)
         return Solution(
-            model, jacobian, residuals, errors, solved.cofactors, freedom, effective, sigma0, condition,
+            model,
+            jacobian,
+            residuals,
+            errors,
+            solved.cofactors,
+            freedom,
+            effective,
+            sigma0,
+            condition,
             self.points.groups[keep],
-        )  # fmt: skip
+        )
 
     def _enough(self, points: int) -> None:
         count, known = len(self.model.params), len(self.priors)

@@ -55,12 +55,16 @@ class UndecidedCrop(InputError):
         super().__init__(
             f"this image is a crop that begins at {_text(offset)} of a larger image, and nothing shows whether its RPC "
             "belongs to the crop or to the larger image",
-            file=scene.path, field="scene.crop_offset",
+            file=scene.path,
+            field="scene.crop_offset",
             remedy=Text(
-                "give ", moved, " if the RPC belongs to the larger image, or ", kept, " if it belongs to this crop; "
-                "control points, a DEM of the crop alone, or a reference decide it too",
+                "give ",
+                moved,
+                " if the RPC belongs to the larger image, or ",
+                kept,
+                " if it belongs to this crop; control points, a DEM of the crop alone, or a reference decide it too",
             ),
-        )  # fmt: skip
+        )
         self.choices = ((moved, "the RPC belongs to the larger image"), (kept, "the RPC belongs to this crop"))
 
     def __reduce__(self) -> Any:
@@ -88,9 +92,10 @@ def checked(offset: Sequence[float]) -> tuple[float, float]:
     """
     if len(offset) != 2 or not all(math.isfinite(value) for value in offset):
         raise InputError(
-            f"{', '.join(f'{value:g}' for value in offset)} is not the place of a crop", field="scene.crop_offset",
+            f"{', '.join(f'{value:g}' for value in offset)} is not the place of a crop",
+            field="scene.crop_offset",
             remedy="give the column and row of its first pixel in the whole image: COL,ROW",
-        )  # fmt: skip
+        )
     return float(offset[0]), float(offset[1])
 
 

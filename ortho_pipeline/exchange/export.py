@@ -39,9 +39,10 @@ def check_formats(names: Sequence[str], known: Mapping[str, Format]) -> tuple[Fo
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise InputError(
-            f"no format is called {', '.join(unknown) or 'nothing'}", field="formats",
+            f"no format is called {', '.join(unknown) or 'nothing'}",
+            field="formats",
             remedy=f"one or more of {', '.join(known)}",
-        )  # fmt: skip
+        )
     return tuple(known[name] for name in dict.fromkeys(names))
 
 
@@ -145,13 +146,15 @@ FORMATS: Mapping[str, Format] = {
         ("rpb", "RPC as DigitalGlobe writes it", ".RPB", lambda export, path: write_rpb(export.rpc.rpc, path)),
         ("vrt", "RPC over the image", ".vrt", lambda export, path: write_vrt(export.dataset, export.rpc.rpc, path)),
         (
-            "tag", "RPC in the TIFF tag of a copy", "_rpc.tif",
+            "tag",
+            "RPC in the TIFF tag of a copy",
+            "_rpc.tif",
             lambda export, path: write_tagged_copy(export.dataset, export.rpc.rpc, path),
         ),
         ("gcp", "ground control points", "_gcp.vrt", _write_gcps),
         ("gcp-tag", "ground control points in a copy", "_gcp.tif", _write_gcps),
         ("geolocation", "geolocation arrays", "_geolocation.vrt", _write_geolocation),
     )
-}  # fmt: skip
+}
 #: Names that no plugin's format has: those of the formats above, and other keys of the document.
 RESERVED = {*FORMATS, "exact", "files", "gcps", "model", "notices", "warnings"}

@@ -56,11 +56,12 @@ def gcps_of_model(
     gcps = gcps[np.isfinite(gcps).all(axis=1)]
     if len(gcps) < 4:
         raise InputError(
-            "the rays of the image do not meet the ground: there is no grid of control points", field="model",
+            "the rays of the image do not meet the ground: there is no grid of control points",
+            field="model",
             remedy=Text(
                 "give the metadata of this very image, and a DEM or ", Setting("surface.height"), " that lies under it"
             ),
-        )  # fmt: skip
+        )
     return gcps
 
 
@@ -154,9 +155,9 @@ def write_geolocation(
             field="model" if surface is None else "surface.dem",
             remedy=Text(
                 "give the metadata of this very image, and a DEM that covers the whole scene, or ",
-                Setting("surface.height")
+                Setting("surface.height"),
             ),
-        )  # fmt: skip
+        )
     arrays = path.parent.resolve() / f"{path.stem}.tif"
     with raster_output(arrays) as temporary:
         made = gdal.GetDriverByName("GTiff").Create(
@@ -167,11 +168,20 @@ def write_geolocation(
                 raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
     view = _without_georeferencing(dataset)
     view.SetMetadata(
-        {"X_DATASET": str(arrays), "X_BAND": "1", "Y_DATASET": str(arrays), "Y_BAND": "2", "PIXEL_OFFSET": "0",
-         "LINE_OFFSET": "0", "PIXEL_STEP": str(step), "LINE_STEP": str(step), "SRS": _wgs84().ExportToWkt(),
-         "GEOREFERENCING_CONVENTION": "TOP_LEFT_CORNER"},
+        {
+            "X_DATASET": str(arrays),
+            "X_BAND": "1",
+            "Y_DATASET": str(arrays),
+            "Y_BAND": "2",
+            "PIXEL_OFFSET": "0",
+            "LINE_OFFSET": "0",
+            "PIXEL_STEP": str(step),
+            "LINE_STEP": str(step),
+            "SRS": _wgs84().ExportToWkt(),
+            "GEOREFERENCING_CONVENTION": "TOP_LEFT_CORNER",
+        },
         "GEOLOCATION",
-    )  # fmt: skip
+    )
     with raster_output(path) as temporary:
         close(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), view))
         name_sources_relatively(temporary, path)

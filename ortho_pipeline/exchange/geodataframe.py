@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.points import Points, points_of
 from ortho_pipeline.points.image_errors import read_image_errors, says_more
-from ortho_pipeline.points.rows import CSV_ERRORS, Row, Table, number, role_of, sigma_of
+from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, Table, number, role_of, sigma_of
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -40,9 +40,10 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
         import geopandas
     except ImportError as error:
         raise InputError(
-            "a GeoDataFrame needs GeoPandas, which is not installed", field="points",
+            "a GeoDataFrame needs GeoPandas, which is not installed",
+            field="points",
             remedy="pip install 'ortho-pipeline[geopandas]'",
-        ) from error  # fmt: skip
+        ) from error
     columns: dict[str, Any] = {
         "id": list(points.ids),
         "role": points.roles.astype(object),
@@ -106,15 +107,19 @@ def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
     missing = [name for name in ("col", "row") if name not in frame.columns]
     if missing:
         raise InputError(
-            f"no column {' and '.join(missing)}", file=source, field="columns",
+            f"no column {' and '.join(missing)}",
+            file=source,
+            field="columns",
             remedy="name the columns of the place in the image (px from the outer corner of the first pixel) so",
-        )  # fmt: skip
+        )
     if not frame.columns.is_unique:
         raise InputError("two columns of one name", file=source, field="columns", remedy="rename one of them")
     table = Table(
-        _FRAME, crs=None if frame.crs is None else frame.crs.to_wkt(), vertical=frame.attrs.get("vertical"),
+        _FRAME,
+        crs=None if frame.crs is None else frame.crs.to_wkt(),
+        vertical=frame.attrs.get("vertical"),
         source=source,
-    )  # fmt: skip
+    )
     # As objects, for the missing values of pandas are neither numbers nor None.
     cells = {name: frame[name].astype(object).where(frame[name].notna(), None) for name in _COLUMNS if name in frame}
     records = [dict(zip(cells, values, strict=True)) for values in zip(*cells.values(), strict=True)]
@@ -126,7 +131,7 @@ def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
     return table, sigmas
 
 
-def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
+def _row(source: str, where: str, record: dict[str, Any], place: Any) -> PointRow:
     def cell(name: str) -> float:
         return number(_plain(record[name]), source, f"{where}, {name}")
 
@@ -139,11 +144,13 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> Row:
         height = place.z if place is not None and place.has_z and "h" not in record else math.nan
     sigma_image = _sigma(source, where, record, "sigma_image", zero=False)
     covariance, group, common, alike = read_image_errors(
-        [_plain(record.get(name)) for name in CSV_ERRORS], source, [f"{where}, {name}" for name in CSV_ERRORS],
+        [_plain(record.get(name)) for name in CSV_ERRORS],
+        source,
+        [f"{where}, {name}" for name in CSV_ERRORS],
         sigma_image,
-    )  # fmt: skip
+    )
     name = _plain(record.get("id"))
-    return Row(
+    return PointRow(
         where=where,
         id=None if name is None else str(name),
         image=(cell("col"), cell("row")),

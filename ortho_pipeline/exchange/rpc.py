@@ -119,8 +119,10 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
     raise InputError(
         f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
-        file=name, field="scene.rpc", remedy=Text("give the RPC file with ", Setting("scene.rpc", "FILE")),
-    )  # fmt: skip
+        file=name,
+        field="scene.rpc",
+        remedy=Text("give the RPC file with ", Setting("scene.rpc", "FILE")),
+    )
 
 
 def _begins_like_rpc(path: Path | VsiPath) -> bool:
@@ -142,12 +144,16 @@ def _refuse_unread_sidecar(dataset: gdal.Dataset) -> None:
     for file in _sidecar_names(path) if isinstance(path, Path) else []:
         if file.is_file():
             files.read_bounded(
-                file, 1_000_000, field="scene.rpc",
+                file,
+                1_000_000,
+                field="scene.rpc",
                 remedy=Text(
-                    "copy it again from the delivery, or choose another RPC: ", Setting("scene.rpc", "tag"), ", ",
-                    Setting("scene.rpc", "FILE")
+                    "copy it again from the delivery, or choose another RPC: ",
+                    Setting("scene.rpc", "tag"),
+                    ", ",
+                    Setting("scene.rpc", "FILE"),
                 ),
-            )  # fmt: skip
+            )
 
 
 def _unreadable_beside(path: Path) -> list[str]:

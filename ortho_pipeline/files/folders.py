@@ -105,8 +105,10 @@ def listing(folder: AnyPath) -> Listing:
     if kept is not None and kept[0] == state:
         return kept[1]
     with os.scandir(folder) as entries:
-        found = [(entry.name, entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False))
-                 for entry in entries]  # fmt: skip
+        found = [
+            (entry.name, entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False))
+            for entry in entries
+        ]
     made = Listing((name for name, _ in found), (name for name, plain in found if not plain))
     if time.time() - max(state[2:]) / 1e9 > _SETTLED and _state(folder) == state:
         while len(_kept) >= _MOST:

@@ -220,7 +220,11 @@ class VsiPath:
         """
         data = self.read(MAX_READ + 1)
         if len(data) > MAX_READ:
-            raise OSError(errno.EFBIG, f"a file of more than {MAX_READ // 1_000_000} MB is not read whole", self._name)
+            raise OSError(
+                errno.EFBIG,
+                f"the file is larger than {MAX_READ // 1_000_000} MB, the limit for reading it at once",
+                self._name,
+            )
         return data
 
     def read_text(self, encoding: str = "utf-8") -> str:
@@ -244,9 +248,14 @@ class VsiPath:
 
 #: What a closed process says to libcurl by way of GDAL: no file has this name, and nobody listens there.
 _CLOSED = {
-    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none", "GDAL_HTTP_PROXY": "127.0.0.1:1", "GDAL_HTTPS_PROXY": "127.0.0.1:1",
-    "GDAL_HTTP_MAX_RETRY": "0", "GDAL_HTTP_CONNECTTIMEOUT": "1", "NO_PROXY": "", "no_proxy": "",
-}  # fmt: skip
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
+    "GDAL_HTTP_PROXY": "127.0.0.1:1",
+    "GDAL_HTTPS_PROXY": "127.0.0.1:1",
+    "GDAL_HTTP_MAX_RETRY": "0",
+    "GDAL_HTTP_CONNECTTIMEOUT": "1",
+    "NO_PROXY": "",
+    "no_proxy": "",
+}
 _closed_with: dict[str, str | None] = {}
 #: A request that fails in passing (429, 502, 503, 504, no answer) is repeated by GDAL too, if nobody says otherwise.
 _PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10", **COUNTING}
@@ -409,7 +418,9 @@ def located(path: AnyPath, *, allow_network: bool = False) -> AnyPath:
             return name[url.end() :]
         if scheme not in SCHEMES:
             raise InputError(
-                f"URLs of the kind {scheme!r} are not read", file=name, remedy=f"one of {', '.join(SCHEMES)}, or a file"
+                f"URLs with the scheme {scheme!r} are not supported",
+                file=name,
+                remedy=f"one of {', '.join(SCHEMES)}, or a file",
             )
         name = SCHEMES[scheme] + name[url.end() :]
     if not Location(name).in_archive:
@@ -435,15 +446,16 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
     plain = _decoded(address)
     if _NAMED.search(plain) or _SIGNED.search(_PAGE.sub("", plain) if paged else plain):
         raise InputError(
-            "an address with credentials in it (a password, a signature) is not read, for what is read is named in all "
-            "outputs", file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
-            remedy="give it without them, as s3://, gs:// or az:// with the credentials in the environment",
-        )  # fmt: skip
+            "an address must not contain credentials (a password, a signature), because outputs name all their inputs",
+            file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
+            remedy="use s3://, gs:// or az://, with the credentials in the environment",
+        )
     if not allowed:
         raise InputError(
-            "files of the network are not opened unasked", file=address,
-            remedy=Text("allow them with ", Setting("scene.allow_network")),
-        )  # fmt: skip
+            "network access is off by default",
+            file=address,
+            remedy=Text("allow it with ", Setting("scene.allow_network")),
+        )
     _open_network()
 
 

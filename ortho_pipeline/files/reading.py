@@ -41,7 +41,7 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 told.setdefault("remedy", "give a plain file")
-                raise InputError("this is not a file but a folder, a pipe or a device", file=path, **told)
+                raise InputError("this is a folder, a pipe or a device, not a file", file=path, **told)
             return file.read(limit + 1)
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError) and not isinstance(path, VsiPath):
@@ -76,9 +76,12 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
         found = json.loads(
-            text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
+            text,
+            parse_constant=_finite,
+            parse_float=_finite,
+            parse_int=_whole,
             object_pairs_hook=_unique if unique else None,
-        )  # fmt: skip
+        )
         if _SURROGATE.search(text):
             # Half of a character is in no name of a file, and cannot be written to a report.
             json.dumps(found, ensure_ascii=False).encode()
@@ -93,7 +96,7 @@ def read_json(path: str | os.PathLike[str], limit: int, remedy: str, *, unique: 
     """Return the JSON document in a file of at most `limit` bytes, as `parse_json` does."""
     data = read_bounded(path, limit, remedy=remedy)
     if len(data) > limit:
-        raise InputError(f"a file of more than {limit // 1_000_000} MB is not read here", file=path, remedy=remedy)
+        raise InputError(f"this file is larger than the limit of {limit // 1_000_000} MB", file=path, remedy=remedy)
     return parse_json(data, path, remedy, unique=unique)
 
 
@@ -114,7 +117,7 @@ def _whole(text: str) -> int:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
-        raise ValueError("a field stands twice")
+        raise ValueError("a field appears twice")
     return found
 
 

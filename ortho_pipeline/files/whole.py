@@ -24,7 +24,7 @@ from ortho_pipeline.files.reading import read_bounded
 #: What a temporary name has between its random part and its suffix.
 _PART = ".part"
 #: Default remedy for a file that cannot be written.
-_REMEDY = "choose a folder that you may write to and that has room"
+_REMEDY = "choose a folder with write access and enough free space"
 
 
 class Outputs:
@@ -108,9 +108,11 @@ class Outputs:
                 lock = Lock(path, wait=wait, needed=False)
             except BlockingIOError as error:
                 raise InputError(
-                    f"another command is writing {self.name!r} in this folder", file=self.folder, field="folder",
-                    remedy="wait for its end, or choose another output folder",
-                ) from error  # fmt: skip
+                    f"another command is writing {self.name!r} in this folder",
+                    file=self.folder,
+                    field="folder",
+                    remedy="wait until it ends, or choose another output folder",
+                ) from error
             if not lock.held:
                 # A file system without locks: two commands on one folder do not notice each other there.
                 return lock, False
@@ -157,9 +159,13 @@ class Outputs:
     def _clear(self, start: str) -> None:
         """Remove the files in the folder whose names begin so, but for the lock's."""
         with os.scandir(self.folder) as entries:
-            left = [entry.path for entry in entries
-                    if entry.name.startswith(start) and not entry.name.endswith(f"lock{_PART}")
-                    and not entry.is_dir(follow_symlinks=False)]  # fmt: skip
+            left = [
+                entry.path
+                for entry in entries
+                if entry.name.startswith(start)
+                and not entry.name.endswith(f"lock{_PART}")
+                and not entry.is_dir(follow_symlinks=False)
+            ]
         for path in left:
             Path(path).unlink(missing_ok=True)
 
@@ -173,7 +179,11 @@ class Outputs:
         """Return a new temporary path for `final`; drivers go by its suffix."""
         suffix = final.suffix if len(final.suffix) < 40 else ""
         if os.path.isdir(final) or not final.name:
-            raise InputError("a folder lies where this file would be written", file=final, remedy="remove or rename it")
+            raise InputError(
+                "a folder with this name exists, so the file cannot be written",
+                file=final,
+                remedy="remove or rename it",
+            )
         try:
             if len(os.fsencode(final.name)) > os.pathconf(final.parent, "PC_NAME_MAX"):
                 raise InputError("this name is too long for the file system", file=final, remedy="rename the image")
@@ -263,9 +273,10 @@ def allowed(path: str | os.PathLike[str]) -> Path:
     for link in (place, *place.parents):
         if os.path.islink(link):
             raise InputError(
-                "a symbolic link is in the way: outputs are not written through links", file=link,
-                remedy="remove the link, or choose the folder or file that it leads to as the output",
-            )  # fmt: skip
+                "this is a symbolic link; outputs are not written through links",
+                file=link,
+                remedy="remove the link, or give its target as the output",
+            )
     return place
 
 
@@ -388,7 +399,7 @@ def _place(path: str | os.PathLike[str]) -> Path:
     except (OSError, RuntimeError) as error:
         # Links that point at each other are a RuntimeError before Python 3.13.
         raise InputError(
-            f"this path leads nowhere ({getattr(error, 'strerror', None) or error})",
+            f"this path cannot be resolved ({getattr(error, 'strerror', None) or error})",
             file=path,
             remedy="check its links",
         ) from error
@@ -398,7 +409,7 @@ def _place(path: str | os.PathLike[str]) -> Path:
         if absolute.is_relative_to(root):
             return folder / absolute.relative_to(root)
     raise InputError(
-        f"this path is outside of the output folder {folder}", file=path, remedy="choose a path in that folder"
+        f"this path is outside the output folder {folder}", file=path, remedy="choose a path in that folder"
     )
 
 

@@ -51,7 +51,7 @@ class XmlFields:
         if len(data) > limit:
             size = f"{limit // 1_000_000} MB"
             raise InputError(
-                f"this file has more than {size}, which no metadata of a scene has", file=path, remedy=remedy
+                f"this file has more than {size}, too much for the metadata of a scene", file=path, remedy=remedy
             )
         try:
             self.root: Element = ElementTree.fromstring(data, forbid_dtd=True)
@@ -85,7 +85,7 @@ class XmlFields:
         """Return all elements of a path."""
         found = self.root.findall(field)
         if len(found) > most:
-            raise self.error(f"there are {len(found)} of these, more than one scene has", field)
+            raise self.error(f"there are {len(found)} of these, too many for one scene", field)
         return found
 
     def numbers(self, field: str, count: int | None, parent: Element | None = None) -> list[float]:
@@ -115,7 +115,7 @@ class XmlFields:
         """Return the number of rows or columns in a field."""
         value = self.number(field, parent)
         if value != int(value) or not 0 < value <= MOST_PIXELS:
-            raise self.error(f"{value} is not a size of an image", field)
+            raise self.error(f"{value} is not an image size", field)
         return int(value)
 
     def time(self, field: str, parent: Element | None = None) -> float:

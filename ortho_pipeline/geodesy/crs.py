@@ -30,6 +30,7 @@ from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
+from ortho_pipeline.geodesy.missing_grids import grid_of_message, grid_remedy, unavailable_grids
 from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]
@@ -86,7 +87,7 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     try:
         refuse_files(text if isinstance(text, str) else json.dumps(text))
         if isinstance(text, str) and not _STATED.match(text) and not _NAME.fullmatch(text):
-            raise ValueError("neither a name nor a form of a coordinate system")
+            raise ValueError("not a name, a code or a definition of a CRS")
         return pyproj.CRS.from_user_input(text)
     except (CRSError, ProjError, ValueError, TypeError, RecursionError) as error:
         shown = str(text) if len(str(text)) < 80 else f"{str(text)[:80]}..."
@@ -130,7 +131,7 @@ def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
         raise CrsError(error.message, field="output.crs", remedy=remedy) from error
     operation = plain.coordinate_operation
     if "Derived" in plain.type_name or (operation is not None and operation.method_name.startswith("PROJ ")):
-        raise CrsError(f"a GeoTIFF cannot hold {plain.to_string()!r}", field="output.crs", remedy=remedy)
+        raise CrsError(f"a GeoTIFF cannot store the CRS {plain.to_string()!r}", field="output.crs", remedy=remedy)
     return crs
 
 
@@ -159,7 +160,12 @@ class Vertical:
     Parameters
     ----------
     name : str
-        One of these; make it with `parse`, which checks it.
+        One of these. Create it with `parse`, which checks it.
+
+    Examples
+    --------
+    >>> Vertical.parse("egm96").label
+    'EGM96 height (EPSG:5773)'
     """
 
     name: str
@@ -189,15 +195,16 @@ class Vertical:
 
     @classmethod
     def stated(cls, text: str) -> Vertical:
-        """Return the height datum that a file of strangers names: as `parse`, but no grid by its path."""
+        """Return the height datum that a file states: as `parse`, but a path of a grid is an error."""
         name = text.strip()
         if Path(name).suffix.lower() not in _GRID_SUFFIXES:
             return cls.parse(name)
         if not _BARE_NAME.fullmatch(name):
             raise DatumError(
-                f"{name[:80]!r} is the path of a grid, which is not opened because a file names it", field="vertical",
+                f"a file refers to the geoid grid {name[:80]!r} by its path; such paths are not opened",
+                field="vertical",
                 remedy=Text("give the grid as ", Setting("points.vertical", "FILE")),
-            )  # fmt: skip
+            )
         vertical_transformer(name)
         return cls(name)
 
@@ -208,7 +215,7 @@ class Vertical:
 
     @property
     def label(self) -> str:
-        """Name for people."""
+        """Name for messages and reports."""
         if self.is_ellipsoid:
             return "WGS84 ellipsoid"
         if self.name.startswith("EPSG:"):
@@ -231,7 +238,7 @@ class Vertical:
         Raises
         ------
         DatumError
-            If the grid is not installed (the message names it and says how to get it), or gives absurd heights.
+            If the grid is not installed (the remedy says how to get it), or gives impossible heights.
         """
         lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
         if self.is_ellipsoid:
@@ -248,7 +255,7 @@ class Vertical:
         asked = np.isfinite(lon) & np.isfinite(lat)
         if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
             # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.
-            missing = _unavailable_grids(_compound(self.name), "EPSG:4979")
+            missing = unavailable_grids(_compound(self.name), "EPSG:4979")
             if missing:
                 raise _grid_error(self, f"Grid {missing[0]} is not available")
         return shift
@@ -268,7 +275,7 @@ def _vertical_of_code(code: str) -> Vertical:
             f"{code} ({crs.name}) is not a vertical CRS", field="vertical", remedy=f"give {VERTICAL_FORMS}"
         )
     if part.axis_info[0].direction.lower() != "up":
-        raise DatumError(f"{code} ({crs.name}) counts depths, not heights", field="vertical")
+        raise DatumError(f"{code} ({crs.name}) gives depths, not heights", field="vertical")
     return Vertical(":".join(authority))
 
 
@@ -289,7 +296,7 @@ def vertical_transformer(name: str) -> Transformer:
             raise _grid_error(Vertical(name), fault)
         if set(name) & {",", '"'}:
             raise DatumError(
-                "PROJ cannot read a grid whose path holds a comma or a quotation mark", file=name, remedy="rename it"
+                "PROJ cannot read a grid whose path contains a comma or a quotation mark", file=name, remedy="rename it"
             )
         return Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
@@ -304,43 +311,23 @@ def _grid_error(vertical: Vertical, message: str) -> DatumError:
     if not vertical.name.startswith("EPSG:"):
         exists = Path(vertical.name).exists()
         return DatumError(
-            "is not a geoid grid that PROJ reads" if exists else "this geoid grid does not exist",
+            "PROJ cannot read this file as a geoid grid" if exists else "this geoid grid does not exist",
             file=vertical.name,
             field="vertical",
-            remedy="give a .gtx or GeoTIFF geoid grid, or its name if it lies in PROJ's search path",
+            remedy="give a .gtx or GeoTIFF geoid grid, or only its name if it is in PROJ's search path",
         )
-    grid = _grid_of_message(message)
+    grid = grid_of_message(message)
     if grid is None:
         return DatumError(
-            f"there is no transformation from {vertical.label} to the ellipsoid", field="vertical",
-            remedy="give the geoid grid file of this datum instead",
-        )  # fmt: skip
+            f"there is no transformation from {vertical.label} to the ellipsoid",
+            field="vertical",
+            remedy="give a geoid grid file of this datum instead",
+        )
     return DatumError(
         f"heights in {vertical.label} need the geoid grid {grid}, which is not installed",
         field="vertical",
-        remedy=_grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) in place of the datum's name"),
+        remedy=grid_remedy(grid, "or give a geoid grid file (.gtx, .tif) instead of the datum's name"),
     )
-
-
-def _grid_of_message(message: str) -> str | None:
-    found = re.search(r"Grid (\S+) is not available", message)
-    return found.group(1) if found else None
-
-
-def _grid_remedy(grid: str, otherwise: str) -> str:
-    sync = f"`pyproj sync --file {grid}` (or `projsync --file {grid}`, both from PROJ's network)"
-    # Of the worldwide geoids Debian's package has this one alone.
-    debian = " or install Debian's proj-data," if "egm96" in grid else ""
-    return f"run {sync},{debian} {otherwise}"
-
-
-def _unavailable_grids(source: Any, target: Any) -> list[str]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False)
-    return [
-        grid.short_name for operation in group.unavailable_operations for grid in operation.grids if not grid.available
-    ]
 
 
 # -- ground to ground ------------------------------------------------------------------------------------------------
@@ -351,14 +338,14 @@ class GroundTransform:
 
     Systems on a modern ellipsoid are promoted to 3D, so small differences between realisations enter the height.
     Systems on a classical ellipsoid (Bessel, Airy, Hayford ...) are transformed in plan and keep the WGS84 height,
-    since nobody measures heights above those. Geocentric systems are allowed on either side.
+    because heights are not measured above those. Geocentric systems are allowed on either side.
 
     Instances can be pickled, and shared between threads.
 
     Parameters
     ----------
     source, target : str or pyproj.CRS
-        Compound and 3D systems stand for their horizontal part.
+        Of compound and 3D systems the horizontal part is used.
 
     Raises
     ------
@@ -429,9 +416,9 @@ class GroundTransform:
         try:
             self._leg(transformer, spatial, sample, errcheck=True)
         except ProjError as error:
-            grid = _grid_of_message(str(error))
+            grid = grid_of_message(str(error))
             if grid is None and "No operation" in str(error):
-                grid = next(iter(_unavailable_grids(self.source, self.target)), None)
+                grid = next(iter(unavailable_grids(self.source, self.target)), None)
             if grid is not None:
                 raise _way_error(self.source, self.target, grid) from error
 
@@ -453,19 +440,20 @@ def _transformer(source: pyproj.CRS, target: pyproj.CRS) -> Transformer:
     try:
         return Transformer.from_crs(source, target, always_xy=True, only_best=True, allow_ballpark=False)
     except (ProjError, CRSError) as error:
-        raise _way_error(source, target, _grid_of_message(str(error))) from error
+        raise _way_error(source, target, grid_of_message(str(error))) from error
 
 
 def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> OrthoError:
     if grid is None:
         return CrsError(
-            f"there is no transformation from {source.name!r} to {target.name!r}", field="CRS",
-            remedy="choose systems of known datum, such as UTM on WGS84",
-        )  # fmt: skip
+            f"there is no transformation from {source.name!r} to {target.name!r}",
+            field="CRS",
+            remedy="choose a CRS with a known datum, such as UTM on WGS84",
+        )
     return CrsError(
         f"the transformation from {source.name!r} to {target.name!r} needs the grid {grid}, which is not installed",
         field="CRS",
-        remedy=_grid_remedy(grid, "or choose a system on WGS84"),
+        remedy=grid_remedy(grid, "or choose a CRS on WGS84"),
     )
 
 
@@ -485,9 +473,14 @@ def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, s
         better = group.unavailable_operations[0]
         grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
         log.warning(
-            "%s -> %s: used %.1f m, a transformation of %.1f m needs the grid %s, which is not installed",
-            source.name, target.name, used.get_last_used_operation().accuracy, better.accuracy, grid,
-        )  # fmt: skip
+            "%s -> %s: using a transformation accurate to %.1f m. A better one (%.1f m) needs the grid %s, "
+            "which is not installed",
+            source.name,
+            target.name,
+            used.get_last_used_operation().accuracy,
+            better.accuracy,
+            grid,
+        )
 
 
 #: By the texts that systems are made of: a CRS writes its WKT to be hashed.

@@ -28,7 +28,7 @@ _LEADS = re.compile(
 _VALUE = re.compile(_START + r"""([^=,@"'“”\[\]()]+)""")
 #: Of every eighth system in the databases of EPSG and Esri the longest text has 7,000 characters.
 _LONGEST = 100_000
-_REMEDY = "give EPSG:n, WKT or a PROJ string without files; a grid in PROJ's own folder is found by its name"
+_REMEDY = "give EPSG:n, WKT or a PROJ string without file paths; PROJ finds grids in its own folder by name"
 
 
 def refuse_files(text: str) -> None:
@@ -46,21 +46,26 @@ def refuse_files(text: str) -> None:
         sign.
     """
     if len(text) > _LONGEST:
-        raise CrsError(f"a coordinate system of {len(text)} characters is not read", field="CRS", remedy=_REMEDY)
+        raise CrsError(f"this coordinate system is too long ({len(text)} characters)", field="CRS", remedy=_REMEDY)
     if text.lstrip().startswith("{"):
         text = _unescaped(text)
     if "%" in text:
         # PROJ 9.5 takes the name of a missing grid for a format: %s and %n there end the process.
-        raise CrsError("a coordinate system with a percent sign is not read", field="CRS", remedy=_REMEDY)
+        raise CrsError("a coordinate system must not contain a percent sign", field="CRS", remedy=_REMEDY)
     if any(match["path"] is not None for match in _LEADS.finditer(text)):
-        raise CrsError("a coordinate system names a file by its path; it is not opened", field="CRS", remedy=_REMEDY)
+        raise CrsError(
+            "this coordinate system refers to a file by its path; such files are not opened",
+            field="CRS",
+            remedy=_REMEDY,
+        )
     for match in _VALUE.finditer(text):
         for name in {match[1].strip(), match[1].split(maxsplit=1)[0] if match[1].strip() else ""}:
             if name and _is_of_working_folder(name):
                 raise CrsError(
-                    f"a coordinate system names {name[:80]!r}, which is a file in the current folder", field="CRS",
+                    f"this coordinate system refers to {name[:80]!r}, which is a file in the current folder",
+                    field="CRS",
                     remedy="run the command in another folder, or install the grid in PROJ's own folder",
-                )  # fmt: skip
+                )
 
 
 def _is_of_working_folder(name: str) -> bool:

@@ -20,7 +20,7 @@ UNITS = (
 
 def dem_vertical_remedy(first: str = "") -> str:
     """Return the advice to state the height datum by option, after another advice if there is one."""
-    option = Text("say what the heights are measured above with ", Setting("surface.vertical"), f" ({VERTICAL_FORMS})")
+    option = Text("give the height datum with ", Setting("surface.vertical"), f" ({VERTICAL_FORMS})")
     return Text(first, "; or ", option) if first else option
 
 
@@ -32,21 +32,21 @@ def dem_vertical(
     Parameters
     ----------
     declared : DeclaredVertical or None
-        What the CRS of the DEM says.
+        Datum that the CRS of the DEM states.
     option : Vertical or None
-        What the user says.
+        Datum that the user gives.
     override : bool
-        Let the user be right against an authority code.
+        Use the user's datum even against an authority code.
 
     Raises
     ------
     DatumError
-        If nobody says it, or both do and differ.
+        If neither states the datum, or if they contradict each other.
     """
     if declared is None:
         if option is None:
             raise DatumError(
-                "this DEM does not say what its heights are measured above",
+                "this DEM does not state its height datum",
                 field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
@@ -54,30 +54,30 @@ def dem_vertical(
     if option is None:
         if declared.vertical is None:
             raise DatumError(
-                f"the heights of this DEM are in {declared.name!r}, which is not a datum that is known here",
+                f"unknown height datum {declared.name!r} in this DEM",
                 field="surface.vertical",
                 remedy=dem_vertical_remedy(),
             )
         by_name = Notice(
             "dem-datum-by-name",
-            f"the height datum {declared.vertical.label} of the DEM is known by its name {declared.name!r} only",
+            f"the height datum {declared.vertical.label} of the DEM was recognised only by its name, {declared.name!r}",
             declared=declared.name,
         )
         return declared.vertical, [] if declared.certain else [by_name]
     if option == declared.vertical:
         return option, []
-    told, asked = f"the DEM declares its heights as {declared.name!r}", Setting("surface.vertical")
-    used = Text(f"{told}; {option.label} was used as ", asked, " says")
+    told, asked = f"the DEM states the height datum {declared.name!r}", Setting("surface.vertical")
+    used = Text(f"{told}; {option.label} was used instead (", asked, ")")
     warning = Notice("dem-datum-overridden", used, declared=declared.name, used=option.name)
     # A grid file is how a user brings the geoid of a declared datum whose own grid is not installed.
     realises = declared.vertical is not None and not declared.vertical.is_ellipsoid and ":" not in option.name[:5]
     realises = realises and not option.is_ellipsoid
     if declared.certain and not override and not realises:
         raise DatumError(
-            Text(f"{told}, ", asked, f" says {option.label}"),
+            Text(f"{told}, but ", asked, f" gives {option.label}"),
             field="surface.vertical",
             remedy=Text(
-                "leave the option out, or override what the file declares with ", Setting("surface.override_vertical")
+                "leave the option out, or override the datum of the file with ", Setting("surface.override_vertical")
             ),
         )
     return option, [warning]
@@ -94,17 +94,17 @@ def dem_unit(text: str, declared: DeclaredVertical | None) -> float:
     Raises
     ------
     DatumError
-        If the unit is not known, or the band and the CRS say different ones.
+        If the unit is unknown, or the band and the CRS state different ones.
     """
     stated = UNITS.get("".join(c for c in text.lower() if c.isalpha())) if text else None
     if text and stated is None:
-        raise DatumError(f"the unit {text!r} of the heights is not known", field="unit", remedy="use metres or feet")
-    # Two-dimensional systems say nothing; 3D ones made by promotion say metre whatever the band holds.
+        raise DatumError(f"unknown unit of heights {text!r}", field="unit", remedy="use metres or feet")
+    # Two-dimensional systems have no unit of heights; promoted 3D ones always state metres.
     axis = declared.metres_per_unit if declared else None
     if stated is not None and axis is not None and abs(stated - axis) > 1e-3:
         raise DatumError(
-            f"the band says {text!r}, the CRS a unit of {axis:.6g} m",
+            f"the units of the heights differ: {text!r} in the band, {axis:.6g} m in the CRS",
             field="unit",
-            remedy="state the unit of the heights once (gdal_edit.py -units m, or another CRS)",
+            remedy="correct one of them (gdal_edit.py -units m dem.tif, or assign another CRS)",
         )
     return axis or stated or 1.0

@@ -20,7 +20,7 @@ class DeclaredVertical:
     name : str
         As written there.
     vertical : Vertical or None
-        The datum, None if the name says nothing that is known.
+        The datum; None if the name is unknown.
     certain : bool
         True if an authority code or a grid identifies it, False if only its name does.
     metres_per_unit : float
@@ -52,7 +52,7 @@ def declared_vertical(crs: pyproj.CRS) -> DeclaredVertical | None:
     plain = part.source_crs if part.is_bound and part.source_crs is not None else part
     axis = plain.axis_info[0]
     if axis.direction.lower() == "down":
-        raise DatumError(f"{plain.name!r} counts depths, not heights", field="vertical CRS")
+        raise DatumError(f"{plain.name!r} gives depths, not heights", field="vertical CRS")
     authority = plain.to_authority(min_confidence=90)
     if authority is not None and authority[0] == "EPSG":
         # PROJ also finds a code by comparing names; only a code that is written there is certain.

@@ -43,12 +43,12 @@ def header_fault(path: Path) -> str | None:
 
 def _fault_of_gtx(header: bytes, path: Path) -> str | None:
     if len(header) < _GTX.size:
-        return "this is shorter than a header of GTX"
+        return "the file is shorter than a GTX header"
     *place, rows, columns = _GTX.unpack(header)
     if not np.isfinite(place).all() or min(place[2:]) <= 0 or min(rows, columns) <= 0:
-        return "the header states no grid"
+        return "the header describes no grid"
     if _GTX.size + 4 * rows * columns != path.stat().st_size:
-        return f"the header states {rows} x {columns} heights, which is not the size of the file"
+        return f"the header states {rows} x {columns} heights, which does not match the size of the file"
     return None
 
 
@@ -62,7 +62,7 @@ def _fault_of_tiff(data: mmap.mmap) -> str | None:
         (at,) = offset.unpack_from(data, 8 if big else 4)
         while at:
             if at in seen or len(seen) >= _MOST_DIRECTORIES:
-                return "its directories have no end"
+                return "its TIFF directories form a loop"
             seen.add(at)
             (entries,) = count.unpack_from(data, at)
             begin, stated = at + count.size, {}
@@ -74,10 +74,10 @@ def _fault_of_tiff(data: mmap.mmap) -> str | None:
                     (stated[tag],) = struct.unpack_from(form, data, place + entry.size - offset.size)
             needed = _TILES if _TILES[0] in stated else _STRIPS
             if not all(stated.get(tag) for tag in needed):
-                return "a directory does not say how large its blocks are"
+                return "a TIFF directory does not state the size of its blocks"
             (at,) = offset.unpack_from(data, begin + entries * entry.size)
     except struct.error:
-        return "a directory lies beyond the end of the file"
+        return "a TIFF directory is beyond the end of the file"
     return None
 
 
@@ -92,10 +92,11 @@ def refuse_absurd(undulation: np.ndarray, name: str) -> None:
     absurd = undulation[np.abs(undulation) > _LARGEST_UNDULATION]
     if absurd.size:
         raise DatumError(
-            f"this height datum lies {absurd[0]:.4g} m above the ellipsoid, and the Earth's geoid within 110 m of it",
-            file=None if name.startswith("EPSG:") else name, field="vertical",
+            f"this height datum is {absurd[0]:.4g} m above the ellipsoid; the geoid is within 110 m of it",
+            file=None if name.startswith("EPSG:") else name,
+            field="vertical",
             remedy="give a geoid grid in metres, and check that the file is not damaged",
-        )  # fmt: skip
+        )
 
 
 def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, shift: np.ndarray, file: str) -> None:
@@ -116,6 +117,8 @@ def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, sh
         except ProjError:
             continue
         raise DatumError(
-            f"this geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, which lies in it", file=file,
-            field="vertical", remedy="the file is cut off or damaged: copy it again",
-        )  # fmt: skip
+            f"the geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, although the grid covers it",
+            file=file,
+            field="vertical",
+            remedy="the file is cut off or damaged: copy it again",
+        )

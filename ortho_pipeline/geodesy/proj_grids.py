@@ -19,7 +19,7 @@ from ortho_pipeline.stores.objects import Objects
 _LIST, _LIST_BYTES = "files.geojson", 50_000_000
 #: No grid is larger.
 _GRID_BYTES = 2_000_000_000
-_REMEDY = "name a folder that you may write to in PROJ_USER_WRITABLE_DIRECTORY"
+_REMEDY = "set PROJ_USER_WRITABLE_DIRECTORY to a folder that you may write to"
 
 
 def proj_info() -> dict[str, Any]:
@@ -93,7 +93,9 @@ def fetch_grid(name: str) -> Path:
         facts = next(one["properties"] for one in listed["features"] if one["properties"]["name"] == name)
         digest = str(facts["sha256sum"])
     except FileNotFoundError as error:
-        raise StorageError("PROJ's store has no list of grids", file=store.of(_LIST), remedy="try later") from error
+        raise StorageError(
+            "PROJ's server has no list of grids", file=store.of(_LIST), remedy="try again later"
+        ) from error
     except (StopIteration, KeyError, TypeError) as error:
         raise InputError(f"PROJ has no grid {name}", file=store.of(_LIST), remedy="check the name") from error
     path = Path(pyproj.datadir.get_user_data_dir(True)) / name
@@ -101,7 +103,9 @@ def fetch_grid(name: str) -> Path:
         # In a context of its own: the grid is no part of the outputs that are under way, nor confined to their folder.
         contextvars.Context().run(_fetch, store, path, digest)
     except FileNotFoundError as error:
-        raise StorageError("PROJ's store does not have this grid", file=store.of(name), remedy="try later") from error
+        raise StorageError(
+            "PROJ's server does not have this grid", file=store.of(name), remedy="try again later"
+        ) from error
     # PROJ remembers which grids were not there, until it is told of its folders.
     pyproj.datadir.set_data_dir(pyproj.datadir.get_data_dir())
     vertical_transformer.cache_clear()
@@ -111,12 +115,10 @@ def fetch_grid(name: str) -> Path:
 def _fetch(store: Objects, path: Path, digest: str) -> None:
     with together(path.parent, path.name, wait=True, remedy=_REMEDY), whole_or_nothing(path, side_cars=False) as part:
         content = store.fetch(path.name, part, _GRID_BYTES)
-        wrong = header_fault(part) or (
-            "" if content.sha256 == digest else "its SHA-256 is not the one that PROJ states"
-        )
+        wrong = header_fault(part) or ("" if content.sha256 == digest else "its SHA-256 differs from PROJ's list")
         if wrong:
             raise StorageError(
-                f"what was fetched is not the grid: {wrong}", file=store.of(path.name), remedy="try later"
+                f"the downloaded file is not the grid: {wrong}", file=store.of(path.name), remedy="try again later"
             )
 
 

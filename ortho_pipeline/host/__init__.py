@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ortho_pipeline import _lazily
+from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.host.discovery import Host as Host
@@ -17,4 +17,4 @@ if TYPE_CHECKING:
 __all__ = ["Host", "open_scene"]
 
 if not TYPE_CHECKING:  # a checker knows the names from above, and no others
-    __getattr__ = _lazily(__name__, dict.fromkeys(__all__, "host.discovery"))
+    __getattr__ = lazily(__name__, dict.fromkeys(__all__, "host.discovery"))

@@ -304,9 +304,10 @@ def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
                 raise PluginError(f"{said} wrote nothing", file=path, remedy="its author: write to the path by open()")
             if isinstance(worst, bool) or not isinstance(worst, int | float) or not worst >= 0:
                 raise PluginError(
-                    f"{said}: write returned {worst!r}", file=path,
+                    f"{said}: write returned {worst!r}",
+                    file=path,
                     remedy="its author: return the largest distance in pixels between the file and the model",
-                )  # fmt: skip
+                )
         return float(worst)
 
     return write

@@ -234,9 +234,7 @@ class _Fitted:
         centre = float(area.rows.mean())
         place = line[0] + line[1] * centre
         side = x - place - line[1] * (y - centre)
-        if min((side < -3).sum(), (side > 3).sum()) < SHORTEST:
-            raise InputError("there are too few pixels to one side", field="edge", remedy=_NO_EDGE_REMEDY)
-        levels = float(np.median(values[side < -2])), float(np.median(values[side > 2]))
+        levels = _levels(side, values)
         scale = max(abs(levels[1] - levels[0]), 1e-9 * (1.0 + abs(levels[0])))
 
         def model(p: Array) -> Array:
@@ -254,10 +252,14 @@ class _Fitted:
         turn = 8.0 / len(area.rows)
         wide = np.array([4.0, turn, 2 * scale, 2 * scale])
         found = least_squares(
-            lambda p: (model(p) - values) / scale, start, loss="soft_l1", f_scale=max(3 * noise / scale, 1e-3),
-            x_scale=[0.1, turn / 10, scale, scale, 0.3], max_nfev=60,
+            lambda p: (model(p) - values) / scale,
+            start,
+            loss="soft_l1",
+            f_scale=max(3 * noise / scale, 1e-3),
+            x_scale=[0.1, turn / 10, scale, scale, 0.3],
+            max_nfev=60,
             bounds=(np.append(start[:4] - wide, 0.0), np.append(start[:4] + wide, HALF_WIDTH)),
-        )  # fmt: skip
+        )
         place, b, low, high, sigma = found.x.tolist()
         normal = 1.0 / math.hypot(1.0, b)
         distance = (x - place - b * (y - centre)) * normal
@@ -271,7 +273,7 @@ class _Fitted:
         error = math.sqrt(max(weak, 0.0)) * float(left.std()) / scale
         return cls(
             place - b * centre, b, low, high, abs(sigma), error, noise, misfit, distance, (values - low) / (high - low)
-        )  # fmt: skip
+        )
 
     def model(self, distance: Array) -> Array:
         """Return the fitted edge, 0 to 1, at distances."""
@@ -282,6 +284,19 @@ class _Fitted:
         """Return where the edge enters the first row and leaves the last."""
         top, bottom = float(area.rows[0] - 0.5), float(area.rows[-1] + 0.5)
         return (self.a + self.b * top, top), (self.a + self.b * bottom, bottom)
+
+
+def _levels(side: Array, values: Array) -> tuple[float, float]:
+    """Return the median values to the left and to the right of an edge, from signed distances (px).
+
+    Raises
+    ------
+    InputError
+        If one side has too few pixels.
+    """
+    if min((side < -3).sum(), (side > 3).sum()) < SHORTEST:
+        raise InputError("too few pixels on one side of the edge", field="edge", remedy=_NO_EDGE_REMEDY)
+    return float(np.median(values[side < -2])), float(np.median(values[side > 2]))
 
 
 def edge_response(distance: Array, sigma: float, wide: Array | float, tall: Array | float) -> Array:

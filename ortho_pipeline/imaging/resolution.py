@@ -177,9 +177,11 @@ def _given(source: RasterSource, edge: Segment, band: int) -> Edge:
         )
     if math.hypot(x2 - x1, y2 - y1) > _LONGEST:
         raise InputError(
-            f"an edge of more than {_LONGEST} pixels is not measured", file=source.path, field="edge",
+            f"an edge of more than {_LONGEST} pixels is not measured",
+            file=source.path,
+            field="edge",
             remedy="give a part of it",
-        )  # fmt: skip
+        )
     left, top = max(0, math.floor(min(x1, x2) - reach)), max(0, math.floor(min(y1, y2) - reach))
     right = min(source.width, math.ceil(max(x1, x2) + reach))
     bottom = min(source.height, math.ceil(max(y1, y2) + reach))

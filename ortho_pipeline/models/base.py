@@ -302,9 +302,10 @@ def model_from_dict(data: dict[str, Any]) -> SensorModel:
     except (TypeError, ValueError, AttributeError, ArithmeticError, LookupError, RecursionError) as error:
         # Constructors check what numbers mean; that a value is a number or a list at all is found out by using it.
         raise InputError(
-            f"this is not a model of kind {kind!r} ({str(error)[:200]})", field=kind,
+            f"this is not a model of kind {kind!r} ({str(error)[:200]})",
+            field=kind,
             remedy="leave what was written as it is, or write the model again",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def as_ground(ground: ArrayLike) -> Array:

@@ -145,9 +145,10 @@ class ImageCorrection(OverAnother):
         # The origin is a convention: a slope without a shift would depend on it.
         slopes = tuple(name for name in left if not name.endswith("_shift"))
         return slopes + tuple(
-            f"{axis}_shift" for axis in ("col", "row")
+            f"{axis}_shift"
+            for axis in ("col", "row")
             if f"{axis}_shift" in left and not any(name.startswith(axis) for name in slopes)
-        )  # fmt: skip
+        )
 
     def without(self, names: Iterable[str]) -> Self:
         names = tuple(names)

@@ -115,8 +115,9 @@ class MapPlane(SensorModel):
         if not (math.isfinite(azimuth) and LOWEST_ELEVATION < elevation <= math.pi / 2):
             raise InputError(
                 f"a satellite {math.degrees(elevation):.3g} degrees above the horizon takes no such image",
-                field="elevation", remedy="it is an angle from 5 to 90 degrees",
-            )  # fmt: skip
+                field="elevation",
+                remedy="it is an angle from 5 to 90 degrees",
+            )
         middle = np.array([[corner[0] + pixel[0] * size[0] / 2, corner[1] - pixel[1] * size[1] / 2, plane]])
         away = _along(map_crs, middle, azimuth) / -math.tan(elevation)
         return cls(map_crs, corner, pixel, size, plane, (float(away[0]), float(away[1])), heights)

@@ -255,9 +255,13 @@ class Rational(SensorModel):
     def __post_init__(self) -> None:
         terms = term_table(self.family)
         shapes = {
-            "coefficients": (terms.family.parameters,), "ground_offset": (3,), "ground_scale": (3,),
-            "image_offset": (2,), "image_scale": (2,), "box": (2, 3),
-        }  # fmt: skip
+            "coefficients": (terms.family.parameters,),
+            "ground_offset": (3,),
+            "ground_scale": (3,),
+            "image_offset": (2,),
+            "image_scale": (2,),
+            "box": (2, 3),
+        }
         for name, shape in shapes.items():
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != shape or not np.isfinite(values).all():
@@ -334,10 +338,8 @@ class Rational(SensorModel):
     def penalised(self) -> tuple[str, ...]:
         """Names of the parameters that a regularisation draws to zero: all but the affine part of the numerators."""
         return tuple(
-            name
-            for name in self.param_names
-            if "den_" in name or int(exponents(name.rpartition("_")[2]).sum()) > 1
-        )  # fmt: skip
+            name for name in self.param_names if "den_" in name or int(exponents(name.rpartition("_")[2]).sum()) > 1
+        )
 
     # -- evaluation --------------------------------------------------------------------------------------------------
 

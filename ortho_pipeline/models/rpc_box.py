@@ -53,9 +53,17 @@ POLE = 1e-3
 _MOST_BOXES = 4096
 #: Largest offsets and half-sizes that a scene on Earth can have: degrees, metres of height, pixels.
 _LARGEST = {
-    "lon_off": 540.0, "lat_off": 90.0, "h_off": 1e5, "col_off": 1e9, "row_off": 1e9,
-    "lon_scale": 180.0, "lat_scale": 90.0, "h_scale": 1e5, "col_scale": 1e9, "row_scale": 1e9,
-}  # fmt: skip
+    "lon_off": 540.0,
+    "lat_off": 90.0,
+    "h_off": 1e5,
+    "col_off": 1e9,
+    "row_off": 1e9,
+    "lon_scale": 180.0,
+    "lat_scale": 90.0,
+    "h_scale": 1e5,
+    "col_scale": 1e9,
+    "row_scale": 1e9,
+}
 #: Sides of a pixel on the ground (m): microscopes and whole continents are not scenes.
 _PIXEL = (1e-3, 1e5)
 _METRES_PER_DEGREE = 111_320.0
@@ -188,5 +196,6 @@ def _check_pixel(values: dict[str, float], jacobian: Array) -> None:
     if not (_PIXEL[0] <= 1.0 / long and 1.0 / short <= _PIXEL[1]):
         raise InputError(
             f"a pixel of this RPC is {1.0 / long:.2g} x {1.0 / short:.2g} m on the ground",
-            field="col_scale, row_scale, lon_scale, lat_scale", remedy=_DAMAGED,
-        )  # fmt: skip
+            field="col_scale, row_scale, lon_scale, lat_scale",
+            remedy=_DAMAGED,
+        )

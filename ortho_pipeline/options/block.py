@@ -27,10 +27,12 @@ class BlockOptions:
     ] = None
     ties: Annotated[
         str | None,
-        Option("--ties", Text(
-            "Find tie points between the images by matching, besides those of ", Setting("points.points"), "."
-        ), choices=("auto",)),
-    ] = None  # fmt: skip
+        Option(
+            "--ties",
+            Text("Find tie points between the images by matching, besides those of ", Setting("points.points"), "."),
+            choices=("auto",),
+        ),
+    ] = None
     gcps: Annotated[
         PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
     ] = None
@@ -61,52 +63,70 @@ class BlockOptions:
     ground_sigma: Annotated[
         str | None,
         Option(
-            "--ground-sigma", "Sigmas (m) in plan and height of ground that states none in the points file.", "XY[,H]",
+            "--ground-sigma",
+            "Sigmas (m) in plan and height of ground that states none in the points file.",
+            "XY[,H]",
             unset="estimated",
         ),
-    ] = None  # fmt: skip
+    ] = None
     model_crs: Annotated[str | None, Option("--model-crs", MODEL_CRS, "CRS")] = None
     hold: Annotated[
         float | None,
         Option(
-            "--hold", "Hold the orientation at its start values with this sigma.", "PX", kind="number", above=0,
+            "--hold",
+            "Hold the orientation at its start values with this sigma.",
+            "PX",
+            kind="number",
+            above=0,
             unset="10 where nothing else gives a datum",
         ),
-    ] = None  # fmt: skip
+    ] = None
     dem_heights: Annotated[
         str,
         Option(
-            "--dem-heights", Text(
-                "Use the heights of ", Setting("surface.dem"), " as observations of the ties, or only to match."
-            ),
+            "--dem-heights",
+            Text("Use the heights of ", Setting("surface.dem"), " as observations of the ties, or only to match."),
             choices=("on", "off"),
         ),
-    ] = "on"  # fmt: skip
+    ] = "on"
     dem_bias: Annotated[
         float | None,
         Option(
-            "--dem-bias", "Standard deviation of an error that all heights of the DEM share.", "M",
-            kind="number", unset="that of a single height",
+            "--dem-bias",
+            "Standard deviation of an error that all heights of the DEM share.",
+            "M",
+            kind="number",
+            unset="that of a single height",
         ),
-    ] = None  # fmt: skip
+    ] = None
     dem_correlation: Annotated[
         float | None,
         Option(
-            "--dem-correlation", "Distance over which DEM errors are correlated, by exp(-d / M).", "M", kind="number",
-            above=0, unset="each sample of the DEM has its own error",
+            "--dem-correlation",
+            "Distance over which DEM errors are correlated, by exp(-d / M).",
+            "M",
+            kind="number",
+            above=0,
+            unset="each sample of the DEM has its own error",
         ),
-    ] = None  # fmt: skip
+    ] = None
     dem_shift_sigma: Annotated[
         float | None,
         Option(
-            "--dem-shift-sigma", "Standard deviation of the horizontal position of the DEM, in each axis.", "M",
-            kind="number", unset="half a sample",
+            "--dem-shift-sigma",
+            "Standard deviation of the horizontal position of the DEM, in each axis.",
+            "M",
+            kind="number",
+            unset="half a sample",
         ),
-    ] = None  # fmt: skip
+    ] = None
     join_limit: Annotated[
         float,
         Option(
-            "--join-limit", "Warn if the relative position of two images with common points has a larger sigma.", "PX",
-            kind="number", above=0,
+            "--join-limit",
+            "Warn if the relative position of two images with common points has a larger sigma.",
+            "PX",
+            kind="number",
+            above=0,
         ),
-    ] = 0.5  # fmt: skip
+    ] = 0.5

@@ -18,23 +18,24 @@ class MosaicOptions:
     order: Annotated[
         str,
         Option(
-            "--order", "What lies on top: the scene that looks down most steeply, or the first; or at each pixel "
+            "--order",
+            "What lies on top: the scene that looks down most steeply, or the first; or at each pixel "
             "the scene that is most accurate there, as their output.accuracy_raster says.",
             choices=("best-view", "first-on-top", "most-accurate"),
         ),
-    ] = "best-view"  # fmt: skip
+    ] = "best-view"
     seams: Annotated[bool, Option("--seams", "Measure how well the scenes agree where they overlap.")] = True
     seamlines: Annotated[
         bool,
         Option(
-            "--seamlines", "Let the seams run where scenes differ least, up to 256 pixels from where the order has "
-            "them.",
+            "--seamlines",
+            "Let the seams run where scenes differ least, up to 256 pixels from where the order has them.",
         ),
-    ] = False  # fmt: skip
+    ] = False
     balance: Annotated[
         bool,
         Option(
-            "--balance", "Make the brightness of the scenes alike where they overlap: a gain and an offset of each "
-            "scene and band.",
+            "--balance",
+            "Make the brightness of the scenes alike where they overlap: a gain and an offset of each scene and band.",
         ),
-    ] = False  # fmt: skip
+    ] = False

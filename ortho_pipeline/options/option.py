@@ -25,9 +25,21 @@ EXECUTORS = ("sequential", "processes", "dask")
 
 #: How the value of an option is written, where choices or a field that is true or false do not say it.
 Kind = Literal[
-    "text", "file", "number", "integer", "pair", "box", "one or two", "number or word", "number or nan", "bytes",
-    "integers", "files", "folders", "keys",
-]  # fmt: skip
+    "text",
+    "file",
+    "number",
+    "integer",
+    "pair",
+    "box",
+    "one or two",
+    "number or word",
+    "number or nan",
+    "bytes",
+    "integers",
+    "files",
+    "folders",
+    "keys",
+]
 PathLike = str | os.PathLike[str]
 
 

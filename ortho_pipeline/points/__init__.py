@@ -5,7 +5,7 @@ Imports `geodesy` and what is below. A new point format is an entry in `formats`
 
 from __future__ import annotations
 
-from ortho_pipeline.points.rows import Point
+from ortho_pipeline.points.rows import TablePoint
 from ortho_pipeline.points.selection import AnyPoints, assign_roles
 from ortho_pipeline.points.shared_marks import HasGround, marks_warning, one_mark
 from ortho_pipeline.points.table import (
@@ -21,8 +21,8 @@ __all__ = [
     "DEFAULT_SIGMA_IMAGE",
     "AnyPoints",
     "HasGround",
-    "Point",
     "Points",
+    "TablePoint",
     "assign_roles",
     "gcps_of_dataset",
     "marks_warning",

@@ -16,9 +16,9 @@ from ortho_pipeline.points.rows import (
     CSV_ERRORS,
     CSV_IMAGE,
     OF_IMAGE,
-    Columns,
+    ColumnRules,
     Line,
-    Row,
+    PointRow,
     Table,
     cells_of,
     lines_of,
@@ -97,7 +97,7 @@ def is_header(text: str) -> bool:
     return len(names & {"id", "image", "col", "row", "x", "y", "h"}) >= 3
 
 
-def read_csv(path: str | os.PathLike[str], text: str, expected: Columns = OF_IMAGE) -> Table:
+def read_csv(path: str | os.PathLike[str], text: str, expected: ColumnRules = OF_IMAGE) -> Table:
     """Read a table with a header: ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]`` or their like.
 
     Further columns are those of `CSV_ERRORS`.
@@ -145,7 +145,7 @@ def _ours(name: str) -> str:
     return own if own in ("id", "col", "row", "x", "y", "h", "role") else _ALIASES.get(_plain(name), own)
 
 
-def _header(path: str | os.PathLike[str], line: Line, expected: Columns) -> Header:
+def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> Header:
     delimiter = _delimiter(line.text)
     names = cells_of(path, line, delimiter)
     ours = _our_names(names)
@@ -194,7 +194,7 @@ class _Cells:
     where: str
     cells: Sequence[str]
     header: Header
-    expected: Columns
+    expected: ColumnRules
     marks: set[str]
 
     def text(self, name: str) -> str:
@@ -222,8 +222,8 @@ class _Cells:
 
 
 def _row(
-    path: str | os.PathLike[str], line: Line, header: Header, expected: Columns, marks: set[str]
-) -> Row | None:  # fmt: skip
+    path: str | os.PathLike[str], line: Line, header: Header, expected: ColumnRules, marks: set[str]
+) -> PointRow | None:
     """Return the point of a line, None where it is inactive; `marks` are the decimal marks of the file until here."""
     cells, where = cells_of(path, line, header.delimiter), f"line {line.number}"
     if len(cells) != len(header.names):
@@ -232,8 +232,10 @@ def _row(
         raise InputError(
             f"{counted(len(cells), 'cell')} under {counted(len(header.names), 'column name')} "
             f"({', '.join(header.names)[:120]})",
-            file=path, field=where, remedy=remedy,
-        )  # fmt: skip
+            file=path,
+            field=where,
+            remedy=remedy,
+        )
     if not header.names[-1] and cells[-1]:
         raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
     of = _Cells(path, where, cells, header, expected, marks)
@@ -250,7 +252,7 @@ def _row(
     covariance, group, common, alike = read_image_errors(
         [of.plain(name) for name in CSV_ERRORS], path, [of.column(name) for name in CSV_ERRORS], sigma
     )
-    return Row(
+    return PointRow(
         where=where,
         id=of.text("id") or None,
         image=(of.value("col"), of.value("row")),
@@ -275,7 +277,9 @@ def _decimal(cell: str, header: Header, marks: set[str], path: str | os.PathLike
     marks.update(mark for mark, there in ((",", comma), (".", point)) if there)
     if len(marks) > 1:
         raise InputError(
-            f"{short(cell)}: commas and points both stand in the numbers of this file", file=path, field=where,
+            f"{short(cell)}: commas and points both stand in the numbers of this file",
+            file=path,
+            field=where,
             remedy="write all decimals alike, and no separators of thousands",
-        )  # fmt: skip
+        )
     return re.sub(r",(?=\d*(?:[eE][+-]?\d+)?$)", ".", cell, count=1) if comma else cell

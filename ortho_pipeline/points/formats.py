@@ -21,9 +21,9 @@ from ortho_pipeline.points.rows import (
     OF_GROUND,
     OF_HEIGHTS,
     OWN_IMAGE,
-    Columns,
+    ColumnRules,
     Placement,
-    Row,
+    PointRow,
     Table,
     load_text,
     short,
@@ -41,45 +41,58 @@ class _Format(NamedTuple):
     reader: Callable[..., Table]
     wanted: str
     known: Callable[[str, str, str], object]
-    of_block: tuple[Columns, ...] = ()
+    of_block: tuple[ColumnRules, ...] = ()
 
 
 #: In the order in which they are tried: content tells them apart, then the suffix.
 _FORMATS = (
     _Format(
-        "GeoJSON with 'ji'", read_geojson,
+        "GeoJSON with 'ji'",
+        read_geojson,
         "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
         lambda suffix, start, first: start.startswith(("{", "[")) or suffix in (".geojson", ".json"),
         (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
     ),
     _Format(
-        "QGIS .points", read_qgis,
+        "QGIS .points",
+        read_qgis,
         "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
         lambda suffix, start, first: suffix == ".points" or re.match(r"(?i)mapX\s*,", first),
     ),
     _Format(
-        "ENVI .pts", read_envi, "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
+        "ENVI .pts",
+        read_envi,
+        "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
         lambda suffix, start, first: suffix == ".pts" or start.startswith(";"),
     ),
     _Format(
-        "ASP .gcp", read_asp,
+        "ASP .gcp",
+        read_asp,
         "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
-        lambda suffix, start, first: suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start), (OF_BLOCK,),
+        lambda suffix, start, first: suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start),
+        (OF_BLOCK,),
     ),
     _Format(
-        "CSV/TSV (id,col,row,x,y,h,...)", read_csv,
+        "CSV/TSV (id,col,row,x,y,h,...)",
+        read_csv,
         "write one point a line, its numbers under a header such as id,col,row,x,y,h",
-        lambda suffix, start, first: suffix in (".csv", ".tsv") or is_header(first), (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
+        lambda suffix, start, first: suffix in (".csv", ".tsv") or is_header(first),
+        (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
     ),
     _Format(
-        "ODM gcp_list.txt", read_odm, "write x y z column row image [label], under a line with the CRS",
-        lambda suffix, start, first: odm_crs(first) is not None, (OF_BLOCK,),
+        "ODM gcp_list.txt",
+        read_odm,
+        "write x y z column row image [label], under a line with the CRS",
+        lambda suffix, start, first: odm_crs(first) is not None,
+        (OF_BLOCK,),
     ),
     _Format(
-        "ArcGIS link table", read_links, "write [id] from-x from-y to-x to-y",
+        "ArcGIS link table",
+        read_links,
+        "write [id] from-x from-y to-x to-y",
         lambda suffix, start, first: LINK_TABLE.match(first),
     ),
-)  # fmt: skip
+)
 _NAMES = ", ".join(one.name for one in _FORMATS)
 
 
@@ -111,7 +124,7 @@ def read_table(
     return _of_image(path, table, image_name, pieces or {})
 
 
-def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK) -> Table:
+def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BLOCK) -> Table:
     """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
 
     Raises
@@ -123,9 +136,10 @@ def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK)
     kind = _format_of(path, text)
     if expected not in kind.of_block:
         raise InputError(
-            "points of several images do not stand in this format", file=path,
+            "points of several images do not stand in this format",
+            file=path,
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
-        )  # fmt: skip
+        )
     # Only formats whose columns have names can be asked for those of ground alone.
     table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
     if not table.rows:
@@ -133,7 +147,7 @@ def read_block_table(path: str | os.PathLike[str], expected: Columns = OF_BLOCK)
     return table
 
 
-def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: Columns) -> Table:
+def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: ColumnRules) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
     with completed(path, remedy=kind.wanted):
         table = kind.reader(path, text, *expected)
@@ -150,15 +164,18 @@ def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
             return kind
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(
-            f"numbers without names: it is not said what the columns are; the first line is {short(first)}", file=path,
+            f"numbers without names: it is not said what the columns are; the first line is {short(first)}",
+            file=path,
             field="line 1",
             remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
             "from-x from-y to-x to-y)",
-        )  # fmt: skip
+        )
     raise InputError(
-        f"the format of this point file is not known; its first line is {short(first)}", file=path, field="line 1",
+        f"the format of this point file is not known; its first line is {short(first)}",
+        file=path,
+        field="line 1",
         remedy=f"give one of: {_NAMES}",
-    )  # fmt: skip
+    )
 
 
 def _of_image(
@@ -168,12 +185,14 @@ def _of_image(
     if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"there are points of several images ({some})", file=path, field="image",
+            f"there are points of several images ({some})",
+            file=path,
+            field="image",
             remedy="say which with image_name, or read them as a block (read_block_points)",
-        )  # fmt: skip
+        )
     if image_name is None or not named:
         return table
-    kept: list[Row] = []
+    kept: list[PointRow] = []
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
         # A point that was measured in several of the images counts once: where it was measured first, this image ahead.

@@ -18,10 +18,10 @@ from ortho_pipeline.points.rows import (
     CSV_ERRORS,
     OF_BLOCK,
     OF_IMAGE,
-    Columns,
-    Point,
-    Row,
+    ColumnRules,
+    PointRow,
     Table,
+    TablePoint,
     number,
     role_of,
     short,
@@ -29,7 +29,7 @@ from ortho_pipeline.points.rows import (
 )
 
 
-def read_geojson(path: str | os.PathLike[str], text: str, expected: Columns = OF_IMAGE) -> Table:
+def read_geojson(path: str | os.PathLike[str], text: str, expected: ColumnRules = OF_IMAGE) -> Table:
     """Read points with a property ``ji`` = [column, row] from the *centre* of the first pixel; lon, lat, height.
 
     Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image), and
@@ -59,7 +59,7 @@ def _geojson_crs(path: str | os.PathLike[str], document: dict[str, Any]) -> str:
     return "EPSG:4979"
 
 
-def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: Columns) -> list[Row]:
+def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: ColumnRules) -> list[PointRow]:
     """Return a row for each image that the point of a feature was measured in."""
     properties = feature.get("properties") if isinstance(feature, dict) else None
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
@@ -80,10 +80,12 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
     role = properties.get("role") or expected.role
     sigma_image = sigma("sigma_image", False)
     covariance, group, common, alike = read_image_errors(
-        [properties.get(one) for one in CSV_ERRORS], path, [f"{where}.properties.{one}" for one in CSV_ERRORS],
+        [properties.get(one) for one in CSV_ERRORS],
+        path,
+        [f"{where}.properties.{one}" for one in CSV_ERRORS],
         sigma_image,
-    )  # fmt: skip
-    row = Row(
+    )
+    row = PointRow(
         where=where,
         id=str(name) if name is not None else None,
         image=(math.nan, math.nan),
@@ -111,7 +113,7 @@ def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -
 
 
 def _measured(
-    path: str | os.PathLike[str], where: str, properties: dict[str, Any], expected: Columns
+    path: str | os.PathLike[str], where: str, properties: dict[str, Any], expected: ColumnRules
 ) -> Iterator[tuple[str | None, tuple[float, float]]]:
     """Yield image and column, row from the corner of the first pixel, for each image that a point was measured in."""
     ji, file_name = properties.get("ji"), properties.get("filename")
@@ -121,9 +123,11 @@ def _measured(
         pairs = list(ji.items())
     elif expected is OF_BLOCK and not isinstance(file_name, str):
         raise InputError(
-            "it is not said in which image this point was measured", file=path, field=field,
+            "it is not said in which image this point was measured",
+            file=path,
+            field=field,
             remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",
-        )  # fmt: skip
+        )
     for image, pair in pairs:
         if not isinstance(pair, list) or len(pair) != 2:
             raise InputError("no property 'ji' = [column, row]", file=path, field=field, remedy="measure the points")
@@ -135,7 +139,7 @@ def _measured(
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
-def feature_of(point: Point) -> dict[str, Any]:
+def feature_of(point: TablePoint) -> dict[str, Any]:
     """Return the GeoJSON feature of a point whose ground is longitude, latitude and height."""
     place = list(point.ground if math.isfinite(point.ground[2]) else point.ground[:2])
     properties = {
@@ -151,7 +155,7 @@ def feature_of(point: Point) -> dict[str, Any]:
     return {"type": "Feature", "id": point.id, "properties": properties, "geometry": geometry}
 
 
-def _error_properties(point: Point) -> dict[str, float]:
+def _error_properties(point: TablePoint) -> dict[str, float]:
     """Return the properties `CSV_ERRORS` of a point that say more than `sigma_image` does."""
     (column, both), (_, row) = point.covariance_image
     found: dict[str, float] = {}

@@ -81,9 +81,13 @@ def _plan(crs: pyproj.CRS) -> pyproj.CRS:
 
 
 def _from_geocentric(
-    path: str | os.PathLike[str], table: Table, crs: pyproj.CRS, option: str | Vertical | None, ground: Array,
+    path: str | os.PathLike[str],
+    table: Table,
+    crs: pyproj.CRS,
+    option: str | Vertical | None,
+    ground: Array,
     wheres: Sequence[str],
-) -> tuple[Array, pyproj.CRS]:  # fmt: skip
+) -> tuple[Array, pyproj.CRS]:
     """Return longitude, latitude and ellipsoidal height of points in Earth-centred X, Y, Z (metres)."""
     _check_kind(path, table, crs)
     given = None if option is None else Vertical.parse(option)
@@ -92,8 +96,10 @@ def _from_geocentric(
         if said is not None and not said.is_ellipsoid:
             raise DatumError(
                 f"{crs.name!r} has X, Y, Z from the centre of the Earth and no heights above {said.label}",
-                file=path, field="points.vertical", remedy="leave the height datum out",
-            )  # fmt: skip
+                file=path,
+                field="points.vertical",
+                remedy="leave the height datum out",
+            )
     placed = ground_transform(crs, "EPSG:4979")(ground)
     # No deeper than the sea, no higher than an aircraft: kilometres for metres and other systems come out elsewhere.
     bad = ~(np.abs(placed[:, 2]) < _ON_EARTH) & np.isfinite(ground).any(axis=1)
@@ -101,11 +107,13 @@ def _from_geocentric(
         first = int(np.flatnonzero(bad)[0])
         x, y, z = ground[first]
         raise InputError(
-            f"X {x:.12g}, Y {y:.12g}, Z {z:.12g} is not on Earth", file=path, field=wheres[first],
+            f"X {x:.12g}, Y {y:.12g}, Z {z:.12g} is not on Earth",
+            file=path,
+            field=wheres[first],
             remedy=Text(
                 "geocentric points need x, y and h (Z) in metres; other coordinates another ", Setting("points.crs")
             ),
-        )  # fmt: skip
+        )
     return placed, pyproj.CRS.from_epsg(4326)
 
 
@@ -124,8 +132,10 @@ def _vertical_of(
     if stated is not None and said is not None and stated != said:
         raise DatumError(
             f"the file states its heights in {stated.label}, and its CRS {crs.name!r} in {said.label}",
-            file=path, field="vertical", remedy="state the height datum once",
-        )  # fmt: skip
+            file=path,
+            field="vertical",
+            remedy="state the height datum once",
+        )
     certain = stated or said
     if given is not None and certain is not None and given != certain:
         raise DatumError(
@@ -189,9 +199,11 @@ def _check_kind(path: str | os.PathLike[str], table: Table, crs: pyproj.CRS) -> 
         return
     named = "longitude" if table.of_ground == "geographic" else "easting"
     raise CrsError(
-        f"the columns are called {named} and so on, but {crs.name!r} is {kind}", file=path, field="points.crs",
+        f"the columns are called {named} and so on, but {crs.name!r} is {kind}",
+        file=path,
+        field="points.crs",
         remedy="give the CRS that these columns are in, or rename them x and y",
-    )  # fmt: skip
+    )
 
 
 def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequence[str], ground: Array) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.points.rows import CSV_ERRORS, Row, number, short, sigma_of
+from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, number, short, sigma_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -55,8 +55,9 @@ def reconciled(sigma: Array, covariance: ArrayLike | None) -> tuple[Array, Array
         raise InputError(
             f"sigma_image {sigma[k]:g} of point {k + 1} contradicts covariance_image, whose root mean square per axis "
             f"is {derived[k]:g}",
-            field="sigma_image", remedy="change both, or give the covariance by with_covariance_image",
-        )  # fmt: skip
+            field="sigma_image",
+            remedy="change both, or give the covariance by with_covariance_image",
+        )
     return np.where(more, derived, sigma), np.where(more[:, None, None], given, square)
 
 
@@ -177,23 +178,29 @@ def read_image_errors(
     if not all(there[:3]):
         missing = CSV_ERRORS[there[:3].index(False)]
         raise InputError(
-            f"a covariance without {missing}", file=path, field=where[there.index(True)],
+            f"a covariance without {missing}",
+            file=path,
+            field=where[there.index(True)],
             remedy=f"give {', '.join(CSV_ERRORS[:3])}, or sigma_image alone",
-        )  # fmt: skip
+        )
     column, row = (sigma_of(values[k], path, where[k], zero=False, what="variance") for k in range(2))
     both = number(values[2], path, where[2])
     matrix = np.array([[[column, both], [both, row]]])
     if not _is_positive_definite(matrix)[0]:
         raise InputError(
             f"{short(values[2])} is too large for the covariance of column and row: it is not positive definite",
-            file=path, field=where[2], remedy="its square is below var_col times var_row",
-        )  # fmt: skip
+            file=path,
+            field=where[2],
+            remedy="its square is below var_col times var_row",
+        )
     derived = float(sigma_of_covariance(matrix)[0])
     if sigma is not None and not abs(sigma - derived) <= _SAME_SIGMA * derived:
         raise InputError(
-            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}", file=path, field=where[0],
+            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}",
+            file=path,
+            field=where[0],
             remedy="leave sigma_image empty where a covariance is given",
-        )  # fmt: skip
+        )
     return (column, row, both), group, common, alike
 
 
@@ -201,13 +208,15 @@ def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
     found = number(value, path, where)
     if found != math.floor(found) or not 0 <= found < 2**53:
         raise InputError(
-            f"{short(value)} is not a group", file=path, field=where,
+            f"{short(value)} is not a group",
+            file=path,
+            field=where,
             remedy="number the groups from 0 on; leave it empty for a point that errs on its own",
-        )  # fmt: skip
+        )
     return int(found)
 
 
-def covariance_of(rows: Sequence[Row], sigma: Array) -> Array:
+def covariance_of(rows: Sequence[PointRow], sigma: Array) -> Array:
     """Return covariances ``(N, 2, 2)`` px^2 of the rows of a file, from `sigma` where they give none."""
     found = reconciled(sigma, None)[1]
     for k, row in enumerate(rows):
@@ -217,12 +226,12 @@ def covariance_of(rows: Sequence[Row], sigma: Array) -> Array:
     return found
 
 
-def groups_of(rows: Sequence[Row]) -> Index:
+def groups_of(rows: Sequence[PointRow]) -> Index:
     """Return the groups ``(N,)`` of the rows of a file."""
     return np.array([-1 if row.group is None else row.group for row in rows], dtype=np.int64)
 
 
-def common_of(rows: Sequence[Row]) -> dict[str, Array]:
+def common_of(rows: Sequence[PointRow]) -> dict[str, Array]:
     """Return the standard deviations ``(N,)`` of what points have in common, by name, of the rows of a file."""
     return {
         name: np.array([getattr(row, name) or 0.0 for row in rows], dtype=np.float64)
@@ -230,7 +239,7 @@ def common_of(rows: Sequence[Row]) -> dict[str, Array]:
     }
 
 
-def sigmas_of(rows: Sequence[Row], default: float) -> Array:
+def sigmas_of(rows: Sequence[PointRow], default: float) -> Array:
     """Return standard deviations ``(N,)`` px of the rows of a file; `default` for those that give nothing."""
     found = np.empty(len(rows))
     for k, row in enumerate(rows):

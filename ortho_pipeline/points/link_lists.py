@@ -8,7 +8,7 @@ import re
 
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.points.rows import Line, Row, Table, cells_of, lines_of, number, short, sigma_of
+from ortho_pipeline.points.rows import Line, PointRow, Table, cells_of, lines_of, number, short, sigma_of
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------
 
@@ -44,7 +44,7 @@ def read_qgis(path: str | os.PathLike[str], text: str) -> Table:
 _QGIS_NAMES = {"pixelx": "sourcex", "pixely": "sourcey"}
 
 
-def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells: list[str]) -> Row | None:
+def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells: list[str]) -> PointRow | None:
     where = f"line {line.number}"
     if len(cells) != len(names):
         raise InputError(
@@ -58,7 +58,7 @@ def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells:
     )
     if given.get("enable", "1") == "0":
         return None
-    return Row(where=where, id=None, image=(column, -minus_line), ground=(x, y, math.nan))
+    return PointRow(where=where, id=None, image=(column, -minus_line), ground=(x, y, math.nan))
 
 
 # -- OpenDroneMap ----------------------------------------------------------------------------------------------------
@@ -95,7 +95,7 @@ def read_odm(path: str | os.PathLike[str], text: str) -> Table:
         )
         z = math.nan if unknown_height else number(cells[2], path, f"{where}, column z")
         label = " ".join(cells[6:]) or None
-        table.rows.append(Row(where, label, (column, row), (x, y, z), image_name=cells[5]))
+        table.rows.append(PointRow(where, label, (column, row), (x, y, z), image_name=cells[5]))
     return table
 
 
@@ -144,14 +144,16 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
         image = given.pop("image file", None)
         if image is not None and image not in images:
             raise InputError(
-                f"no comment FileName{short(image)[1:-1]}= names the image of this point", file=path, field=where,
+                f"no comment FileName{short(image)[1:-1]}= names the image of this point",
+                file=path,
+                field=where,
                 remedy="name it, for example ; FileName0=scene.tif",
-            )  # fmt: skip
+            )
         value = {name: number(cell, path, f"{where}, {name}") for name, cell in given.items()}
         at = (value["image x"] - 1.0, value["image y"] - 1.0)
         ground = (value["x"], value["y"], value.get("elev", math.nan))
         name = None if image is None else re.split(r"[\\/]", images[image])[-1]
-        table.rows.append(Row(where, None, at, ground, image_name=name))
+        table.rows.append(PointRow(where, None, at, ground, image_name=name))
     return table
 
 
@@ -196,9 +198,11 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         cells = re.split(r"\s*,\s*|\s+", line.text.strip())
         if len(cells) < 12 or (len(cells) - 7) % 5:
             raise InputError(
-                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image", file=path, field=where,
+                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image",
+                file=path,
+                field=where,
                 remedy="id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
-            )  # fmt: skip
+            )
         lat, lon, height = (
             number(cells[k], path, f"{where}, {name}") for k, name in ((1, "latitude"), (2, "longitude"), (3, "height"))
         )
@@ -206,7 +210,7 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         for k in range(7, len(cells), 5):
             column, at_row = (number(cells[k + i], path, f"{where}, {name}") for i, name in ((1, "column"), (2, "row")))
             spread = max(sigma_of(cells[k + i], path, f"{where}, pixel sigma", zero=False) for i in (3, 4))
-            row = Row(where, cells[0], (column + 0.5, at_row + 0.5), (lon, lat, height), image_name=cells[k])
+            row = PointRow(where, cells[0], (column + 0.5, at_row + 0.5), (lon, lat, height), image_name=cells[k])
             row.sigma_image, row.sigma_xy, row.sigma_h = spread, max(sigmas[:2]), sigmas[2]
             table.rows.append(row)
     return table
@@ -236,10 +240,12 @@ def read_links(path: str | os.PathLike[str], text: str) -> Table:
         )
         if minus_row > 1.0:
             raise InputError(
-                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say", file=path,
-                field=f"{where}, from-y", remedy="make the links on the raster without its georeference, where y is "
+                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say",
+                file=path,
+                field=f"{where}, from-y",
+                remedy="make the links on the raster without its georeference, where y is "
                 "minus the row, or give the points as CSV with the columns Pixel and Line",
-            )  # fmt: skip
+            )
         label = cells[0] if len(cells) == 5 else None
-        table.rows.append(Row(where, label, (x, -minus_row), (to[0], to[1], math.nan)))
+        table.rows.append(PointRow(where, label, (x, -minus_row), (to[0], to[1], math.nan)))
     return table

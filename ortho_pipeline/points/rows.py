@@ -37,7 +37,7 @@ CSV_IMAGE = "image"
 CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common", "sigma_alike")
 
 
-class Columns(NamedTuple):
+class ColumnRules(NamedTuple):
     """Columns that a CSV may have, those that every line fills, and the role of lines that give none."""
 
     names: tuple[str, ...]
@@ -46,10 +46,10 @@ class Columns(NamedTuple):
 
 
 #: Points of one image; rays of a block, whose ground may be known; ground whose heights count; ground alone.
-OF_IMAGE = Columns((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
-OF_BLOCK = Columns(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
-OF_HEIGHTS = Columns((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
-OF_GROUND = Columns(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
+OF_IMAGE = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
+OF_BLOCK = ColumnRules(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
+OF_HEIGHTS = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
+OF_GROUND = ColumnRules(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -58,7 +58,7 @@ Placement = tuple[float, float, float]
 OWN_IMAGE: Placement = (0.0, 0.0, 1.0)
 
 
-class Point(NamedTuple):
+class TablePoint(NamedTuple):
     """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres.
 
     `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`; so are `sigma_common` (m) and
@@ -78,7 +78,7 @@ class Point(NamedTuple):
 
 
 @dataclass(slots=True)
-class Row:
+class PointRow:
     """One point as its file has it; None is what the file does not give. `piece` is where its image lies.
 
     `covariance` has the variances (px^2) of column and row and their covariance.
@@ -116,7 +116,7 @@ class Table:
     """
 
     format: str
-    rows: list[Row] = field(default_factory=list)
+    rows: list[PointRow] = field(default_factory=list)
     source: str = ""
     crs: str | None = None
     vertical: str | None = None
@@ -135,7 +135,7 @@ def is_writable(text: str) -> bool:
     return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
-def numbered_ids(path: str | os.PathLike[str], rows: Sequence[Row]) -> tuple[str, ...]:
+def numbered_ids(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> tuple[str, ...]:
     """Number the points without an id by their place in the file; refuse an id that stands twice."""
     first: dict[str, str] = {}
     for count, row in enumerate(rows, start=1):
@@ -188,9 +188,11 @@ def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> flo
         )
     if origin != "corner" and not table.origin_allowed:
         raise InputError(
-            f"the format {table.format} says itself what its first pixel is called", file=path,
-            field="points.pixel_origin", remedy="leave the option out",
-        )  # fmt: skip
+            f"the format {table.format} says itself what its first pixel is called",
+            file=path,
+            field="points.pixel_origin",
+            remedy="leave the option out",
+        )
     return PIXEL_ORIGINS[origin]
 
 
@@ -210,10 +212,11 @@ def load_text(path: str | os.PathLike[str]) -> str:
         )
     if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
         raise InputError(
-            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published", file=path,
+            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published",
+            file=path,
             remedy="export the cell array of the GCP tool as text, and give its columns names such as Name, Pixel, "
             "Line, Easting, Northing, Elev",
-        )  # fmt: skip
+        )
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:

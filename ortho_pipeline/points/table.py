@@ -44,9 +44,9 @@ from ortho_pipeline.points.rows import (
     CSV_ERRORS,
     ROLES,
     Placement,
-    Point,
-    Row,
+    PointRow,
     Table,
+    TablePoint,
     is_writable,
     numbered_ids,
     origin_shift,
@@ -139,9 +139,16 @@ class Points:
 
     @classmethod
     def of(
-        cls, image: ArrayLike, ground: ArrayLike, crs: str | pyproj.CRS, *, ids: Sequence[str] | None = None,
-        roles: str | ArrayLike = "control", sigma_image: ArrayLike = DEFAULT_SIGMA_IMAGE, sigma_ground: ArrayLike = 0.0,
-    ) -> Points:  # fmt: skip
+        cls,
+        image: ArrayLike,
+        ground: ArrayLike,
+        crs: str | pyproj.CRS,
+        *,
+        ids: Sequence[str] | None = None,
+        roles: str | ArrayLike = "control",
+        sigma_image: ArrayLike = DEFAULT_SIGMA_IMAGE,
+        sigma_ground: ArrayLike = 0.0,
+    ) -> Points:
         """Make points of arrays: `image` ``(N, 2)`` from the outer corner of the first pixel, `ground` ``(N, 3)``.
 
         The rest is one value for all points or one for each; without `ids` points are numbered from 1.
@@ -171,7 +178,7 @@ class Points:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def __iter__(self) -> Iterator[Point]:
+    def __iter__(self) -> Iterator[TablePoint]:
         columns = self.image.tolist(), self.ground.tolist(), self.roles.tolist()
         sigmas = self.sigma_image.tolist(), self.sigma_ground.tolist()
         shared = self.groups.tolist(), self.sigma_common.tolist(), self.sigma_alike.tolist()
@@ -179,7 +186,7 @@ class Points:
             self.ids, *columns, *sigmas, self.covariance_image.tolist(), *shared, strict=True
         ):
             covariance = tuple(both[0]), tuple(both[1])
-            yield Point(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, *others)
+            yield TablePoint(name, tuple(image), tuple(ground), role, sigma, tuple(sigma_ground), covariance, *others)
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
@@ -343,7 +350,7 @@ def gcps_of_dataset(
     named = all(names) and len(set(names)) == len(gcps)
     flat = all(gcp.GCPZ == 0 for gcp in gcps)
     rows = [
-        Row(
+        PointRow(
             where=f"GCP {count}",
             id=gcp.Id if named else str(count),
             image=(float(gcp.GCPPixel), float(gcp.GCPLine)),
@@ -372,9 +379,7 @@ def gcps_of_dataset(
 # -- writing ---------------------------------------------------------------------------------------------------------
 
 
-def write_points(
-    points: Points, path: str | os.PathLike[str], *, images: Sequence[str] | None = None
-) -> None:  # fmt: skip
+def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequence[str] | None = None) -> None:
     """Write points as ``.csv``/``.tsv``, ``.geojson`` (lon, lat, EPSG:4979) or QGIS ``.points``; whole or not at all.
 
     CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas. An id is text without
@@ -399,9 +404,11 @@ def write_points(
     odd = next((name for name in points.ids if not name or name != plain_id(name) or not is_writable(name)), None)
     if odd is not None and writers[suffix] is not _qgis_text:
         raise InputError(
-            f"the id {short(odd)} would be read as another one", file=path, field="id",
+            f"the id {short(odd)} would be read as another one",
+            file=path,
+            field="id",
             remedy="give each point a name without line breaks, and no blanks around it or in a row",
-        )  # fmt: skip
+        )
     write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 
 
@@ -411,9 +418,11 @@ def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) 
     # An id that starts with '#' would read as a comment without quotation marks.
     hidden = any(name.startswith("#") for name in points.ids)
     writer = csv.writer(
-        out, delimiter="\t" if suffix == ".tsv" else ",", lineterminator="\n",
+        out,
+        delimiter="\t" if suffix == ".tsv" else ",",
+        lineterminator="\n",
         quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL,
-    )  # fmt: skip
+    )
     extra = _error_columns(points)
     writer.writerow([*CSV_COLUMNS, *extra, *([] if images is None else ["image"])])
     # One column holds both plan components: the larger one is the careful choice.

@@ -153,9 +153,10 @@ class Intensity:
                 valid &= band.GetMaskBand().ReadAsArray(*window, **size) != 0
         except RuntimeError as error:
             raise InputError(
-                f"the pixels cannot be read ({first_line(error, self.source.path)})", file=self.source.path,
+                f"the pixels cannot be read ({first_line(error, self.source.path)})",
+                file=self.source.path,
                 remedy="the file is cut off or damaged: copy it again",
-            ) from error  # fmt: skip
+            ) from error
         found /= len(bands)
         found[~valid] = np.nan
         return found

@@ -19,7 +19,8 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
-from ortho_pipeline.raster.source import Grid, RasterSource, holds, pixel_type
+from ortho_pipeline.raster.pixel_types import holds, pixel_type
+from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
 
 #: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.
@@ -89,25 +90,30 @@ class Profile:
 def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> float:
     if source.validity == "alpha":
         raise InputError(
-            "the image says by its alpha band which pixels are valid", file=source.path, field="output.nodata",
+            "the alpha band of this image already marks the valid pixels",
+            file=source.path,
+            field="output.nodata",
             remedy=Text(
                 "leave out ", Setting("output.nodata"), ", or choose the other bands with ", Setting("output.bands")
             ),
-        )  # fmt: skip
+        )
     if not holds(dtype, value):
         raise InputError(
-            f"pixels of the type {dtype} cannot have the value {value:g}", field="output.nodata",
+            f"pixels of type {dtype} cannot have the value {value:g}",
+            field="output.nodata",
             remedy=Text("give another value, or another type with ", Setting("output.dtype")),
-        )  # fmt: skip
+        )
     return value
 
 
 def _kept_nodata(value: float | None, dtype: np.dtype[Any], source: RasterSource) -> float | None:
     if value is not None and not holds(dtype, value):
         raise InputError(
-            f"the image's nodata value {value:g} does not fit into {dtype}", file=source.path, field="output.dtype",
-            remedy=Text("set the value of pixels without an image with ", Setting("output.nodata")),
-        )  # fmt: skip
+            f"the nodata value {value:g} of the image does not fit into {dtype}",
+            file=source.path,
+            field="output.dtype",
+            remedy=Text("choose another nodata value with ", Setting("output.nodata")),
+        )
     return value
 
 
@@ -120,10 +126,15 @@ def classes_profile(name: str, classes: Mapping[int, tuple[str, str]], metadata:
     for value, (_, colour) in classes.items():
         table.SetColorEntry(value, (*bytes.fromhex(colour.removeprefix("#")), 255))
     return Profile(
-        count=1, dtype=np.dtype(np.uint8), validity="nodata", nodata=0.0, descriptions=(name,),
-        interpretations=(gdal.GCI_PaletteIndex,), color_table=table,
+        count=1,
+        dtype=np.dtype(np.uint8),
+        validity="nodata",
+        nodata=0.0,
+        descriptions=(name,),
+        interpretations=(gdal.GCI_PaletteIndex,),
+        color_table=table,
         metadata={**{f"CLASS_{value}": text for value, (text, _) in classes.items()}, **metadata},
-    )  # fmt: skip
+    )
 
 
 def as_written(pixels: NDArray[Any], valid: NDArray[np.bool_], dtype: np.dtype[Any], fill: float) -> NDArray[Any]:
@@ -177,12 +188,14 @@ def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
     """
     if not valid_pixels:
         raise InputError(
-            "no pixel of this ortho has a value", file=path,
+            "no pixel of this ortho has a value",
+            file=path,
             remedy=Text(
-                "check the extent, the heights (", Setting("surface.height"),
-                ", or the DEM's place, datum and unit), and the nodata value and mask of the image"
+                "check the extent, the heights (",
+                Setting("surface.height"),
+                ", or the DEM's place, datum and unit), and the nodata value and mask of the image",
             ),
-        )  # fmt: skip
+        )
 
 
 def square_side(profile: Profile, side: int) -> int:
@@ -210,7 +223,7 @@ class RasterWriter:
         progress: Progress | None = None,
     ) -> None:
         if driver not in ("COG", "GTiff"):
-            raise InputError(f"orthos are not written as {driver!r}", field="format", remedy="COG or GTiff")
+            raise InputError(f"orthos cannot be written as {driver!r}", field="format", remedy="COG or GTiff")
         self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
         # The bands of a block lie together in the file, and GDAL holds several such blocks.
         self._side = square_side(profile, 512)

@@ -61,9 +61,10 @@ def gdal_errors(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise InputError(
-            f"the output cannot be written ({first_line(error)})", file=path,
+            f"the output cannot be written ({first_line(error)})",
+            file=path,
             remedy="check the free disk space and the creation options",
-        ) from error  # fmt: skip
+        ) from error
     finally:
         gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", previous)
 
@@ -78,7 +79,7 @@ def close(dataset: gdal.Dataset | None) -> None:
         make it, which some of its drivers say by returning none.
     """
     if dataset is None:
-        raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not make the file")
+        raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not create the file")
     try:
         dataset.FlushCache()
     except RuntimeError:
@@ -173,7 +174,7 @@ def check_written(
                     left, top = column * width, row * height
                     band.ReadRaster(left, top, min(width, band.XSize - left), min(height, band.YSize - top))
     except RuntimeError as error:
-        raise InputError(f"the output cannot be read again ({first_line(error)})", **told) from error
+        raise InputError(f"the output cannot be read back ({first_line(error)})", **told) from error
 
 
 # -- whole files ------------------------------------------------------------------------------------------------------
@@ -267,23 +268,28 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
         if key not in known:
             meant = difflib.get_close_matches(key, known, 1)
             raise InputError(
-                f"the {driver} driver has no creation option {key}", field="creation option",
+                f"the {driver} driver has no creation option {key}",
+                field="creation option",
                 remedy=f"did you mean {meant[0]}?" if meant else f"see the {driver} driver in GDAL's documentation",
-            )  # fmt: skip
+            )
         if key not in _LAYOUT:
             raise InputError(
-                f"the creation option {key} is not taken: it does more than lay out the file", field="creation option",
+                f"the creation option {key} is not allowed: it changes more than the layout of the file",
+                field="creation option",
                 remedy=Text(
-                    "grid and CRS of an ortho are options of their own (", Setting("output.crs"), ", ",
-                    Setting("output.resolution"), ")"
+                    "set the grid and CRS of an ortho with ",
+                    Setting("output.crs"),
+                    " and ",
+                    Setting("output.resolution"),
                 ),
-            )  # fmt: skip
+            )
         if not _PLAIN_VALUE.fullmatch(value) or not _fits(known[key], value):
             values = ", ".join(choice.text or "" for choice in known[key].findall("Value")) or known[key].get("type")
             raise InputError(
-                f"{value[:60]!r} is not a value of the creation option {key}", field="creation option",
+                f"{value[:60]!r} is not a value of the creation option {key}",
+                field="creation option",
                 remedy=f"{key} takes: {values}",
-            )  # fmt: skip
+            )
     defaults = {"BIGTIFF": "IF_SAFER"}
     if driver == "GTiff":
         defaults |= {"TILED": "YES", "BLOCKXSIZE": str(side), "BLOCKYSIZE": str(side)}

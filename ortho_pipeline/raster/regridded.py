@@ -43,7 +43,7 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
     dataset = open_dataset(path, **access)
     left, dx, skew, top, other, dy = dataset.GetGeoTransform()
     if skew or other:
-        raise InputError("this raster is turned against the axes of its CRS", field="geotransform")
+        raise InputError("this raster is not north-up", field="geotransform")
     crs = parse_crs(dataset.GetProjection())
     return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
 
@@ -65,9 +65,14 @@ class Regridded:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], grid: Grid, *, resampling: str = "bilinear", memory: int = MEMORY,
+        self,
+        path: str | os.PathLike[str],
+        grid: Grid,
+        *,
+        resampling: str = "bilinear",
+        memory: int = MEMORY,
         **access: Any,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.path, self._grid, self._resampling = path, grid, resampling
         self._memory, self._local = memory, threading.local()
         self._source = RasterSource(path, memory=memory, **access)
@@ -86,11 +91,16 @@ class Regridded:
         wanted = f"{counted(profile.count, 'band')} of {profile.dtype}"
         if own != wanted:
             raise InputError(
-                f"this ortho has {own}, where {wanted} would be filled", file=self.path,
+                f"this ortho has {own}, but {wanted} is needed to fill gaps",
+                file=self.path,
                 remedy=Text(
-                    "make it of the same bands and type (", Setting("output.bands"), ", ", Setting("output.dtype"), ")"
+                    "make it with the same bands and type (",
+                    Setting("output.bands"),
+                    ", ",
+                    Setting("output.dtype"),
+                    ")",
                 ),
-            )  # fmt: skip
+            )
 
     def read(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return pixels and which are valid ``(bands, height, width)`` of a window of the grid."""
@@ -116,7 +126,7 @@ class Regridded:
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
-            ) from error  # fmt: skip
+            ) from error
         pixels = found[:count]
         valid = np.broadcast_to(found[-1] >= _ENOUGH, pixels.shape).copy()
         if pixels.dtype.kind == "f":
@@ -130,12 +140,20 @@ class Regridded:
             # The kernels of each block as wide as at the middle: GDAL would take what it finds in the block.
             scales = self._scales()
             self._local.warped = gdal.Warp(
-                "", self._source.dataset, format="VRT", dstSRS=self._grid.crs.to_wkt(),
-                srcSRS=self._own.crs.to_wkt(), outputBounds=self._grid.extent, width=self._grid.width,
-                height=self._grid.height, resampleAlg=self._resampling, errorThreshold=0.0, dstAlpha=True,
+                "",
+                self._source.dataset,
+                format="VRT",
+                dstSRS=self._grid.crs.to_wkt(),
+                srcSRS=self._own.crs.to_wkt(),
+                outputBounds=self._grid.extent,
+                width=self._grid.width,
+                height=self._grid.height,
+                resampleAlg=self._resampling,
+                errorThreshold=0.0,
+                dstAlpha=True,
                 warpMemoryLimit=self._memory // 8,
                 warpOptions=[f"XSCALE={scales[0]!r}", f"YSCALE={scales[1]!r}"],
-            )  # fmt: skip
+            )
         return self._local.warped
 
     def _scales(self) -> tuple[float, float]:
@@ -159,9 +177,10 @@ class Regridded:
         xmin, ymin, xmax, ymax = own.extent
         if not (box[0] < xmax and box[2] > xmin and box[1] < ymax and box[3] > ymin):
             raise InputError(
-                f"this ortho ({crs_text(own.crs)}) lies elsewhere", file=self.path,
+                f"this ortho ({crs_text(own.crs)}) does not overlap the scene",
+                file=self.path,
                 remedy="give an ortho of this place, or leave it out",
-            )  # fmt: skip
+            )
 
 
 def _offset(grid: Grid, own: Grid) -> tuple[int, int] | None:

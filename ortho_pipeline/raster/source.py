@@ -26,10 +26,11 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
-from ortho_pipeline.options import PIXEL_TYPES
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.block_cache import keep_blocks
-from ortho_pipeline.raster.gate import DRIVERS, DecodedUnit, open_seen
+from ortho_pipeline.raster.caching.block_cache import keep_blocks
+from ortho_pipeline.raster.opening.drivers import DRIVERS
+from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
+from ortho_pipeline.raster.pixel_types import nodata_of, numpy_type, read_type
 from ortho_pipeline.runtime.process_limits import require_memory
 
 gdal.UseExceptions()
@@ -39,11 +40,11 @@ log = logging.getLogger(__name__)
 MAX_SIDE = 4_000_000
 #: GDAL reads whole blocks: one larger than this is refused before it is allocated (bytes).
 MAX_BLOCK = 1 << 30
-#: Bytes that reading and warping may take where nobody says how many.
+#: Default memory of reading and warping, in bytes.
 MEMORY = 512_000_000
 #: Endings of files beside an image that GDAL's readers of metadata look for.
 _SIDE_CARS = re.compile(r"(?is).+\.(xml|txt|imd|rpb|pvl|met|att|eph|tfw|wld|prj|hdr|ovr|msk|rpc|dim)$")
-_WHOLE = "give a whole raster of a format that GDAL reads ('ortho doctor' lists the allowed ones); copy it again"
+_WHOLE = "give a complete raster in an allowed format ('ortho doctor' lists them), or copy it again"
 
 
 def open_dataset(
@@ -60,9 +61,9 @@ def open_dataset(
     path : path
         A file, also in an archive; URLs and GDAL's network file systems only with `allow_network`.
     roots : sequence of path
-        Folders that the files may lie in that this one leads to, besides its own.
+        Further folders in which files that this one refers to may be.
     siblings : bool
-        Whether GDAL may look at side-car files. Without them RPC metadata are those of the file itself.
+        Whether GDAL may read sidecar files. Without them RPC metadata are those of the file itself.
 
     Raises
     ------
@@ -95,11 +96,15 @@ def open_pixels(
     dataset, block = _opened(path, allow_network, roots, True)
     if block.size > memory:
         raise InputError(
-            f"one block of this raster is {block.size / 1e6:,.0f} MB when it is unpacked, which is beyond the "
-            f"{memory / 1e6:,.0f} MB of memory allowed", file=block.path, field="block size",
-            remedy=Text("tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image give a larger ",
-                        Setting("output.memory", "MB")),
-        )  # fmt: skip
+            f"one block of this raster needs {block.size / 1e6:,.0f} MB, more than the allowed "
+            f"{memory / 1e6:,.0f} MB of memory",
+            file=block.path,
+            field="block size",
+            remedy=Text(
+                "tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image increase ",
+                Setting("output.memory", "MB"),
+            ),
+        )
     keep_blocks(block.size)
     return dataset, block.size
 
@@ -114,7 +119,7 @@ def _opened(
     if isinstance(place, VsiPath):
         drivers.remove("VRT")
         if Location(name).in_archive and not place.exists():
-            raise InputError("there is no such file in an archive", file=name, remedy=_in_archive(name))
+            raise InputError("there is no such file in the archive", file=name, remedy=_in_archive(name))
     elif not Path(name).is_file() and not (Path(name).is_dir()):
         what = "this is a pipe or a device" if Path(name).exists() else "there is no such file"
         raise InputError(what, file=name, remedy=check_path(name))
@@ -131,7 +136,7 @@ def _opened(
         raise InputError(
             f"GDAL cannot open this as a raster ({first_line(error)})",
             file=name,
-            remedy="give a raster of a format that GDAL reads; 'ortho doctor' lists the allowed ones",
+            remedy="give a raster in an allowed format ('ortho doctor' lists them)",
         ) from error
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
@@ -139,7 +144,7 @@ def _opened(
 
 
 def _refuse_pipes(path: Path) -> None:
-    """Refuse an image beside whose metadata or side-cars lies a pipe or a device: GDAL would wait for it for ever."""
+    """Raise an `InputError` if metadata or a sidecar of an image is a pipe or a device: GDAL would wait for ever."""
     folder = path if path.is_dir() else path.parent
     with contextlib.suppress(OSError):
         found = listing(folder)
@@ -151,9 +156,11 @@ def _refuse_pipes(path: Path) -> None:
                 kind = stat.S_IFMT(os.stat(folder / name).st_mode)
             if kind in (stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK):
                 raise InputError(
-                    "a pipe or a device lies beside this image where its metadata would be", file=path,
-                    field=name, remedy="remove it",
-                )  # fmt: skip
+                    "a pipe or a device is in the place of this image's metadata",
+                    file=path,
+                    field=name,
+                    remedy="remove it",
+                )
 
 
 def _check_size(dataset: gdal.Dataset, name: str) -> None:
@@ -164,9 +171,9 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
     block = math.prod(band.GetBlockSize()) * gdal.GetDataTypeSize(band.DataType) // 8
     if max(width, height) > MAX_SIDE or block > MAX_BLOCK:
         raise InputError(
-            f"the header claims {width} x {height} pixels in blocks of {block} bytes",
+            f"the header states {width} x {height} pixels in blocks of {block} bytes",
             file=name,
-            remedy="the file is damaged, or has to be tiled first (gdal_translate -co TILED=YES)",
+            remedy="the file is damaged, or must be tiled first (gdal_translate -co TILED=YES in.tif out.tif)",
         )
 
 
@@ -186,8 +193,21 @@ def first_line(error: BaseException, of: object = "") -> str:
 class Grid:
     """North-up pixel grid of an output raster.
 
-    `left` and `top` are the map coordinates of the outer corner of the first pixel, `dx` and `dy` the (positive) size
-    of a pixel, in units of `crs`.
+    Parameters
+    ----------
+    left, top : float
+        Map coordinates of the outer corner of the first pixel, in units of `crs`.
+    dx, dy : float
+        Size of a pixel (positive), in units of `crs`.
+    width, height : int
+        Number of columns and rows.
+
+    Examples
+    --------
+    >>> import pyproj
+    >>> grid = Grid(pyproj.CRS(32636), 500_000.0, 4_100_000.0, 2.0, 2.0, 100, 50)
+    >>> grid.extent
+    (500000.0, 4099900.0, 500200.0, 4100000.0)
     """
 
     crs: pyproj.CRS
@@ -200,7 +220,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         if not (self.dx > 0 and self.dy > 0 and math.isfinite(self.left) and math.isfinite(self.top)):
-            raise InputError("a pixel has a positive size", field="resolution")
+            raise InputError("the pixel size must be positive", field="resolution")
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             raise InputError(
                 f"the output would have {self.width} x {self.height} pixels",
@@ -216,13 +236,16 @@ class Grid:
         xmin, ymin, xmax, ymax = (float(value) for value in extent)
         dx, dy = resolution
         if not (0 < dx < 1e12 and 0 < dy < 1e12):
-            raise InputError(f"no pixel is {dx:g} x {dy:g} large", field="resolution", remedy="correct it")
+            raise InputError(
+                f"{dx:g} x {dy:g} is not a pixel size", field="resolution", remedy="give a positive resolution"
+            )
         # Beyond that many pixels from the origin a number does not tell one pixel from the next.
         if not (xmin < xmax and ymin < ymax and max(map(abs, (xmin, ymin, xmax, ymax))) / min(dx, dy) < 2**52):
             raise InputError(
-                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent", field="extent",
+                f"{xmin:.12g} {ymin:.12g} {xmax:.12g} {ymax:.12g} is not an extent",
+                field="extent",
                 remedy="give xmin ymin xmax ymax",
-            )  # fmt: skip
+            )
         if align:
             # A hair of tolerance keeps an extent that is already aligned from growing by a pixel of rounding.
             xmin, ymin = math.floor(xmin / dx + 1e-6) * dx, math.floor(ymin / dy + 1e-6) * dy
@@ -233,16 +256,16 @@ class Grid:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """xmin, ymin, xmax, ymax."""
+        """Map coordinates of the outer edges: xmin, ymin, xmax, ymax."""
         return self.left, self.top - self.height * self.dy, self.left + self.width * self.dx, self.top
 
     @property
     def geotransform(self) -> tuple[float, float, float, float, float, float]:
-        """GDAL's six numbers."""
+        """The six numbers of GDAL's geotransform."""
         return self.left, self.dx, 0.0, self.top, 0.0, -self.dy
 
     def xy(self, columns: NDArray[Any], rows: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return map coordinates of pixel positions (corner convention: the centre of the first pixel is 0.5, 0.5)."""
+        """Return map coordinates of pixel positions. The centre of the first pixel is (0.5, 0.5)."""
         return self.left + np.asarray(columns) * self.dx, self.top - np.asarray(rows) * self.dy
 
 
@@ -264,16 +287,17 @@ class _RasterFile:
         bands = self.bands
         if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
             raise InputError(
-                "complex pixels are not resampled", file=self.path, remedy="split them into real bands first"
+                "complex pixels cannot be resampled", file=self.path, remedy="split them into real bands first"
             )
         if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
             # GDAL before 3.7 gives bytes with a sign as bytes without one.
             raise InputError(
-                "these pixels are bytes with a sign, which this GDAL reads as 0 to 255", file=self.path,
-                remedy="make 16 bit of them (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
-            )  # fmt: skip
-        self.dtype = np.result_type(*(_numpy_type(band.DataType) for band in bands))
-        self.nodata = tuple(_nodata(band, self.dtype) for band in bands)
+                "this GDAL reads signed bytes wrongly, as 0 to 255",
+                file=self.path,
+                remedy="convert them to 16 bits (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
+            )
+        self.dtype = np.result_type(*(numpy_type(band.DataType) for band in bands))
+        self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
         flags = self._io(bands[0].GetMaskFlags)
         # GDAL's own order: a mask of the dataset stands beside nodata.
@@ -334,10 +358,10 @@ class _RasterFile:
 
 
 class RasterSource:
-    """A raster that several threads read windows of; it may lie in several files, a band or some in each.
+    """A raster in one or several files. Several threads may read windows of it at the same time.
 
-    Images of one scene that have the same size (a file for each band, as vendors deliver them) are one source: their
-    bands share one pass through the geometry.
+    Vendors often deliver a file for each band. Files of the same size are one source: the geometry of their bands
+    is computed once.
 
     Parameters
     ----------
@@ -346,10 +370,10 @@ class RasterSource:
     bands : sequence of int, optional
         Which bands, counted from 1 over all files, in the order wanted.
     dtype : str, optional
-        GDAL's name of the type that an ortho shall have. Pixels of another type are read as floating point that
-        holds both, so that interpolated values are rounded and clamped once, when they are written.
+        Pixel type of the ortho, as GDAL names it. Pixels of another type are read as floating point that holds
+        both, so that interpolated values are rounded and clamped only once, when they are written.
     memory : int
-        Bytes that one of its blocks may take; see `open_pixels`.
+        Largest allowed size of a block in bytes; see `open_pixels`.
 
     Attributes
     ----------
@@ -358,14 +382,14 @@ class RasterSource:
         Common type of all bands, as they are read.
     nodata : tuple of float or None, per band
     validity : {'all', 'nodata', 'mask', 'alpha'}
-        How the raster says which of its pixels are valid. NaN is never valid.
+        How the raster marks its valid pixels. NaN is never valid.
     block : int
-        Bytes of the blocks that GDAL holds at once to read a pixel of all bands.
+        Bytes that GDAL decodes at once to read one pixel of all bands.
 
     Raises
     ------
     InputError
-        If a file cannot be used, is not as large as the first, or has no such band.
+        If a file cannot be used, differs in size from the first, or has no such band.
     """
 
     def __init__(
@@ -393,7 +417,7 @@ class RasterSource:
         if bands is not None:
             self._files = [_RasterFile(name, access, numbers) for name, numbers in self._chosen(bands)]
         self.count = sum(file.count for file in self._files)
-        self.dtype = _read_as(np.result_type(*(file.dtype for file in self._files)), dtype)
+        self.dtype = read_type(np.result_type(*(file.dtype for file in self._files)), dtype)
         self.nodata = tuple(value for file in self._files for value in file.nodata)
         self.palette = any(file.palette for file in self._files)
         self.block = sum(file.block for file in self._files)
@@ -407,9 +431,11 @@ class RasterSource:
         for band in bands:
             if not 1 <= band <= len(places):
                 raise InputError(
-                    f"there is no band {band}: the image has {len(places)}", file=self.path, field="output.bands",
+                    f"there is no band {band}: the image has {len(places)}",
+                    file=self.path,
+                    field="output.bands",
                     remedy=f"give one from 1 to {len(places)}",
-                )  # fmt: skip
+                )
             path, number = places[band - 1]
             if chosen and chosen[-1][0] == path:
                 chosen[-1][1].append(number)
@@ -434,7 +460,7 @@ class RasterSource:
 
     @property
     def descriptions(self) -> tuple[str, ...]:
-        """Names of the bands; of several files, bands without one have the name of their file."""
+        """Names of the bands. With several files, a band without a name has the name of its file."""
         several = len(self.paths) > 1
         return tuple(
             band.GetDescription() or (Path(file.path).stem if several else "")
@@ -463,38 +489,3 @@ class RasterSource:
                 valid[start:stop] = part
             start = stop
         return valid
-
-
-def _numpy_type(gdal_type: int) -> np.dtype[Any]:
-    from osgeo import gdal_array
-
-    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))  # type: ignore[no-any-return]
-
-
-def _nodata(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
-    value = band.GetNoDataValue()
-    # A value that the type cannot hold marks nothing.
-    return value if value is not None and holds(dtype, value) else None
-
-
-def holds(dtype: np.dtype[Any], value: float) -> bool:
-    """Tell whether a pixel of this type can have a value (of floating point: nearly)."""
-    if dtype.kind == "f":
-        return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
-    limits = np.iinfo(dtype)
-    return float(value).is_integer() and bool(limits.min <= value <= limits.max)
-
-
-def pixel_type(name: str) -> np.dtype[Any]:
-    """Return the type of pixels that GDAL calls `name`."""
-    code = gdal.GetDataTypeByName(name)
-    if name.lower() not in {one.lower() for one in PIXEL_TYPES}:
-        raise InputError(f"no pixels are of the type {name!r}", field="output.dtype", remedy=", ".join(PIXEL_TYPES))
-    return _numpy_type(code)
-
-
-def _read_as(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
-    """Return the type in which pixels are read that are written as `wanted`."""
-    if wanted is None or pixel_type(wanted) == own:
-        return own
-    return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)

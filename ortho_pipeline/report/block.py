@@ -41,7 +41,7 @@ from ortho_pipeline.report.wording import (
     instead,
     refuted,
     scale_rules,
-)  # fmt: skip
+)
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
@@ -144,9 +144,11 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
 def _corrected(head: BlockHeadline, notices: Sequence[Mapping[str, Any]]) -> BlockHeadline:
     """Return the headline as an error leaves it: without a figure that it makes untrue."""
     found = instead(f"{head.figure} and {head.height}" if head.height else head.figure, head.what, notices)
-    return head if found is None else BlockHeadline(
-        figure=UNKNOWN, height=None, what=found[0], notes=(found[1], *head.notes)
-    )  # fmt: skip
+    return (
+        head
+        if found is None
+        else BlockHeadline(figure=UNKNOWN, height=None, what=found[0], notes=(found[1], *head.notes))
+    )
 
 
 def verdict(report: BlockReport) -> str | None:
@@ -259,10 +261,16 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     shown = pictures or {}
     plots = {label: plot_rays(report, label, rays[label]) for label in list(report.images)[:PICTURES]}
     cards = [
-        card(report, label, shown.get(label), None if (plot := plots.get(label)) is None else plot.svg(),
-             _frame_in(report.images[label].size), rays[label])
+        card(
+            report,
+            label,
+            shown.get(label),
+            None if (plot := plots.get(label)) is None else plot.svg(),
+            _frame_in(report.images[label].size),
+            rays[label],
+        )
         for label in report.images
-    ]  # fmt: skip
+    ]
     plan, network = plot_ground(report), plot_network(report)
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
@@ -343,10 +351,14 @@ def plot_ground(report: BlockReport) -> Drawing | None:
     at = (places - low + 0.04 * size) / (1.08 * size) * 1000.0
     extent = at.max(axis=0) + 40.0
     shown = [
-        (place.tolist(), [east, -north], point.role if _takes_part(point) else "out",
-         f"{point.id} ({point.role}): E {east:+.2f}, N {north:+.2f}, h {up:+.2f} m")
+        (
+            place.tolist(),
+            [east, -north],
+            point.role if _takes_part(point) else "out",
+            f"{point.id} ({point.role}): E {east:+.2f}, N {north:+.2f}, h {up:+.2f} m",
+        )
         for place, (east, north, up), point in zip(at, np.array(residuals).tolist(), known, strict=True)
-    ]  # fmt: skip
+    ]
     return _vectors("Known minus adjusted ground in plan", shown, extent.tolist(), "m")
 
 

@@ -41,9 +41,11 @@ def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
     found = headline(adjustment, None)
     name = f"{adjustment.model}, {counted(sum(point.used for point in adjustment.points), 'control point')}"
     return Headline(
-        figure=found.figure, metres=found.metres,
-        what=f"{found.what}, when the model was adjusted ({name})", notes=(*found.notes, _source(scene)),
-    )  # fmt: skip
+        figure=found.figure,
+        metres=found.metres,
+        what=f"{found.what}, when the model was adjusted ({name})",
+        notes=(*found.notes, _source(scene)),
+    )
 
 
 def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:

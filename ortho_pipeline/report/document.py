@@ -295,8 +295,11 @@ def residuals_geojson(fit: Fit) -> dict[str, Any]:
     features = []
     for i, name in enumerate(points.ids):
         pairs = {
-            "": points.image[i], "res_": fit.residuals[i], "raw_": fit.raw_residuals[i], "loo_": fit.loo_residuals[i],
-        }  # fmt: skip
+            "": points.image[i],
+            "res_": fit.residuals[i],
+            "raw_": fit.raw_residuals[i],
+            "loo_": fit.loo_residuals[i],
+        }
         numbers = {f"{key}{axis}": pair[k] for key, pair in pairs.items() for k, axis in enumerate(("col", "row"))}
         numbers |= {"res_px": float(np.hypot(*fit.residuals[i])), "east_m": metres[i, 0], "north_m": metres[i, 1]}
         numbers["length_m"] = float(np.hypot(*metres[i]))
@@ -356,9 +359,11 @@ def read_report_json(path: str | PathLike[str]) -> dict[str, Any]:
         raise InputError("this is not a report of ortho-pipeline", file=path, remedy=_REMEDY)
     if document.get("schema_version") != _VERSION:
         raise InputError(
-            f"schema version {document.get('schema_version')!r} is not known here (this version reads "
-            f"{_VERSION})", file=path, field="schema_version", remedy="make the report again",
-        )  # fmt: skip
+            f"schema version {document.get('schema_version')!r} is not known here (this version reads {_VERSION})",
+            file=path,
+            field="schema_version",
+            remedy="make the report again",
+        )
     return document
 
 
@@ -392,9 +397,10 @@ def write_plots(report: SceneReport, folder: Path, stem: str, kind: str = "svg")
     except (LookupError, ValueError, ArithmeticError) as error:
         # Its members have their types, but numbers that contradict each other are nobody's.
         raise InputError(
-            f"the report is damaged ({type(error).__name__}: {str(error)[:120]})", field="plots",
+            f"the report is damaged ({type(error).__name__}: {str(error)[:120]})",
+            field="plots",
             remedy="make the report again",
-        ) from error  # fmt: skip
+        ) from error
     files = {}
     for name, drawing in drawings.items():
         files[name] = folder / f"{stem}_{name}.{kind}"

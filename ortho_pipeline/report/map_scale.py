@@ -106,10 +106,19 @@ def judge(errors: Array, evidence: Evidence, pixel: float | None, survey: float 
     paper = usual_scale(max(rmse / POSITION, (pixel or 0.0) / PIXEL))
     nmas = next((scale for scale in SCALES if ce90 <= nmas_limit(scale) * (1 + 1e-9)), None)
     found = MapScaleRecord(
-        evidence=evidence, n=count, rmse=rmse, ce90=ce90, pixel=pixel, paper_scale=paper, limited_by=limited,
-        class_cm=math.ceil(100 * math.hypot(rmse, survey) - 1e-9), survey=survey,
-        claim=evidence != "loo" and count >= ENOUGH_CHECK_POINTS, nmas_scale=nmas, statement="",
-    )  # fmt: skip
+        evidence=evidence,
+        n=count,
+        rmse=rmse,
+        ce90=ce90,
+        pixel=pixel,
+        paper_scale=paper,
+        limited_by=limited,
+        class_cm=math.ceil(100 * math.hypot(rmse, survey) - 1e-9),
+        survey=survey,
+        claim=evidence != "loo" and count >= ENOUGH_CHECK_POINTS,
+        nmas_scale=nmas,
+        statement="",
+    )
     return found.replaced(statement=_statement(found))
 
 

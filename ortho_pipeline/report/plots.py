@@ -307,7 +307,7 @@ def _series(axes: Axes, found: Covariance, key: Literal["correlation", "relative
     looks = {
         "control": (("control", "control"), ("control-dash", "loo")),
         "check": (("check-line", "check-head"), ("check-dash", "check")),
-    }  # fmt: skip
+    }
     drawing, values = axes.drawing, operator.attrgetter(key)
     for k, (line, mark) in enumerate(looks[role]):
         at = [axes.at(one.distance_m, values(one)[k]) for one in found.classes]

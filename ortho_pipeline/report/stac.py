@@ -80,7 +80,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
             "a STAC item needs the time of acquisition, and the metadata of this scene have none",
             field="output.acquired",
             remedy=Text("give it, for example ", Setting("output.acquired", "2005-08-03T08:12:31Z")),
-        )  # fmt: skip
+        )
     try:
         time = datetime.fromisoformat(str(text).strip())
         return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
@@ -93,9 +93,7 @@ def acquisition_time(facts: Mapping[str, Any], given: str | None = None) -> date
         ) from error
 
 
-def write_item(
-    path: Path, report: SceneReport, files: Mapping[str, Path], acquired: datetime, name: str
-) -> None:  # fmt: skip
+def write_item(path: Path, report: SceneReport, files: Mapping[str, Path], acquired: datetime, name: str) -> None:
     """Write the STAC item of an ortho, and its pictures.
 
     Parameters
@@ -154,8 +152,10 @@ def write_catalog(path: Path, items: Sequence[Path], title: str) -> None:
     for item in items:
         catalog.add_link(pystac.Link("item", _href(item, path.parent), "application/geo+json"))
     document = catalog.to_dict(include_self_link=False, transform_hrefs=False)
-    document["links"] = [{"rel": "root", "href": f"./{path.name}", "type": "application/json"},
-                         *(link for link in document["links"] if link["rel"] == "item")]  # fmt: skip
+    document["links"] = [
+        {"rel": "root", "href": f"./{path.name}", "type": "application/json"},
+        *(link for link in document["links"] if link["rel"] == "item"),
+    ]
     write_json(path, document, ascii_only=False)
 
 
@@ -236,12 +236,18 @@ def _accuracy(report: SceneReport) -> dict[str, Any]:
         tested = report.matching and report.matching.absolute
         if not tested or tested.m is None:
             return {}
-        return {"accuracy:geometric_rmse": round(tested.m, 4), "ortho:accuracy_from": "check points",
-                "ortho:accuracy_points": tested.n}  # fmt: skip
+        return {
+            "accuracy:geometric_rmse": round(tested.m, 4),
+            "ortho:accuracy_from": "check points",
+            "ortho:accuracy_points": tested.n,
+        }
     for rmse, what in ((report.rmse_m.check, "check points"), (report.rmse_m.loo, "leave-one-out residuals")):
         if rmse:
-            found = {"accuracy:geometric_rmse": round(rmse.total, 4), "ortho:accuracy_from": what,
-                     "ortho:accuracy_points": rmse.n}  # fmt: skip
+            found = {
+                "accuracy:geometric_rmse": round(rmse.total, 4),
+                "ortho:accuracy_from": what,
+                "ortho:accuracy_points": rmse.n,
+            }
             break
     points = report.adjustment.points
     shifts = np.array([point.residual_m for point in points if point.role == "check" and point.residual_m])

@@ -212,17 +212,41 @@ def fitness(found: MapScaleRecord, where: str = "") -> str:
 
 def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     """Return the rules that `fitness` and the standards go by: name, what it asks, what is found, and the result."""
-    rows = [("RMSE in plan", "at most 0.25 mm in the map", f"{found.rmse:.4g} m",
-             scale_text(usual_scale(found.rmse / POSITION)))]  # fmt: skip
+    rows = [
+        (
+            "RMSE in plan",
+            "at most 0.25 mm in the map",
+            f"{found.rmse:.4g} m",
+            scale_text(usual_scale(found.rmse / POSITION)),
+        )
+    ]
     if found.pixel is not None:
-        rows.append(("Pixel size", "at most 0.1 mm in the map; the larger of image and ortho", size_m(found.pixel),
-                     scale_text(usual_scale(found.pixel / PIXEL))))  # fmt: skip
+        rows.append(
+            (
+                "Pixel size",
+                "at most 0.1 mm in the map; the larger of image and ortho",
+                size_m(found.pixel),
+                scale_text(usual_scale(found.pixel / PIXEL)),
+            )
+        )
     survey = f", {found.survey:.4g} m of the check points themselves" if found.survey else ""
     needs = "" if found.claim else f" (a claim needs {ENOUGH_CHECK_POINTS} check points)"
-    rows.append(("ASPRS 2023, horizontal class", "RMSE, with that of the check points themselves, up to the next cm",
-                 f"{found.rmse:.4g} m{survey}", f"{class_size(found.class_cm)}{needs}"))  # fmt: skip
-    rows.append(("NMAS 1947", "nine of ten points within 1/30 inch in the map, 1/50 from 1:20,000 on; pixels do "
-                 "not count", f"{found.ce90:.4g} m", scale_text(found.nmas_scale)))  # fmt: skip
+    rows.append(
+        (
+            "ASPRS 2023, horizontal class",
+            "RMSE, with that of the check points themselves, up to the next cm",
+            f"{found.rmse:.4g} m{survey}",
+            f"{class_size(found.class_cm)}{needs}",
+        )
+    )
+    rows.append(
+        (
+            "NMAS 1947",
+            "nine of ten points within 1/30 inch in the map, 1/50 from 1:20,000 on; pixels do not count",
+            f"{found.ce90:.4g} m",
+            scale_text(found.nmas_scale),
+        )
+    )
     return rows
 
 
@@ -238,9 +262,11 @@ def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) ->
         if said:
             notes = [f"{said} {FEW}", *notes]
         return Headline(
-            figure=px(relative.px), metres=None if relative.m is None else metres(relative.m),
-            what=held_out, notes=(matching.floor(), *notes),
-        )  # fmt: skip
+            figure=px(relative.px),
+            metres=None if relative.m is None else metres(relative.m),
+            what=held_out,
+            notes=(matching.floor(), *notes),
+        )
     ground = "" if relative.m is None else f" ({metres(relative.m)})"
     notes = [f"Relative: {px(relative.px)}{ground} {held_out}.", matching.floor(), *notes]
     if absolute.n < ENOUGH_CHECK_POINTS:

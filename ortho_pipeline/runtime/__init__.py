@@ -1,1 +1,1 @@
-"""What the process runs on: kernels that are compiled, its memory and its threads."""
+"""The process: compiled kernels, memory and threads."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.runtime.kernels.marked import Marked
+from ortho_pipeline.runtime.compilation.marked import Marked
 
 #: numba takes settings from a file of this name in the working folder, which may be somebody else's delivery.
 _SETTINGS = ".numba_config.yaml"
@@ -66,7 +66,7 @@ class Kernel(Marked):
         if self._made is None:
             with _lock:
                 _refuse_settings()
-                from ortho_pipeline.runtime.kernels import compiler
+                from ortho_pipeline.runtime.compilation import compiler
 
                 self._made = self._made or compiler.dispatcher(self)
         return self._made
@@ -80,6 +80,7 @@ class Kernel(Marked):
 def _refuse_settings() -> None:
     if Path(_SETTINGS).exists():
         raise InputError(
-            "numba would take its settings from this file in the working folder, and could run code that they name",
-            file=Path(_SETTINGS).absolute(), remedy="remove the file, or start from another folder",
-        )  # fmt: skip
+            "numba would read its settings from this file in the working folder, which could run foreign code",
+            file=Path(_SETTINGS).absolute(),
+            remedy="remove the file, or run the command in another folder",
+        )

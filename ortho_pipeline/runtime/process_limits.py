@@ -80,11 +80,11 @@ def require_memory(size: int = LEAST, threads: int = 0) -> None:
     needed = size + threads * _PER_THREAD
     if limit - used < needed:
         raise OrthoError(
-            f"there is not enough memory: a limit on this process leaves {max(0, limit - used) >> 20} MB of address "
-            f"space, and the work takes {needed >> 20} MB",
+            f"not enough memory: the limit of this process leaves {max(0, limit - used) >> 20} MB of address "
+            f"space, but the work needs {needed >> 20} MB",
             field="ulimit -v",
             remedy=Text(
-                "raise the limit, or give less work at once (",
+                "raise the limit, or reduce the work at a time (",
                 Setting("output.memory", "MB"),
                 ", ",
                 Setting("output.threads", "1"),
@@ -152,7 +152,7 @@ def claim_gdal_threads() -> None:
     _Pool.process = _Pool.process or os.getpid()
     if _Pool.process != os.getpid():
         raise OrthoError(
-            "this process was forked from one in which GDAL's threads were running, and they do not run here",
+            "this process was forked while GDAL's threads were running; they do not exist here",
             remedy=Text(
                 "start processes with multiprocessing.get_context('spawn'), or give ", Setting("output.threads", "1")
             ),

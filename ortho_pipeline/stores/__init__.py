@@ -1,4 +1,4 @@
-"""Files that lie elsewhere: stores and servers, STAC documents, what is delivered there and what is kept of it here.
+"""Remote files: stores and servers, STAC documents, uploads, and the local cache.
 
 `obstore` is loaded when the first of them is asked for.
 """

@@ -19,11 +19,40 @@ _AT_ONCE = 16
 #: What follows the whole name of an image, its stem, its stem in capitals, and what stands before the rest of its stem.
 _AFTER_NAME = (".ovr", ".msk", ".aux.xml", ".aux", ".AUX", ".OVR", ".MSK")
 _AFTER_STEM = (
-    "_rpc.txt", "_RPC.TXT", ".RPB", ".rpb", ".IMD", ".imd", ".RPC", ".rpc", ".XML", ".xml", ".TXT", ".txt", ".PVL",
-    ".pvl", "_metadata.txt", "_METADATA.txt", "_metadata.xml", "_METADATA.XML", "_MTL.txt", "_MTL.TXT", ".pass",
-    ".PASS", ".aux", ".AUX", ".tab", ".TAB", ".wld", ".WLD", "_survey.txt", "_MET.TXT", "_MET.txt", "_met.txt",
+    "_rpc.txt",
+    "_RPC.TXT",
+    ".RPB",
+    ".rpb",
+    ".IMD",
+    ".imd",
+    ".RPC",
+    ".rpc",
+    ".XML",
+    ".xml",
+    ".TXT",
+    ".txt",
+    ".PVL",
+    ".pvl",
+    "_metadata.txt",
+    "_METADATA.txt",
+    "_metadata.xml",
+    "_METADATA.XML",
+    "_MTL.txt",
+    "_MTL.TXT",
+    ".pass",
+    ".PASS",
+    ".aux",
+    ".AUX",
+    ".tab",
+    ".TAB",
+    ".wld",
+    ".WLD",
+    "_survey.txt",
+    "_MET.TXT",
+    "_MET.txt",
+    "_met.txt",
     "_extended.json",
-)  # fmt: skip
+)
 _AFTER_UPPER = ("_MET.TXT", "_MET.txt", "_met.txt")
 _BEFORE_REST = ("HDR", "RPC")
 #: Names of their own in the folder.
@@ -65,10 +94,12 @@ def _questions(path: VsiPath) -> Iterator[VsiPath]:
     rest, letters = path.stem[3:], path.suffix[1:]
     world = {letters[:1] + letters[-1:] + "w", letters + "w"}
     names = [
-        *(path.name + end for end in _AFTER_NAME), *(path.stem + end for end in _AFTER_STEM),
+        *(path.name + end for end in _AFTER_NAME),
+        *(path.stem + end for end in _AFTER_STEM),
         *(f"{path.stem}.{end}" for one in world for end in (one, one.upper())),
         *(f"{path.stem.upper()}{end}" for end in _AFTER_UPPER),
-        *(f"{first}{rest}{end}" for first in _BEFORE_REST for end in (".txt", ".TXT")), *_IN_FOLDER,
-    ]  # fmt: skip
+        *(f"{first}{rest}{end}" for first in _BEFORE_REST for end in (".txt", ".TXT")),
+        *_IN_FOLDER,
+    ]
     for name in names:
         yield path.with_name(name)

@@ -28,15 +28,15 @@ _AT_ONCE = 4
 
 
 @dataclass(frozen=True)
-class Delivery:
-    """The folder of a delivery, and, when it has ended well, what each of its files is in the store."""
+class Upload:
+    """A local folder whose files are uploaded; afterwards `stored` has the content of each in the store."""
 
     folder: Path
     stored: dict[str, Content] = field(default_factory=dict)
 
 
 @contextlib.contextmanager
-def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[Path], bool]) -> Iterator[Delivery]:
+def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[Path], bool]) -> Iterator[Upload]:
     """Yield a folder on this machine, whose files are in the folder of objects when the block has ended well.
 
     Parameters
@@ -55,12 +55,14 @@ def delivered(address: str, name: str, *, allow_network: bool, keep: Callable[[P
     """
     if address.partition("://")[0] not in STORES:
         raise InputError(
-            "nothing is written to such an address", file=address, field="folder",
-            remedy=f"one of {', '.join(STORES)}, or a folder",
-        )  # fmt: skip
+            "outputs cannot be written to such an address",
+            file=address,
+            field="folder",
+            remedy=f"use one of {', '.join(STORES)}, or a folder",
+        )
     store = Objects(address, allow_network=allow_network)
     with tempfile.TemporaryDirectory(prefix="ortho_") as folder:
-        delivery = Delivery(Path(folder))
+        delivery = Upload(Path(folder))
         yield delivery
         delivery.stored.update(_upload(store, Path(folder), f"{name}{_RECORD}", keep))
 

@@ -28,7 +28,7 @@ from ortho_pipeline.stores.objects import Content
 #: Environment variable: the folder of what is kept.
 FOLDER = "ORTHO_CACHE"
 _RECORD = ".json"
-_REMEDY = f"name a folder that you may write to and that has room in the environment variable {FOLDER}"
+_REMEDY = f"set the environment variable {FOLDER} to a folder with write access and enough free space"
 _RECORD_BYTES = 100_000
 #: Members of a record, and of which types they are.
 _FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
@@ -37,8 +37,8 @@ _agreed: dict[str, tuple[int, int, int]] = {}
 
 
 @dataclass(frozen=True)
-class Record:
-    """A file that is kept: where, where it came from, and what it was when it came."""
+class CachedFile:
+    """A cached file: its path, its address, and its size and checksum when it was downloaded."""
 
     path: Path
     address: str
@@ -57,7 +57,7 @@ class Record:
 
 
 def folder() -> Path:
-    """Return the folder of what is kept: ``$ORTHO_CACHE``, or one of the user's folder of caches.
+    """Return the folder of cached files: ``$ORTHO_CACHE``, or a folder in the user's cache folder.
 
     Raises
     ------
@@ -69,9 +69,10 @@ def folder() -> Path:
     if found is None or not found.is_absolute():
         wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
         raise InputError(
-            f"files of the network cannot be kept ({wrong})", field=FOLDER,
+            f"downloaded files cannot be cached ({wrong})",
+            field=FOLDER,
             remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -108,13 +109,13 @@ def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Cal
             content = fetch(part)
             wrong = fault(part) if fault is not None else ""
             if wrong:
-                raise InputError(f"what was fetched is not sound: {wrong}", file=address, remedy="check the address")
+                raise InputError(f"the downloaded file is not valid: {wrong}", file=address, remedy="check the address")
             _agreed[os.fspath(path)] = states([part])[os.fspath(part)]
         record = {"address": address, "bytes": content.size, "sha256": content.sha256, "fetched": time.time()}
         write_json(_record_of(path), record)
 
 
-def records() -> Iterator[Record]:
+def records() -> Iterator[CachedFile]:
     """Yield what is kept, by name."""
     for path in sorted(folder().glob(f"*/[!.]*{_RECORD}")):
         found = _read(path)
@@ -147,11 +148,11 @@ def _agrees(path: Path, address: str) -> bool:
     return True
 
 
-def _read(path: Path) -> Record | None:
+def _read(path: Path) -> CachedFile | None:
     """Return the record of a kept file; None where it is none, so that the file is fetched again."""
     try:
         given = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
-        record = Record(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
+        record = CachedFile(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
     except (InputError, KeyError, TypeError):
         return None
     kinds = all(type(getattr(record, name)) in kinds for name, kinds in _FIELDS.items())

@@ -26,16 +26,17 @@ from ortho_pipeline.files.traffic import count
 
 #: How often a request is repeated, and for how long, before it has failed.
 RETRIES: dict[str, Any] = {
-    "max_retries": 8, "retry_timeout": timedelta(minutes=3),
+    "max_retries": 8,
+    "retry_timeout": timedelta(minutes=3),
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=15), "base": 2},
-}  # fmt: skip
+}
 #: How often an object is fetched whose content is not what the store says of it.
 _ATTEMPTS = 3
 #: Objects that are written on a condition are small (bytes).
 _MOST_ON_A_CONDITION = 100_000_000
 _TIMEOUTS = {"connect_timeout": "10s", "timeout": "900s"}
 _CHUNK = 4 << 20
-#: What is noted beside an object that is encrypted.
+#: Attributes that are stored with an encrypted object.
 _SHA256 = "sha256"
 #: Bytes of the parts in which a large object is stored.
 PART = 8 << 20
@@ -78,7 +79,9 @@ class Objects:
         require_network(address, allow_network)
         if not Location(address).is_address:
             raise InputError(
-                "this is no address of a folder", file=address, remedy=f"one of {', '.join(SCHEMES)}, and a name"
+                "this is not the address of a folder",
+                file=address,
+                remedy=f"use one of {', '.join(SCHEMES)}, and a name",
             )
         self.address = address.rstrip("/")
         self._store = _store_of(self.address)
@@ -125,9 +128,10 @@ class Objects:
                 result = self._store.get(name)
                 if result.meta["size"] > limit:
                     raise InputError(
-                        f"this object has {result.meta['size']} bytes, and {limit} are the most that is read",
-                        file=self.of(name), remedy="check the address",
-                    )  # fmt: skip
+                        f"this object has {result.meta['size']} bytes; the limit is {limit}",
+                        file=self.of(name),
+                        remedy="check the address",
+                    )
                 digests = _Digests()
                 taken = take(digests.through(result.stream(min_chunk_size=_CHUNK), limit))
                 content = digests.content(result.meta[self._version])
@@ -138,9 +142,10 @@ class Objects:
             if not wrong:
                 return taken, content
         raise StorageError(
-            f"{wrong}, {_ATTEMPTS} times", file=self.of(name),
-            remedy="try again later; if it stays so, the object is damaged in its store",
-        )  # fmt: skip
+            f"{wrong}, {_ATTEMPTS} times",
+            file=self.of(name),
+            remedy="try again later; if this persists, the object in the store is damaged",
+        )
 
     def names(self, prefix: str = "") -> Iterator[tuple[str, int]]:
         """Yield names and sizes of the objects whose names begin so; a plain web server lists none."""
@@ -214,16 +219,17 @@ class Objects:
             if not wrong and _TAG.fullmatch(stored["e_tag"] or "") is None:
                 # As Azure's: an ETag that is a number of the version alone.
                 there = self._attempts(name, content.size, collections.deque(maxlen=0).extend)[1]
-                wrong = "" if there.sha256 == content.sha256 else "it is another content"
+                wrong = "" if there.sha256 == content.sha256 else "the content differs"
             if not wrong:
                 return replace(content, version=stored[self._version], tag=stored["e_tag"] or "")
         with contextlib.suppress(OrthoError):
             self.delete(name)
         gone = "could not be removed" if self.exists(name) else "was removed"
         raise StorageError(
-            f"{wrong} after it was written, {_ATTEMPTS} times; it {gone}", file=self.of(name),
-            remedy="try again; if it stays so, check the store and the way to it",
-        )  # fmt: skip
+            f"{wrong} after it was written, {_ATTEMPTS} times; it {gone}",
+            file=self.of(name),
+            remedy="try again; if this persists, check the store and the connection",
+        )
 
     def _put_if(self, name: str, data: bytes | Path, content: Content, mode: Any) -> Content:
         """Store an object on a condition.
@@ -251,7 +257,9 @@ class Objects:
                 break
         self.delete(name)
         raise StorageError(
-            f"{wrong} after it was written; it was removed", file=self.of(name), remedy="check the way to the store"
+            f"{wrong} after it was written; it was removed",
+            file=self.of(name),
+            remedy="check the connection to the store",
         )
 
     def _note(self, content: Content) -> Any:
@@ -276,14 +284,16 @@ class Objects:
             raise Conflict("another version of this object is there", file=self.of(name)) from error
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
             raise InputError(
-                "the store does not let you do this", file=self.of(name),
-                remedy="give credentials as the store's own clients find them (docs/remote.md), or check their rights",
-            ) from error  # fmt: skip
+                "the store denies access",
+                file=self.of(name),
+                remedy="set credentials as for the store's own clients (docs/remote.md), or check their permissions",
+            ) from error
         except exceptions.BaseError as error:
             raise StorageError(
-                f"the store does not do what was asked ({_status(error)})", file=self.of(name),
-                remedy="check the address; try again later",
-            ) from error  # fmt: skip
+                f"the request to the store failed ({_status(error)})",
+                file=self.of(name),
+                remedy="check the address and the network connection, and try again later",
+            ) from error
 
 
 class Conflict(StorageError):
@@ -347,25 +357,29 @@ def _difference(content: Content, stated: Mapping[str, Any], *, ours: bool = Fal
     The ETag of what others stored in parts says nothing of the content alone.
     """
     if content.size != stated["size"]:
-        return f"{content.size} bytes, and the store states {stated['size']}"
+        return f"{content.size} bytes, but the store states {stated['size']}"
     tag = _TAG.fullmatch(stated["e_tag"] or "")
     if tag is None or tag[1] in content.tags or (tag[2] and not ours):
         return ""
-    return "the checksum is not the one that the store states"
+    return "the checksum differs from the one that the store states"
 
 
 def _noted_difference(content: Content, stated: Mapping[str, Any], attributes: Mapping[str, str]) -> str:
     """Return how a content differs from what was noted when it was encrypted; others note nothing."""
     if content.size != stated["size"]:
         return _difference(content, stated)
-    return "" if attributes.get(_SHA256, content.sha256) == content.sha256 else "the checksum is not the one noted"
+    return (
+        ""
+        if attributes.get(_SHA256, content.sha256) == content.sha256
+        else "the checksum differs from the recorded one"
+    )
 
 
 def _status(error: Exception) -> str:
     found = re.search(r"status code: (\d{3})", str(error))
     if found:
         return f"HTTP status {found[1]}"
-    return "it cannot be reached" if "connect" in str(error) else "the connection failed"
+    return "cannot connect" if "connect" in str(error) else "the connection failed"
 
 
 def _store_of(address: str) -> Any:

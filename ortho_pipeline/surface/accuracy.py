@@ -122,9 +122,12 @@ class DemAccuracy:
         ]
         classes = [{"slope_deg": [low, high], **vars(errors)} for low, high, errors in self.by_slope()]
         return {
-            "overall": vars(self.overall), "by_slope": classes, "gross": self.gross(),
-            "without_height": int((~np.isfinite(self.differences)).sum()), "points": points,
-        }  # fmt: skip
+            "overall": vars(self.overall),
+            "by_slope": classes,
+            "gross": self.gross(),
+            "without_height": int((~np.isfinite(self.differences)).sum()),
+            "points": points,
+        }
 
 
 def check_dem(surface: DemSurface, ground: Array, crs: str | pyproj.CRS, ids: Sequence[str]) -> DemAccuracy:
@@ -161,7 +164,7 @@ def slopes_at(surface: DemSurface, lonlat: Array) -> Array:
 def typical_sigma(surface: Surface) -> float | None:
     """Return the standard deviation (m) of the heights of a surface, of a raster their root mean square.
 
-    None where nobody says, or the raster holds none.
+    None if it is unknown, or the raster has none.
     """
     sigma = surface.sigma
     if not isinstance(sigma, DemSurface):

@@ -32,20 +32,19 @@ class Excerpt(NamedTuple):
 
 
 class Surface(abc.ABC):
-    """The ground as ellipsoidal heights: `open_dem` opens a DEM, `FlatSurface` is one height.
+    """The ground as ellipsoidal heights. `open_dem` opens a DEM; `FlatSurface` is one height.
 
-    A surface never changes: `with_fill` and `around` return another one. Safe to use from several threads; copies and
-    pickles know what the surface is and nothing of what was read.
+    A surface never changes: `with_fill` and `around` return another one. Threads may share it. Copies and pickles
+    do not contain heights that were read.
 
-    To a warp every surface is a raster of samples, which it reads by windows; flat ground is one whose samples are
-    all alike.
+    For a warp every surface is a raster of samples that is read by windows. The samples of flat ground are equal.
 
     Attributes
     ----------
     fill : 'error', 'mask', 'nearest' or float
-        What stands for a void: NaN for the first two; a height with the others.
+        Value in a void: NaN for the first two, a height for the others.
     sigma : float, Surface or None
-        Standard deviation (m) of the heights; as a surface it has them for heights. None where nobody says.
+        Standard deviation (m) of the heights, or a surface that has one at each place. None if unknown.
     """
 
     fill: str | float
@@ -70,7 +69,7 @@ class Surface(abc.ABC):
 
     @abc.abstractmethod
     def describe(self) -> str:
-        """Say where a point on the surface lies: on the DEM, at so many metres."""
+        """Return where a point on the surface is, in words: on the DEM, or at a height in metres."""
 
     @abc.abstractmethod
     def with_fill(self, fill: str | float) -> Surface:
@@ -108,7 +107,7 @@ class Surface(abc.ABC):
 
     @abc.abstractmethod
     def above(self, ground: Array, crs: str | pyproj.CRS) -> Array:
-        """Return how far (m) points ``(N, 3)`` lie above heights that were measured; NaN where none were."""
+        """Return how far (m) points ``(N, 3)`` are above measured heights. NaN where there are none."""
 
     @abc.abstractmethod
     def range_under(self, ground: Array, crs: str | pyproj.CRS, margin: float = 0.0) -> tuple[float, float]:
@@ -128,7 +127,7 @@ class Surface(abc.ABC):
     @property
     @abc.abstractmethod
     def height_range(self) -> tuple[float, float]:
-        """Lowest and highest height (m) of the whole surface, with a fill height; every sample is read, once."""
+        """Lowest and highest height (m) of the whole surface, with a fill height. Reads every sample once."""
 
     # -- samples -----------------------------------------------------------------------------------------------------
 
@@ -186,7 +185,7 @@ def parse_fill(fill: str | float) -> str | float:
     height = number_of(fill)
     if math.isnan(height):
         raise InputError(
-            f"{fill!r} does not say how to fill voids",
+            f"{fill!r} is not a way to fill voids",
             field="surface.fill",
             remedy="give error, mask, nearest or an ellipsoidal height in metres",
         )
@@ -203,5 +202,5 @@ def positions(xy: ArrayLike) -> Array:
     """
     found = np.asarray(xy, dtype=float)
     if found.ndim != 2 or found.shape[1] < 2:
-        raise InputError(f"positions have the shape (N, 2), not {found.shape}")
+        raise InputError(f"expected positions of shape (N, 2), not {found.shape}")
     return found[:, :2]

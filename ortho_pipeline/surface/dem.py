@@ -25,7 +25,7 @@ from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_re
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.surface.base import Array, Excerpt, Surface, Window, parse_fill, positions
 from ortho_pipeline.surface.dem_file import Affine, DemFile, SampleGrid
-from ortho_pipeline.surface.mosaic import Samples, matching_files, open_mosaic
+from ortho_pipeline.surface.dem_mosaic import Samples, matching_files, open_mosaic
 from ortho_pipeline.surface.voids import nearest_heights
 
 #: ``fill='nearest'`` looks so far for a valid height: samples, and metres after which real terrain is another one.
@@ -57,21 +57,21 @@ def open_dem(
     Parameters
     ----------
     path : path
-        A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.mosaic`).
+        A file, or a pattern such as ``folder/*.tif`` of the files that make one DEM (see `surface.dem_mosaic`).
     vertical : Vertical or str, optional
-        What the heights are measured above. Needed where the DEM does not say it.
+        Height datum. Required if the DEM does not state it.
     override : bool
-        Let `vertical` stand against a datum that the DEM declares by an authority code.
+        Use `vertical` even if the DEM states another datum by an authority code.
     fill : 'error', 'mask', 'nearest' or float
-        What stands for a void (see `Surface`); a number is an ellipsoidal height in metres.
+        Value in a void (see `Surface`). A number is an ellipsoidal height in metres.
     memory : int
-        Bytes of a whole job. An eighth of them may hold heights that were read.
+        Memory of the whole job in bytes. An eighth of it may cache heights.
 
     Raises
     ------
     InputError, DatumError, CrsError
-        If it cannot be opened, its height datum is unknown or contradicted, a geoid grid is missing, or it has no
-        usable georeference.
+        If it cannot be opened, its height datum is unknown or contradicts `vertical`, a geoid grid is missing, or
+        it has no usable georeference.
     """
     access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)
@@ -120,13 +120,13 @@ def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
         ) from error
     if not np.isfinite(undulation).any():
         raise DatumError(
-            f"the geoid grid of {vertical.label} does not reach this DEM",
+            f"{vertical.label} does not cover this DEM",
             field="surface.vertical",
             remedy=dem_vertical_remedy(),
         )
 
 
-class Tiles:
+class TileCache:
     """Arrays by key, as many of the last used as some bytes hold; shared by threads."""
 
     def __init__(self, size: int) -> None:
@@ -180,10 +180,10 @@ class DemSurface(Surface):
     cache_bytes: int
     sigma: float | Surface | None = None
     # What is kept follows from all of the above, so no two surfaces share it.
-    _tiles: Tiles = field(init=False, repr=False)
+    _tiles: TileCache = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_tiles", Tiles(self.cache_bytes))
+        object.__setattr__(self, "_tiles", TileCache(self.cache_bytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return DemSurface, tuple(getattr(self, one.name) for one in fields(self) if one.init)
@@ -366,7 +366,7 @@ class DemSurface(Surface):
 
     @functools.cached_property
     def height_range(self) -> tuple[float, float]:
-        """Lowest and highest height (m) of the whole surface, with a fill height; every sample is read, once."""
+        """Lowest and highest height (m) of the whole surface, with a fill height. Reads every sample once."""
         rows, columns = self.shape
         return self.range_within(0, 0, columns, rows)
 
@@ -400,7 +400,7 @@ class DemSurface(Surface):
 
 def _no_height(path: str) -> CoverageError:
     return CoverageError(
-        "this DEM holds no valid height here", file=path, remedy="check its nodata value, unit and extent"
+        "this DEM has no valid height here", file=path, remedy="check its nodata value, unit and extent"
     )
 
 

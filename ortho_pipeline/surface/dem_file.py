@@ -57,9 +57,13 @@ class SampleGrid:
         inverse = np.linalg.inv([[a, b], [c, d]])
         shift = -inverse @ [x, y]
         return (
-            float(shift[0]), float(inverse[0, 0]), float(inverse[0, 1]),
-            float(shift[1]), float(inverse[1, 0]), float(inverse[1, 1]),
-        )  # fmt: skip
+            float(shift[0]),
+            float(inverse[0, 0]),
+            float(inverse[0, 1]),
+            float(shift[1]),
+            float(inverse[1, 0]),
+            float(inverse[1, 1]),
+        )
 
     @functools.cached_property
     def sample_size(self) -> float:
@@ -189,20 +193,28 @@ class DemFile:
         x, a, b, y, c, d = transform
         if not np.isfinite(transform).all() or abs(a * d - b * c) <= 1e-14 * (abs(a) + abs(b)) * (abs(c) + abs(d)):
             raise CrsError(
-                f"the geotransform {transform} of this DEM is degenerate", file=self.path, field="geotransform",
+                f"the geotransform {transform} of this DEM is degenerate",
+                file=self.path,
+                field="geotransform",
                 remedy="set it with gdal_edit.py -a_ullr",
-            )  # fmt: skip
+            )
         if gdal.DataTypeIsComplex(dataset.GetRasterBand(1).DataType):
-            raise InputError("complex numbers are not heights", file=self.path, field="band 1",
-                             remedy="choose one part of them with gdal_calc.py")  # fmt: skip
+            raise InputError(
+                "the pixels of this DEM are complex numbers, not heights",
+                file=self.path,
+                field="band 1",
+                remedy="extract the real part with gdal_calc.py",
+            )
         # GDAL counts from the corner of the first pixel; heights belong to the centres.
         centre = (x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d)
         grid = SampleGrid(plane, (dataset.RasterYSize, dataset.RasterXSize), centre)
         if grid.sample_size < _FINEST:
             raise CrsError(
-                f"the samples of this DEM would be {grid.sample_size:.1g} m apart", file=self.path,
-                field="geotransform", remedy="set the true one with gdal_edit.py -a_ullr",
-            )  # fmt: skip
+                f"the samples of this DEM would be {grid.sample_size:.1g} m apart",
+                file=self.path,
+                field="geotransform",
+                remedy="set the true one with gdal_edit.py -a_ullr",
+            )
         return crs, grid
 
     def _crs(self, wkt: str) -> tuple[pyproj.CRS, pyproj.CRS]:
@@ -214,7 +226,7 @@ class DemFile:
                 f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
                 file=self.path,
                 field="CRS",
-                remedy="set a CRS of known datum with gdal_edit.py -a_srs",
+                remedy="set a CRS with a known datum with gdal_edit.py -a_srs",
             ) from error
 
     def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
@@ -229,7 +241,7 @@ class DemFile:
             raise InputError(
                 f"the heights cannot be read ({first_line(error, self.path)})",
                 file=self.path,
-                remedy="copy the DEM again: it is damaged",
+                remedy="the file is damaged: copy it again",
             ) from error
         scale, offset = (1.0 if band.GetScale() is None else band.GetScale()), band.GetOffset() or 0.0
         heights = raw.astype(float)

@@ -73,7 +73,7 @@ class FlatSurface(Surface):
         return float(np.isfinite(heights).mean()) if len(heights) else 1.0
 
     def above(self, ground: Array, crs: str | pyproj.CRS) -> Array:
-        """Return NaN ``(N,)``: the height was assumed, and says nothing of those of points."""
+        """Return NaN ``(N,)``: the height is an assumption, so points cannot be compared with it."""
         return np.full(len(ground), np.nan)
 
     def range_under(self, ground: Array, crs: str | pyproj.CRS, margin: float = 0.0) -> tuple[float, float]:
@@ -92,7 +92,7 @@ class FlatSurface(Surface):
         return lambda ground: np.full((len(ground), 2), 0.5)
 
     def window_around(self, left: float, top: float, right: float, bottom: float) -> Window | None:
-        """Return the four samples that stand for all."""
+        """Return four samples; all others are equal to them."""
         return 0, 0, 2, 2
 
     def window(self, u0: int, v0: int, nu: int, nv: int) -> Array:

@@ -36,11 +36,11 @@ _BLOCK = 1024
 #: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
 _SOUND = Text(
-    "give the metadata of this very image (",
+    "give the metadata of this image (",
     Setting("scene.rpc", "FILE"),
     ", ",
     Setting("scene.model", "FILE"),
-    "), and points that were measured in it; if they are, its plugin reads them wrongly (docs/plugins.md)",
+    ") and points measured in it; if they are right, the plugin reads them wrongly (docs/plugins.md)",
 )
 
 
@@ -131,40 +131,49 @@ class Footprint:
         wanted = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
-                self.beyond, file=file, field="surface.dem",
+                self.beyond,
+                file=file,
+                field="surface.dem",
                 remedy=Text(
-                    "check datum and unit of the DEM (", Setting("surface.vertical"),
-                    ") and the place of the scene, or ", wanted
+                    "check the height datum and unit of the DEM (",
+                    Setting("surface.vertical"),
+                    ") and the position of the scene, or ",
+                    wanted,
                 ),
-            )  # fmt: skip
+            )
         if not self.complete and surface.fill == "error":
             raise CoverageError(
-                f"the DEM covers {share(self.coverage)} of the scene", file=file,
-
+                f"the DEM covers {share(self.coverage)} of the scene",
+                file=file,
                 remedy=Text(
-                    "give a DEM that covers it all, or ", wanted, ", nearest, or an ellipsoidal height in metres"
+                    "give a DEM that covers the whole scene, or ",
+                    wanted,
+                    ", nearest, or an ellipsoidal height in metres",
                 ),
-            )  # fmt: skip
+            )
         if self.coverage == 0.0 and surface.fill == "mask":
             raise CoverageError(
-                "the DEM covers nothing of the scene: the ortho would have no pixels", file=file, field="surface.dem",
-                remedy="give the DEM of this place",
-            )  # fmt: skip
+                "the DEM does not cover the scene: the ortho would have no pixels",
+                file=file,
+                field="surface.dem",
+                remedy="give a DEM of this place",
+            )
         if self.unmet and surface.fill == "nearest":
             raise CoverageError(
                 f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
-                "the next height of the DEM",
-                file=file, field="surface.fill",
-                remedy=Text("give a DEM that reaches farther, or ", wanted),
-            )  # fmt: skip
+                "the nearest height of the DEM",
+                file=file,
+                field="surface.fill",
+                remedy=Text("give a larger DEM, or ", wanted),
+            )
 
     def notes(self) -> list[Notice]:
         """Return a notice if the DEM does not cover the scene as a whole, or only with heights beyond the model."""
-        said = [f"{self.beyond}: such places have no pixels"] if self.beyond else []
+        said = [f"{self.beyond}: these places have no pixels"] if self.beyond else []
         if self.coverage < 1.0:
-            what = "have no pixels in the ortho" if self.surface.fill in ("error", "mask") else "were filled"
-            inside = f" ({counted(self.voids, 'sample')} without a height within it)" if self.voids else ""
-            said.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the other places {what}")
+            what = "has no pixels in the ortho" if self.surface.fill in ("error", "mask") else "was filled"
+            inside = f" ({counted(self.voids, 'sample')} without a height inside it)" if self.voids else ""
+            said.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the rest {what}")
         return [Notice("dem-covers-part", "; ".join(said), coverage=self.coverage)] if said else []
 
     def fitted(self, model: SensorModel) -> SensorModel:
@@ -232,12 +241,15 @@ def _nowhere(model: SensorModel, surface: Surface) -> InputError:
     low, high = model.height_range
     if not isinstance(surface, FlatSurface) or low <= surface.height <= high:
         return InputError(
-            "no border pixel meets the ground: the model does not belong to this image", field="model", remedy=_SOUND
+            "no pixel at the image border meets the ground: the model does not belong to this image",
+            field="model",
+            remedy=_SOUND,
         )
     return InputError(
-        f"the scene does not meet the ground at a height of {surface.height:g} m", field="surface.height",
-        remedy=f"give an ellipsoidal height of the terrain; the model is meant for {low:.0f} to {high:.0f} m",
-    )  # fmt: skip
+        f"the scene does not meet the ground at a height of {surface.height:g} m",
+        field="surface.height",
+        remedy=f"give an ellipsoidal height of the terrain; the model is valid from {low:.0f} to {high:.0f} m",
+    )
 
 
 def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
@@ -335,9 +347,10 @@ def ground_sample_distance(
     area = abs(across[0] * down[1] - across[1] * down[0])
     if not (np.isfinite(area) and area > 0):
         raise InputError(
-            "a pixel in the middle of the image has no size on the ground: this model is none of an image",
-            field="model", remedy=_SOUND,
-        )  # fmt: skip
+            "the central pixel has no size on the ground: the model does not belong to this image",
+            field="model",
+            remedy=_SOUND,
+        )
     return math.sqrt(area)
 
 
@@ -387,16 +400,18 @@ def choose_grid(
     ground = _continuous(ground_transform(model.crs, crs)(found.reach), crs)
     if not np.isfinite(ground).any():
         raise InputError(
-            f"the scene does not lie in the domain of {crs.name!r}", field="output.crs", remedy="choose another CRS"
+            f"the scene is outside the area of {crs.name!r}", field="output.crs", remedy="choose another CRS"
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     if (np.array(step) > (high - low)[:2]).all():
         unit = crs.axis_info[0].unit_name
         usual = f"{two_digits(ground_sample_distance(model, crs, width, height, found.middle)):.12f}".rstrip("0")
         raise InputError(
-            f"the scene is smaller than one pixel of {step[0]:g} {unit}s, which is the unit of {crs.name!r}",
-            field="output.resolution", remedy=Text("did you mean ", Setting("output.resolution", usual), "?"),
-        )  # fmt: skip
+            f"a resolution of {step[0]:g} means {step[0]:g} {unit}s in {crs.name!r}; "
+            "the whole scene is smaller than one pixel",
+            field="output.resolution",
+            remedy=Text("did you mean ", Setting("output.resolution", usual), "?"),
+        )
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
 
@@ -406,7 +421,7 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     Raises
     ------
     InputError
-        If there are none: the extent lies beside the scene.
+        If there are none: the extent does not overlap the scene.
     """
     import shapely
 
@@ -417,13 +432,14 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
         ground[:, 0] += 360.0 * round(((xmin + xmax) / 2 - (ground[:, 0].min() + ground[:, 0].max()) / 2) / 360.0)
     hull = shapely.MultiPoint(ground).convex_hull
     if not len(ground) or not hull.intersects(shapely.box(xmin, ymin, xmax, ymax)):
-        place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "outside of this CRS"
+        place = " ".join(f"{value:.10g}" for value in hull.bounds) if len(ground) else "no part of this CRS"
         raise InputError(
-            f"the extent lies beside the scene, which reaches over {place}", field="output.extent",
+            f"the extent does not overlap the scene, which covers {place}",
+            field="output.extent",
             remedy=Text(
                 "give xmin ymin xmax ymax in units of the output CRS, or leave ", Setting("output.extent"), " out"
             ),
-        )  # fmt: skip
+        )
     return float(hull.intersection(shapely.box(xmin, ymin, xmax, ymax)).area) / (grid.dx * grid.dy)
 
 
@@ -439,7 +455,8 @@ def _centre(model: SensorModel, width: int, height: int) -> Array:
     centre = model.image_to_ground(np.array([[width / 2, height / 2]]), model.reference_height)
     if not np.isfinite(centre).all():
         raise InputError(
-            "the middle of the image does not meet the ground: the model does not belong to this image", field="model",
+            "the centre of the image does not meet the ground: the model does not belong to this image",
+            field="model",
             remedy=_SOUND,
-        )  # fmt: skip
+        )
     return centre

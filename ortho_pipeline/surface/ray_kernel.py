@@ -34,7 +34,7 @@ _LAST = 0.01
 _MARGIN = 1e-4
 
 
-class Terrain(NamedTuple):
+class BoundedHeights(NamedTuple):
     """Heights of a DEM, and bounds on them.
 
     Parameters
@@ -62,7 +62,7 @@ class Terrain(NamedTuple):
     steepest: float
 
 
-def terrain_of(heights: Array, left: int, top: int, middle: float, half: float, nodes: Array) -> Terrain:
+def terrain_of(heights: Array, left: int, top: int, middle: float, half: float, nodes: Array) -> BoundedHeights:
     """Return heights ``(rows, columns)`` as terrain for the rays between `nodes` ``(..., n)``: see `curves_at`."""
     first = nodes[..., (1, 6)].reshape(-1, 2)
     rest = (np.abs(nodes[..., (2, 3, 4, 7, 8, 9)]).reshape(-1, 2, 3) * (2, 3, 4)).sum(axis=2)
@@ -86,7 +86,7 @@ def terrain_of(heights: Array, left: int, top: int, middle: float, half: float, 
         rows, columns = (np.arange(0, side, 2) for side in levels[-1].shape)
         levels.append(np.maximum.reduceat(np.maximum.reduceat(levels[-1], rows, axis=0), columns, axis=1))
     bounds = np.concatenate([level.ravel() for level in levels])
-    return Terrain(heights, float(left), float(top), float(middle), float(half), bounds, steep, steepest)
+    return BoundedHeights(heights, float(left), float(top), float(middle), float(half), bounds, steep, steepest)
 
 
 def _ahead(steep: Array, low: Array, high: Array) -> Array:
@@ -104,7 +104,7 @@ def _ahead(steep: Array, low: Array, high: Array) -> Array:
     return steep
 
 
-def meet(curves: Array, terrain: Terrain, tolerance: float) -> Array:
+def meet(curves: Array, terrain: BoundedHeights, tolerance: float) -> Array:
     """Return the normalised heights ``(n,)`` at which rays first meet the terrain; NaN where they do not.
 
     Parameters
@@ -218,7 +218,7 @@ def _improve(work, middle, half, tolerance):
 
 
 @compiled
-def approach(curves: Any, terrain: Terrain, tolerance: float, found: Any) -> int:
+def approach(curves: Any, terrain: BoundedHeights, tolerance: float, found: Any) -> int:
     """Fill the heights at which rays surely first meet the terrain, NaN for the others; return how many these are."""
     heights, rows, columns = terrain.heights, terrain.heights.shape[0] - 1, terrain.heights.shape[1] - 1
     work, cells, others = np.zeros((_ROWS, BLOCK)), np.zeros((2, BLOCK), np.int64), 0
@@ -402,7 +402,7 @@ def _first_meeting(curve, terrain, tolerance):
 
 
 @compiled
-def follow(curves: Any, terrain: Terrain, tolerance: float, found: Any) -> None:
+def follow(curves: Any, terrain: BoundedHeights, tolerance: float, found: Any) -> None:
     """Fill the normalised heights ``(n,)`` at which rays ``(n, 10)`` first meet the terrain; NaN where they do not."""
     for k in range(curves.shape[0]):
         found[k] = _first_meeting(curves[k], terrain, tolerance)

@@ -51,7 +51,7 @@ class DemWindow(NamedTuple):
     cubic: bool
 
 
-class Target(NamedTuple):
+class OutputWindow(NamedTuple):
     """Where pixels go: rows first … last - 1 and columns of a block, and the tile ``(bands, h, w)`` that it is part of.
 
     `row` and `column` are the place of the first row and column in `pixels` and `valid` (whether they have a value).
@@ -228,7 +228,9 @@ def _dem_height(heights, i, j, fu, fv, cubic_dem):
 
 
 @compiled
-def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resampling: Resampling, target: Target) -> int:
+def warp_block(
+    source: SourceWindow, lattice: Lattice, dem: DemWindow, resampling: Resampling, target: OutputWindow
+) -> int:
     """Make output pixels of one block.
 
     Returns
@@ -261,14 +263,26 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
                 begin, end = _span(columns, rows, low_col, high_col, low_row, high_row, done)
             if begin > done:
                 short += row_with_edges(
-                    kernel, resampling, source, columns[done:begin], rows[done:begin],
-                    out[:, line, start + done : start + begin], out_valid[:, line, start + done : start + begin],
-                )  # fmt: skip
+                    kernel,
+                    resampling,
+                    source,
+                    columns[done:begin],
+                    rows[done:begin],
+                    out[:, line, start + done : start + begin],
+                    out_valid[:, line, start + done : start + begin],
+                )
             for band in range(bands if end > begin else 0):
                 row_inside(
-                    kernel, resampling, pixels[band], columns[begin:end], rows[begin:end], left, top, scratch,
+                    kernel,
+                    resampling,
+                    pixels[band],
+                    columns[begin:end],
+                    rows[begin:end],
+                    left,
+                    top,
+                    scratch,
                     out[band, line, start + begin : start + end],
-                )  # fmt: skip
+                )
                 out_valid[band, line, start + begin : start + end] = True
             done = end
     return short
@@ -277,10 +291,13 @@ def warp_block(source: SourceWindow, lattice: Lattice, dem: DemWindow, resamplin
 @inlined
 def _scratch(count, pixels, real):
     return Scratch(
-        np.empty(count, dtype=np.uint64), np.empty(count, dtype=real.dtype), np.empty(count, dtype=real.dtype),
-        np.empty((4, count), dtype=pixels.dtype), np.empty((8, count), dtype=real.dtype),
+        np.empty(count, dtype=np.uint64),
         np.empty(count, dtype=real.dtype),
-    )  # fmt: skip
+        np.empty(count, dtype=real.dtype),
+        np.empty((4, count), dtype=pixels.dtype),
+        np.empty((8, count), dtype=real.dtype),
+        np.empty(count, dtype=real.dtype),
+    )
 
 
 @compiled

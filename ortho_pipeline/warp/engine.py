@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster.block_cache import limit_cache
-from ortho_pipeline.raster.far.ahead import AHEAD, ReadAhead, read_ahead
+from ortho_pipeline.raster.caching.block_cache import limit_cache
+from ortho_pipeline.raster.caching.read_ahead import AHEAD, ReadAhead, read_ahead
 from ortho_pipeline.raster.ortho import (
     Profile,
     RasterWriter,
@@ -35,10 +35,10 @@ from ortho_pipeline.raster.ortho import (
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.runtime.process_limits import thread_pool
 from ortho_pipeline.warp import kernels
-from ortho_pipeline.warp.block_kernel import DemWindow, Target, warp_block
+from ortho_pipeline.warp.block_kernel import DemWindow, OutputWindow, warp_block
 from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpRecord
-from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, Terrain, block_cells
-from ortho_pipeline.warp.layers.hiding import Hiding, Looked
+from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, TileHeights, block_cells
+from ortho_pipeline.warp.quality.hiding import Hiding, Looked
 
 #: Side of a tile, the piece of work of a thread, of few bands (`square_side`). What a tile is may not depend on memory
 #: or threads, which the order of blocks in a file would tell.
@@ -73,9 +73,16 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         if isinstance(path, Hiding):
             work.looked, path = path.begun(job.model, job.surface, grid, window), path.ortho
         writer = stack.enter_context(
-            RasterWriter(path, grid, profile, driver=job.driver, creation_options=job.creation_options,
-                         threads=threads, progress=progress)
-        )  # fmt: skip
+            RasterWriter(
+                path,
+                grid,
+                profile,
+                driver=job.driver,
+                creation_options=job.creation_options,
+                threads=threads,
+                progress=progress,
+            )
+        )
         mask = None if work.looked is None else stack.enter_context(work.looked.writer(job.driver, threads))
         tiles = list(_tiles(grid, square_side(profile, TILE)))
         for done, made in enumerate(_in_order(threads, work, tiles, ahead), start=1):
@@ -114,7 +121,9 @@ def tile_maker(job: WarpJob) -> TileMaker:
 def _check(job: WarpJob) -> None:
     job.check()
     if not 0 < job.tolerance < math.inf:
-        raise InputError("the tolerance is positive and finite", field="tolerance", remedy="0.01 px is the default")
+        raise InputError(
+            "the tolerance must be positive and finite", field="tolerance", remedy="the default is 0.01 px"
+        )
 
 
 def _tiles(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -167,9 +176,14 @@ class TileMaker:
         kernel, reach = KERNELS[job.resampling]
         self.source, self.surface, self.profile, self.window_bytes = source, job.surface, profile, window_bytes
         self.lattices = Lattices(
-            job.model, job.surface, job.grid, (source.width, source.height), tolerance=job.tolerance, reach=reach,
+            job.model,
+            job.surface,
+            job.grid,
+            (source.width, source.height),
+            tolerance=job.tolerance,
+            reach=reach,
             averages=job.resampling == "average",
-        )  # fmt: skip
+        )
         self.cubic_dem = job.dem_interpolation == "cubic"
         self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None)
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
@@ -179,7 +193,7 @@ class TileMaker:
 
     # -- a tile ------------------------------------------------------------------------------------------------------
 
-    def prepare(self, part: tuple[int, int, int, int]) -> tuple[Terrain, list[OutputBlock]]:
+    def prepare(self, part: tuple[int, int, int, int]) -> tuple[TileHeights, list[OutputBlock]]:
         """Find where the pixels of a tile (top, left, height, width) come from, and begin to read them if far away."""
         top, left, height, width = part
         blocks = [
@@ -187,7 +201,7 @@ class TileMaker:
             for row in range(top // BLOCK, -(-(top + height) // BLOCK))
             for column in range(left // BLOCK, -(-(left + width) // BLOCK))
         ]
-        terrain = Terrain(self.surface, self.cubic_dem, self.window_bytes)
+        terrain = TileHeights(self.surface, self.cubic_dem, self.window_bytes)
         seen = self.lattices.build(blocks, terrain)
         if isinstance(self.source, ReadAhead) and seen:
             together = self._together(seen)
@@ -197,7 +211,7 @@ class TileMaker:
         return terrain, seen
 
     def make(
-        self, part: tuple[int, int, int, int], prepared: Future[tuple[Terrain, list[OutputBlock]]] | None = None
+        self, part: tuple[int, int, int, int], prepared: Future[tuple[TileHeights, list[OutputBlock]]] | None = None
     ) -> Made:
         """Compute one tile (top, left, height, width)."""
         top, left, height, width = part
@@ -253,7 +267,9 @@ class TileMaker:
             if window is not None and within:
                 self._warp_block(block, self._window(*window, block.reach), dem, tile.target(block, cell))
 
-    def _warp_block(self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: Target) -> None:
+    def _warp_block(
+        self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: OutputWindow
+    ) -> None:
         # An array that threads shared would have them wait for each other's counts of its references.
         real = kernels.mixing(self.source.dtype)
         resampling = self.resampling._replace(reach=block.reach, box=block.box, real=real)
@@ -270,9 +286,15 @@ class TileMaker:
         if valid is not None:
             kernels.find_whole(valid, reach, whole)
         return kernels.SourceWindow(
-            pixels, np.ones((1, 1, 1), dtype=bool) if valid is None else valid, whole, masked, left, top, source.width,
+            pixels,
+            np.ones((1, 1, 1), dtype=bool) if valid is None else valid,
+            whole,
+            masked,
+            left,
+            top,
+            source.width,
             source.height,
-        )  # fmt: skip
+        )
 
     def _wider(self, window: kernels.SourceWindow, reach: int) -> kernels.SourceWindow:
         """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
@@ -291,10 +313,10 @@ class _Tile:
     pixels: NDArray[Any]
     valid: NDArray[np.bool_]
 
-    def target(self, block: OutputBlock, area: tuple[int, int, int, int]) -> Target:
-        """Return the place of a part of a block (see `Terrain.groups`); the last blocks of a grid reach beyond it."""
+    def target(self, block: OutputBlock, area: tuple[int, int, int, int]) -> OutputWindow:
+        """Return the window of a part of a block (see `TileHeights.groups`). The last blocks reach beyond the grid."""
         top, left = block.row * BLOCK - self.top, block.column * BLOCK - self.left
         _, height, width = self.pixels.shape
         first_row, last_row, first, last = area[0], min(area[1], height - top), area[2], min(area[3], width - left)
         place = top + first_row, left + first
-        return Target(first_row, last_row, first, last, *place, self.pixels, self.valid)
+        return OutputWindow(first_row, last_row, first, last, *place, self.pixels, self.valid)

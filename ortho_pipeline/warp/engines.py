@@ -9,7 +9,7 @@ from typing import Protocol
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.warp import engine, gdal_engine
 from ortho_pipeline.warp.job import WarpJob, WarpRecord
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 
 class Engine(Protocol):
@@ -41,5 +41,5 @@ def engine_of(name: str) -> Engine:
         If none has that name.
     """
     if name not in _ENGINES:
-        raise InputError(f"no engine is called {name!r}", field="output.engine", remedy=" or ".join(_ENGINES))
+        raise InputError(f"unknown engine {name!r}", field="output.engine", remedy=" or ".join(_ENGINES))
     return _ENGINES[name]

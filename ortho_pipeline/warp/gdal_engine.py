@@ -1,4 +1,4 @@
-"""GDAL's own warper as a second engine: slower, and a cross-check by a program that nobody here wrote.
+"""GDAL's own warper as a second engine: slower, and an independent check.
 
 One of GDAL's transformers stands for the sensor model: the one that expresses it, found by trying. How far it is off
 the exact model on the surface is measured through that transformer, at points of the ortho.
@@ -36,13 +36,13 @@ from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, first_line
 from ortho_pipeline.surface.base import Excerpt, Surface
 from ortho_pipeline.warp.job import WARPING, WarpJob, WarpRecord
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3
@@ -87,7 +87,7 @@ class Transformer:
 
     @property
     def limit(self) -> float:
-        """Largest error (px) with which it may stand for a model."""
+        """Largest error (px) with which it may represent a model."""
         return EXPRESSED if self.method.startswith("GCP") else REFUSE_ERROR
 
     def source(self, dataset: gdal.Dataset, bands: tuple[int, ...] = (1,)) -> gdal.Dataset:
@@ -107,10 +107,19 @@ class Transformer:
             return
         name = os.fspath(self.arrays)
         ortho.SetMetadata(
-            {"X_DATASET": name, "X_BAND": "1", "Y_DATASET": name, "Y_BAND": "2", "PIXEL_OFFSET": "0",
-             "LINE_OFFSET": "0", "PIXEL_STEP": "1", "LINE_STEP": "1", "GEOREFERENCING_CONVENTION": "PIXEL_CENTER"},
+            {
+                "X_DATASET": name,
+                "X_BAND": "1",
+                "Y_DATASET": name,
+                "Y_BAND": "2",
+                "PIXEL_OFFSET": "0",
+                "LINE_OFFSET": "0",
+                "PIXEL_STEP": "1",
+                "LINE_STEP": "1",
+                "GEOREFERENCING_CONVENTION": "PIXEL_CENTER",
+            },
             "GEOLOCATION",
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -165,18 +174,24 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
     begin = time.monotonic()
     if isinstance(path, Hiding):
         raise InputError(
-            "GDAL's warper does not look for what terrain hides", field="output.visibility",
+            "GDAL's warper cannot detect occlusions",
+            field="output.visibility",
             remedy=Text("leave out ", Setting("output.visibility"), " or ", Setting("output.engine", "gdal")),
-        )  # fmt: skip
+        )
     _check(job)
     source, profile, grid, threads = job.source, job.look(), job.grid, job.threads()
     # GDAL's warper reads in one of its threads.
     limit_cache(job.resources.memory, 1, source.block, job.surface.block)
     exact = Exact(job.model, job.surface, grid, (source.width, source.height))
     writer = RasterWriter(
-        path, grid, profile, driver=job.driver, creation_options=job.creation_options, threads=threads,
+        path,
+        grid,
+        profile,
+        driver=job.driver,
+        creation_options=job.creation_options,
+        threads=threads,
         progress=job.resources.progress,
-    )  # fmt: skip
+    )
     with writer, gdal_errors(path), contextlib.ExitStack() as scratch:
         arrays, target = writer.scratch("arrays"), writer.scratch("gdal")
         for temporary in (arrays, target):
@@ -206,22 +221,26 @@ def _check(job: WarpJob) -> None:
     job.check()
     if job.dem_interpolation != "bilinear":
         raise InputError(
-            "with GDAL's warper heights of the DEM are interpolated bilinearly", field="output.dem_interpolation",
+            "GDAL's warper interpolates the DEM bilinearly only",
+            field="output.dem_interpolation",
             remedy=Text("leave out ", Setting("output.dem_interpolation"), " or ", Setting("output.engine", "gdal")),
-        )  # fmt: skip
+        )
     if len(job.source.paths) > 1:
         raise InputError(
-            "GDAL's warper takes one file", file=job.source.paths[1], field="engine", remedy="use our own engine"
+            "GDAL's warper accepts only one file",
+            file=job.source.paths[1],
+            field="engine",
+            remedy="use the default engine",
         )
 
 
-# -- what stands for a model -------------------------------------------------------------------------------------------
+# -- transformers that represent a model -------------------------------------------------------------------------------
 
 
 def _standing(
     exact: Exact, exported: RpcExport | None, image: gdal.Dataset, arrays: Path, scratch: contextlib.ExitStack
 ) -> Transformer:
-    """Return the first transformer that stands for the model, with its error."""
+    """Return the first transformer that represents the model, with its error."""
     tried = []
     for candidate in _candidates(exact, exported, arrays, scratch):
         try:
@@ -233,9 +252,10 @@ def _standing(
             return replace(candidate, max_error_px=error)
         tried.append(f"{candidate.method}: {error:.3g} px off")
     raise InputError(
-        f"no transformer of GDAL stands for this model ({'; '.join(tried)})", field="output.engine",
-        remedy=Text("take our own engine (", Setting("output.engine", "ortho"), ")"),
-    )  # fmt: skip
+        f"none of GDAL's transformers represents this model ({'; '.join(tried)})",
+        field="output.engine",
+        remedy=Text("use the default engine (", Setting("output.engine", "ortho"), ")"),
+    )
 
 
 def _candidates(
@@ -323,9 +343,13 @@ def _create(path: Path, profile: Profile, grid: Grid) -> gdal.Dataset:
     """Create the raster that GDAL warps into; its last band is the mask, if the profile has one."""
     mask = profile.validity == "mask"
     return gdal.GetDriverByName("GTiff").Create(
-        os.fspath(path), grid.width, grid.height, profile.count + mask, _gdal_type(profile.dtype),
+        os.fspath(path),
+        grid.width,
+        grid.height,
+        profile.count + mask,
+        _gdal_type(profile.dtype),
         ["TILED=YES", "BIGTIFF=IF_SAFER"],
-    )  # fmt: skip
+    )
 
 
 def _describe(dataset: gdal.Dataset, profile: Profile) -> None:
@@ -360,7 +384,10 @@ def _warp_exactly(
         dstNodata=profile.nodata,
         multithread=threads > 1,
         warpMemoryLimit=job.resources.memory // 2,
-        warpOptions=[*settings, f"NUM_THREADS={threads}", "INIT_DEST=0" if profile.nodata is None else
-                     "INIT_DEST=NO_DATA"],
+        warpOptions=[
+            *settings,
+            f"NUM_THREADS={threads}",
+            "INIT_DEST=0" if profile.nodata is None else "INIT_DEST=NO_DATA",
+        ],
         callback=callback,
-    )  # fmt: skip
+    )

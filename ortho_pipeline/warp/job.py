@@ -51,7 +51,7 @@ class WarpJob:
     profile : Profile, optional
         What the ortho looks like; like its source without.
     exported : RpcExport, optional
-        The RPC that stands for the model (`rpc.export_rpc`), where there is one, for an engine that knows no other.
+        The RPC that represents the model (`rpc.export_rpc`), if there is one, for an engine that needs it.
     """
 
     model: SensorModel
@@ -81,17 +81,19 @@ class WarpJob:
         """Refuse an unknown kernel, and pixels that cannot be interpolated."""
         if self.resampling not in KERNELS:
             raise InputError(
-                f"no kernel is called {self.resampling!r}", field="resampling", remedy=f"one of {', '.join(KERNELS)}"
+                f"unknown resampling kernel {self.resampling!r}",
+                field="resampling",
+                remedy=f"one of {', '.join(KERNELS)}",
             )
         if self.dem_interpolation not in ("bilinear", "cubic"):
             raise InputError(
-                f"DEMs are not interpolated by {self.dem_interpolation!r}",
+                f"unknown DEM interpolation {self.dem_interpolation!r}",
                 field="dem-interpolation",
                 remedy="bilinear or cubic",
             )
         if self.source.dtype.kind in "iu" and self.source.dtype.itemsize == 8 and self.resampling != "nearest":
             raise InputError(
-                "integers of 64 bits are not interpolated without loss",
+                "64-bit integers cannot be interpolated without loss",
                 file=self.source.path,
                 field="resampling",
                 remedy=Text(
@@ -102,7 +104,7 @@ class WarpJob:
             )
         if self.source.palette and self.resampling != "nearest":
             raise InputError(
-                "the pixels are indices into a palette, which cannot be averaged",
+                "the pixels are palette indices, which cannot be averaged",
                 file=self.source.path,
                 field="resampling",
                 remedy=Text(
@@ -141,9 +143,9 @@ class WarpRecord(Record):
         if self.transformer != "GEOLOC_ARRAY" or took <= memory:
             return []
         text = Text(
-            f"GDAL's warper takes about {took / 1e6:.0f} MB for the arrays that stand for this model, beyond ",
+            f"GDAL's warper needs about {took / 1e6:.0f} MB for its geolocation arrays, beyond ",
             Setting("output.memory"),
-            f" {memory / 1e6:.0f}: make a smaller extent, or leave out ",
+            f" {memory / 1e6:.0f}: choose a smaller extent, or leave out ",
             Setting("output.engine", "gdal"),
         )
         return [Notice("memory-exceeded", text, bytes=took)]

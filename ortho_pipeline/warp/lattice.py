@@ -206,7 +206,7 @@ class Lattices:
         self._lock = threading.Lock()
         self.worst, self.finest, self.refined = 0.0, REFINEMENTS[0][0], 0
 
-    def build(self, blocks: list[OutputBlock], terrain: Terrain) -> list[OutputBlock]:
+    def build(self, blocks: list[OutputBlock], terrain: TileHeights) -> list[OutputBlock]:
         """Give each block that has terrain its lattice; return those that see the source."""
         uv = self._nodes_dem(blocks, REFINEMENTS[0][0])
         with_terrain = terrain.ranges(blocks, uv)
@@ -226,7 +226,7 @@ class Lattices:
 
     # -- lattices ----------------------------------------------------------------------------------------------------
 
-    def _lattices(self, blocks: list[OutputBlock], uv: Array, terrain: Terrain) -> list[OutputBlock]:
+    def _lattices(self, blocks: list[OutputBlock], uv: Array, terrain: TileHeights) -> list[OutputBlock]:
         """Give each block its lattice; return those that see the source."""
         if not blocks:
             return []
@@ -266,7 +266,7 @@ class Lattices:
         self._set(blocks, spacing, coefficients, image, uv)
         return self._bounds(blocks, image, coefficients, uv)
 
-    def _project(self, block: OutputBlock, terrain: Terrain) -> None:
+    def _project(self, block: OutputBlock, terrain: TileHeights) -> None:
         """Give a block the exact image points of all its pixels, each at its own height."""
         columns, rows = self._offsets([block], *_positions(1))
         heights = terrain.heights(block, self._exact.dem(columns, rows)[0])
@@ -326,7 +326,7 @@ class Lattices:
         return left < column + BLOCK and right > column and top < row + BLOCK and bottom > row
 
 
-class Terrain:
+class TileHeights:
     """The heights under one tile, read at once or, where memory is short, block by block."""
 
     def __init__(self, surface: Surface, cubic: bool, window_bytes: int) -> None:
@@ -423,7 +423,7 @@ def _extents(points: Array) -> list[list[float]]:
 
 
 def block_cells(spacing: int) -> Iterator[tuple[tuple[int, int, int, int], tuple[slice, slice]]]:
-    """Cut a block into cells for want of memory; yield the pixels of each (see `Terrain.groups`) and its nodes."""
+    """Cut a block into cells for want of memory; yield the pixels of each (see `TileHeights.groups`) and its nodes."""
     step = max(spacing, _CELL)
     for row in range(0, BLOCK, step):
         for column in range(0, BLOCK, step):

@@ -88,9 +88,18 @@ def _may_show(image, j, i, width, height, unknown):
 
 @compiled
 def bounds(
-    image: Any, coefficients: Any, dem: Any, cells: Any, spacing: int, points: Any, exact: Any, exact_dem: Any,
-    error: Any, apart: Any, step: Any,
-) -> None:  # fmt: skip
+    image: Any,
+    coefficients: Any,
+    dem: Any,
+    cells: Any,
+    spacing: int,
+    points: Any,
+    exact: Any,
+    exact_dem: Any,
+    error: Any,
+    apart: Any,
+    step: Any,
+) -> None:
     """Fill `error` ``(blocks,)`` with a bound (source px) on the error in the visible cells of each block.
 
     And `apart` ``(blocks,)`` with the part of it that second differences tell, which the distance of nodes makes.
@@ -114,9 +123,10 @@ def bounds(
         for k in range(points.shape[1]):
             rest = _worse(
                 rest,
-                _unexplained(coefficients[b], dem[b], cells[b], spacing, points[b, k], exact[b, k], exact_dem[b, k],
-                             parallax),
-            )  # fmt: skip
+                _unexplained(
+                    coefficients[b], dem[b], cells[b], spacing, points[b, k], exact[b, k], exact_dem[b, k], parallax
+                ),
+            )
         apart[b] = plan + parallax * shift
         error[b] = apart[b] + _TRUST * rest
         if not error[b] < np.inf:

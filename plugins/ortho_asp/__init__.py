@@ -81,9 +81,11 @@ def open_scene(dataset: gdal.Dataset, *, camera: str | None = None, adjust: str 
     kind = None if path is None else _kind(path)
     if path is None or kind is None:
         raise InputError(
-            "there is no camera of this kind" + ("" if path is None else " in this file"), file=path or name,
-            field="camera", remedy="give the CSM state, .tsai or ASTER camera as camera=FILE",
-        )  # fmt: skip
+            "there is no camera of this kind" + ("" if path is None else " in this file"),
+            file=path or name,
+            field="camera",
+            remedy="give the CSM state, .tsai or ASTER camera as camera=FILE",
+        )
     model: SensorModel = (
         read_csm(path) if kind == "csm" else read_tsai(path, size) if kind == "tsai" else read_aster(path)
     )

@@ -81,11 +81,17 @@ def read_tsai(path: PathLike[str], size: tuple[int, int]) -> FrameCamera:
     # Different focal lengths of the axes are different pitches here; from the first centre to its outer corner.
     pitch_y, (width, height) = pitch * fu / fv, size
     interior = Interior(
-        width, height, fu, pitch, pitch_y,
-        x0=(cu / pitch + 0.5 - width / 2) * pitch, y0=(height / 2 - cv / pitch - 0.5) * pitch_y,
-    )  # fmt: skip
-    model = FrameCamera.from_geocentric(interior, centre, np.diag([1.0, -1.0, -1.0]) @ turn.T,
-                                        heights=heights_below(centre, HEIGHTS))  # fmt: skip
+        width,
+        height,
+        fu,
+        pitch,
+        pitch_y,
+        x0=(cu / pitch + 0.5 - width / 2) * pitch,
+        y0=(height / 2 - cv / pitch - 0.5) * pitch_y,
+    )
+    model = FrameCamera.from_geocentric(
+        interior, centre, np.diag([1.0, -1.0, -1.0]) @ turn.T, heights=heights_below(centre, HEIGHTS)
+    )
     require_view(model)
     return model
 
@@ -158,9 +164,10 @@ def adjusted(model: SensorModel, translation: Array, rotation: Array) -> SensorM
         origin = rotation @ (model.origin - first) + first + translation
         return replace(model, origin=origin, orbital=rotation @ model.orbital)
     raise InputError(
-        f"an adjustment of a model of kind {model.kind!r} is not read", field="adjust",
+        f"an adjustment of a model of kind {model.kind!r} is not read",
+        field="adjust",
         remedy="give the adjusted camera, which bundle_adjust writes too",
-    )  # fmt: skip
+    )
 
 
 def _turns(own: Array, world: Array) -> Array | None:

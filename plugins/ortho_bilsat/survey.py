@@ -15,9 +15,17 @@ CAMERAS = ("PAN", "XS-BLUE", "XS-GREEN", "XS-RED", "XS-NIR")
 MAX_BYTES = 100_000
 #: How many numbers each key has; those in OPTIONAL may be missing.
 NUMBERS = {
-    "position_m": 3, "velocity_m_s": 3, "attitude_deg": 3, "focal_length_mm": 1, "pixel_pitch_um": 1, "columns": 1,
-    "rows": 1, "position_sigma_m": 1, "attitude_sigma_deg": 1, "heights_m": 2,
-}  # fmt: skip
+    "position_m": 3,
+    "velocity_m_s": 3,
+    "attitude_deg": 3,
+    "focal_length_mm": 1,
+    "pixel_pitch_um": 1,
+    "columns": 1,
+    "rows": 1,
+    "position_sigma_m": 1,
+    "attitude_sigma_deg": 1,
+    "heights_m": 2,
+}
 TEXTS = ("scene", "camera", "acquired")
 OPTIONAL = ("attitude_deg", "position_sigma_m", "attitude_sigma_deg", "heights_m")
 HEIGHTS = (-500.0, 9000.0)

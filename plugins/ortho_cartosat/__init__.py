@@ -28,14 +28,21 @@ HEIGHTS = (-500.0, 9000.0)
 #: The RPC that GDAL finds and the one used here are called different beyond this (px).
 DISAGREEMENT = 1.0
 FACTS = {
-    "product_id": "ProductID", "satellite": "SatID", "camera": "Sensor", "date_of_pass": "DateOfPass",
-}  # fmt: skip
+    "product_id": "ProductID",
+    "satellite": "SatID",
+    "camera": "Sensor",
+    "date_of_pass": "DateOfPass",
+}
 NUMBERS = {
-    "altitude_km": "SatelliteAltitude", "heading_deg": "SatelliteHeadingAngle",
-    "along_track_deg": "ViewAngleAlongTrack", "across_track_deg": "ViewAngleAcrossTrack",
-    "pixel_along_m": "InputResolutionAlong", "pixel_across_m": "InputResolutionAcross",
-    "sun_azimuth_deg": "SunAzimuthAtCenter", "sun_elevation_deg": "SunElevationAtCenter",
-}  # fmt: skip
+    "altitude_km": "SatelliteAltitude",
+    "heading_deg": "SatelliteHeadingAngle",
+    "along_track_deg": "ViewAngleAlongTrack",
+    "across_track_deg": "ViewAngleAcrossTrack",
+    "pixel_along_m": "InputResolutionAlong",
+    "pixel_across_m": "InputResolutionAcross",
+    "sun_azimuth_deg": "SunAzimuthAtCenter",
+    "sun_elevation_deg": "SunElevationAtCenter",
+}
 
 
 @hookimpl

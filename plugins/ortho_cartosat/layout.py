@@ -76,9 +76,11 @@ def view_of(image: str | PathLike[str], metadata: Metadata) -> str | None:
     by_name, by_text = None if named is None else _VIEW[named[2].lower()], metadata.view
     if by_name and by_text and by_name != by_text:
         raise InputError(
-            f"the name of the image says {by_name}, the metadata {by_text}", file=metadata.path, field="Sensor",
+            f"the name of the image says {by_name}, the metadata {by_text}",
+            file=metadata.path,
+            field="Sensor",
             remedy="put the files of each image together again, or say which one it is with the option view",
-        )  # fmt: skip
+        )
     return by_text or by_name
 
 
@@ -109,8 +111,10 @@ def _is_partner(candidate: Path, metadata: Metadata) -> bool:
     try:
         other = read_metadata(path)
         views = {view_of(candidate, other), metadata.view}
-        return other.is_cartosat1 and len(views) == 2 and all(
-            other.text(key) == metadata.text(key) for key in ("DateOfPass", "Path", "Row")
-        )  # fmt: skip
+        return (
+            other.is_cartosat1
+            and len(views) == 2
+            and all(other.text(key) == metadata.text(key) for key in ("DateOfPass", "Path", "Row"))
+        )
     except InputError:
         return False

@@ -85,11 +85,16 @@ def pushbroom(
     nominal = size[0] == COLUMNS
     middle = np.full((4, 1), min(max(0.0, heights[0]), heights[1]))
     return pushbroom_of_metadata(
-        np.hstack([corners, middle]), *size, altitude=altitude, along_deg=_tilt(metadata, view),
+        np.hstack([corners, middle]),
+        *size,
+        altitude=altitude,
+        along_deg=_tilt(metadata, view),
         across_deg=metadata.number("ViewAngleAcrossTrack", low=-60, high=60) or 0.0,
-        focal_length=FOCAL_LENGTH if nominal else None, pixel_size=PIXEL_SIZE if nominal else None, heights=heights,
+        focal_length=FOCAL_LENGTH if nominal else None,
+        pixel_size=PIXEL_SIZE if nominal else None,
+        heights=heights,
         sigmas=sigmas,
-    )  # fmt: skip
+    )
 
 
 def _tilt(metadata: Metadata, view: str) -> float:

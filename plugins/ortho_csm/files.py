@@ -18,7 +18,7 @@ import numpy as np
 
 from ortho_csm.frame import frame_fields, read_frame
 from ortho_csm.line_scanner import line_scanner_fields, read_line_scanner
-from ortho_csm.state import REMEDY, State
+from ortho_csm.state import REMEDY, StateFields
 from ortho_pipeline.plugin import (
     FrameCamera,
     InputError,
@@ -66,13 +66,14 @@ def read_csm(path: str | PathLike[str]) -> SensorModel:
     name, _, body = data.partition(b"\n")
     if name.strip() not in [one.encode() for one in _NAMES]:
         raise InputError(
-            f"this is not a CSM state of a line scanner or a frame: it begins with {name[:40]!r}", file=path,
+            f"this is not a CSM state of a line scanner or a frame: it begins with {name[:40]!r}",
+            file=path,
             remedy=REMEDY,
-        )  # fmt: skip
+        )
     fields = parse_json(body, path, REMEDY)
     if not isinstance(fields, dict):
         raise InputError("a state is a JSON object", file=path, remedy=REMEDY)
-    state = State(fields, path)
+    state = StateFields(fields, path)
     state.require_earth()
     try:
         return read_line_scanner(state) if name.strip().decode() == LINE_SCANNER else read_frame(state)
@@ -92,27 +93,30 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
     """
     if isinstance(model, Pushbroom):
         name, fields = LINE_SCANNER, line_scanner_fields(model)
-        again: SensorModel = read_line_scanner(State(fields, "state"))
+        again: SensorModel = read_line_scanner(StateFields(fields, "state"))
         size = model.camera.size
     elif isinstance(model, FrameCamera):
         name, fields = FRAME, frame_fields(model)
-        again, size = read_frame(State(fields, "state")), (model.interior.width, model.interior.height)
+        again, size = read_frame(StateFields(fields, "state")), (model.interior.width, model.interior.height)
     else:
         raise InputError(
-            f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one", field="formats",
+            f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one",
+            field="formats",
             remedy=Text(
-                "take a rigorous model, adjusted by its own parameters (", Setting("points.correction", "model"),
-                "), or another format"
+                "take a rigorous model, adjusted by its own parameters (",
+                Setting("points.correction", "model"),
+                "), or another format",
             ),
-        )  # fmt: skip
+        )
     # What refraction does at other heights a state cannot have: stated, but no reason to refuse it.
     middle = _apart(model, again, size, (model.reference_height - 1.0, model.reference_height + 1.0))
     worst = max(middle, _apart(model, again, size, model.height_range))
     if not middle <= CLOSE and not force:
         raise InputError(
-            f"the state would be {middle:.2g} px off the model, whose lens it cannot have", field="formats",
+            f"the state would be {middle:.2g} px off the model, whose lens it cannot have",
+            field="formats",
             remedy=Text("accept it with ", Setting("force"), ", or write an RPC"),
-        )  # fmt: skip
+        )
     return f"{name}\n{json.dumps({'m_modelName': name, **fields}, indent=2, sort_keys=True)}\n", worst
 
 

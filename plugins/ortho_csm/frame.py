@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_csm.state import State
+from ortho_csm.state import StateFields
 from ortho_pipeline.plugin import (
     ECCENTRICITY_SQUARED,
     GEOGRAPHIC,
@@ -36,7 +36,7 @@ HEIGHTS = (-500.0, 9000.0)
 _OURS_FROM_THEIRS = np.diag([1.0, -1.0, -1.0])
 
 
-def read_frame(state: State) -> FrameCamera:
+def read_frame(state: StateFields) -> FrameCamera:
     """Make a frame camera of a state."""
     width, height = state.size()
     if any(state.radial()):

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ortho_csm.state import State
+from ortho_csm.state import StateFields
 from ortho_pipeline.plugin import (
     ECCENTRICITY_SQUARED,
     SEMI_MAJOR,
@@ -43,7 +43,7 @@ _COLUMNS, _EXACT = 33, 1e-7
 _QUATERNIONS, _POSITIONS = "m_quaternions", "m_positions"
 
 
-def read_line_scanner(state: State) -> Pushbroom:
+def read_line_scanner(state: StateFields) -> Pushbroom:
     """Make a line scanner of a state; free are offsets and drifts of its attitude."""
     columns, rows = state.size()
     if state.numbers("m_currentParameterValue").any():
@@ -66,7 +66,7 @@ def read_line_scanner(state: State) -> Pushbroom:
     return model
 
 
-def _times(state: State) -> tuple[float, float]:
+def _times(state: StateFields) -> tuple[float, float]:
     """Return the time of the upper edge of the first row and seconds per row."""
     lines, starts, periods = (state.numbers(name) for name in ("m_intTimeLines", "m_intTimeStartTimes", "m_intTimes"))
     if not 1 <= len(lines) == len(starts) == len(periods) <= 100_000 or not (np.diff(lines) > 0).all():
@@ -81,7 +81,7 @@ def _times(state: State) -> tuple[float, float]:
     return float(starts[0] + period * (0.5 - lines[0])), period
 
 
-def _camera(state: State, columns: int, rows: int) -> tuple[Array, LineCamera]:
+def _camera(state: StateFields, columns: int, rows: int) -> tuple[Array, LineCamera]:
     """Return the rotation from our axes (x along growing columns) to the camera of the state, and the line camera."""
     sample, line = state.numbers("m_iTransS", 3), state.numbers("m_iTransL", 3)
     plane = np.array([line[1:], sample[1:]])
@@ -110,7 +110,7 @@ def _camera(state: State, columns: int, rows: int) -> tuple[Array, LineCamera]:
     return turn, LineCamera.of_table(columns, rows, at, look[:, 0], look[:, 1])
 
 
-def _table(state: State, field: str, width: int, what: str) -> tuple[Array, Array]:
+def _table(state: StateFields, field: str, width: int, what: str) -> tuple[Array, Array]:
     values = state.numbers(field)
     step = state.number(f"m_dt{what}")
     if len(values) % width or len(values) < 4 * width or not 0 < step < 1e4:
@@ -138,32 +138,61 @@ def line_scanner_fields(model: Pushbroom) -> dict[str, Any]:
     gsd = distance / line.focal
     return {
         **_FIXED,
-        "m_nLines": camera.height, "m_nSamples": camera.width,
-        "m_intTimeLines": [1.0], "m_intTimeStartTimes": [0.5 * model.line_period], "m_intTimes": [model.line_period],
-        "m_t0Ephem": low, "m_dtEphem": float(places_at[1] - places_at[0]), "m_numPositions": 3 * len(places_at),
+        "m_nLines": camera.height,
+        "m_nSamples": camera.width,
+        "m_intTimeLines": [1.0],
+        "m_intTimeStartTimes": [0.5 * model.line_period],
+        "m_intTimes": [model.line_period],
+        "m_t0Ephem": low,
+        "m_dtEphem": float(places_at[1] - places_at[0]),
+        "m_numPositions": 3 * len(places_at),
         "m_positions": flight.positions(places_at, 0).ravel().tolist(),
         "m_velocities": flight.positions(places_at, 1).ravel().tolist(),
-        "m_t0Quat": float(turned_at[0]), "m_dtQuat": float(turned_at[1] - turned_at[0]),
-        "m_numQuaternions": 4 * len(turned_at), "m_quaternions": _quaternions(turns).ravel().tolist(),
-        "m_focalLength": line.focal, "m_detectorSampleOrigin": line.middle, "m_detectorLineOrigin": -line.along,
+        "m_t0Quat": float(turned_at[0]),
+        "m_dtQuat": float(turned_at[1] - turned_at[0]),
+        "m_numQuaternions": 4 * len(turned_at),
+        "m_quaternions": _quaternions(turns).ravel().tolist(),
+        "m_focalLength": line.focal,
+        "m_detectorSampleOrigin": line.middle,
+        "m_detectorLineOrigin": -line.along,
         "m_opticalDistCoeffs": list(line.radial),
-        "m_minElevation": model.heights[0], "m_maxElevation": model.heights[1],
-        "m_majorAxis": SEMI_MAJOR, "m_minorAxis": minor, "m_referencePointXyz": place.tolist(),
-        "m_gsd": gsd, "m_halfSwath": gsd * camera.width / 2, "m_halfTime": abs(duration) / 2,
+        "m_minElevation": model.heights[0],
+        "m_maxElevation": model.heights[1],
+        "m_majorAxis": SEMI_MAJOR,
+        "m_minorAxis": minor,
+        "m_referencePointXyz": place.tolist(),
+        "m_gsd": gsd,
+        "m_halfSwath": gsd * camera.width / 2,
+        "m_halfTime": abs(duration) / 2,
         "m_flyingHeight": distance,
-    }  # fmt: skip
+    }
 
 
 #: What is the same for every state that is written.
 _FIXED: dict[str, Any] = {
-    "m_imageIdentifier": "", "m_sensorName": "ortho-pipeline", "m_sensorIdentifier": "", "m_platformIdentifier": "",
-    "m_focalLengthEpsilon": 0.0, "m_zDirection": 1.0, "m_platformFlag": 1, "m_ikCode": 0,
-    "m_detectorSampleSumming": 1.0, "m_detectorLineSumming": 1.0, "m_startingDetectorSample": 0.0,
-    "m_startingDetectorLine": 0.0, "m_iTransS": [0.0, 1.0, 0.0], "m_iTransL": [0.0, 0.0, 1.0],
-    "m_distortionType": 0, "m_startingEphemerisTime": 0.0,
-    "m_centerEphemerisTime": 0.0, "m_currentParameterValue": [0.0] * 16, "m_parameterType": [2] * 16,
-    "m_covariance": np.eye(16).ravel().tolist(), "m_sunPosition": [0.0] * 3, "m_sunVelocity": [0.0] * 3,
-}  # fmt: skip
+    "m_imageIdentifier": "",
+    "m_sensorName": "ortho-pipeline",
+    "m_sensorIdentifier": "",
+    "m_platformIdentifier": "",
+    "m_focalLengthEpsilon": 0.0,
+    "m_zDirection": 1.0,
+    "m_platformFlag": 1,
+    "m_ikCode": 0,
+    "m_detectorSampleSumming": 1.0,
+    "m_detectorLineSumming": 1.0,
+    "m_startingDetectorSample": 0.0,
+    "m_startingDetectorLine": 0.0,
+    "m_iTransS": [0.0, 1.0, 0.0],
+    "m_iTransL": [0.0, 0.0, 1.0],
+    "m_distortionType": 0,
+    "m_startingEphemerisTime": 0.0,
+    "m_centerEphemerisTime": 0.0,
+    "m_currentParameterValue": [0.0] * 16,
+    "m_parameterType": [2] * 16,
+    "m_covariance": np.eye(16).ravel().tolist(),
+    "m_sunPosition": [0.0] * 3,
+    "m_sunVelocity": [0.0] * 3,
+}
 
 
 def _sites(model: Pushbroom) -> Array:

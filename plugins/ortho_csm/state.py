@@ -13,7 +13,7 @@ MOST_VALUES = 2_000_000
 REMEDY = "write the state again with the program that it is of"
 
 
-class State:
+class StateFields:
     """The fields of a state, each with an error that names file and field."""
 
     def __init__(self, fields: dict[str, Any], path: str | PathLike[str]) -> None:

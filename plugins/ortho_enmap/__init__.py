@@ -35,10 +35,17 @@ MAX_SIZE = 20_000_000
 MOST_BANDS = 300
 _DETECTORS = ("VNIR", "SWIR")
 _SCALARS = {
-    "ROW_OFF": "LINE_OFF", "COL_OFF": "SAMP_OFF", "LAT_OFF": "LAT_OFF", "LONG_OFF": "LONG_OFF",
-    "HEIGHT_OFF": "HEIGHT_OFF", "ROW_SCALE": "LINE_SCALE", "COL_SCALE": "SAMP_SCALE", "LAT_SCALE": "LAT_SCALE",
-    "LONG_SCALE": "LONG_SCALE", "HEIGHT_SCALE": "HEIGHT_SCALE",
-}  # fmt: skip
+    "ROW_OFF": "LINE_OFF",
+    "COL_OFF": "SAMP_OFF",
+    "LAT_OFF": "LAT_OFF",
+    "LONG_OFF": "LONG_OFF",
+    "HEIGHT_OFF": "HEIGHT_OFF",
+    "ROW_SCALE": "LINE_SCALE",
+    "COL_SCALE": "SAMP_SCALE",
+    "LAT_SCALE": "LAT_SCALE",
+    "LONG_SCALE": "LONG_SCALE",
+    "HEIGHT_SCALE": "HEIGHT_SCALE",
+}
 _TERMS = {
     "ROW_NUM": "LINE_NUM_COEFF",
     "ROW_DEN": "LINE_DEN_COEFF",
@@ -169,9 +176,11 @@ def _of_detector(
     its = rpcs[:visible] if detector == "VNIR" else rpcs[visible:]
     if bands != len(its):
         raise InputError(
-            f"the image has {bands} bands, the metadata {len(its)} of {detector}", file=path, field="channels",
+            f"the image has {bands} bands, the metadata {len(its)} of {detector}",
+            file=path,
+            field="channels",
             remedy="give the image with all its bands",
-        )  # fmt: skip
+        )
     return its
 
 

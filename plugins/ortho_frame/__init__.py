@@ -78,11 +78,13 @@ def open_scene(
         given = {"camera": camera, "exterior": exterior, "vertical": vertical}
         missing = [key for key, value in given.items() if not value]
         raise InputError(
-            f"a frame image needs {', '.join(missing)}", file=name, field=missing[0],
-            remedy=Text.joined("; ", (
-                Text(Setting("scene.sensor_options", "...", key=key), f" ({OPTIONS[key]})") for key in missing
-            )),
-        )  # fmt: skip
+            f"a frame image needs {', '.join(missing)}",
+            file=name,
+            field=missing[0],
+            remedy=Text.joined(
+                "; ", (Text(Setting("scene.sensor_options", "...", key=key), f" ({OPTIONS[key]})") for key in missing)
+            ),
+        )
     if refraction not in ("yes", "no"):
         raise InputError(f"{refraction!r} is neither yes nor no", field="refraction")
     pose = read_exterior(exterior, name)

@@ -28,11 +28,23 @@ MAX_JSON_BYTES = 200_000_000
 #: Columns of a table, by the ways to write them; the first of each is the name in messages.
 MAP_COLUMNS = (("x",), ("y",), ("z",), ("omega",), ("phi",), ("kappa",))
 GEOGRAPHIC_COLUMNS = (
-    ("lon", "longitude"), ("lat", "latitude"), ("alt", "altitude", "height", "h"), ("roll",), ("pitch",), ("yaw",),
-)  # fmt: skip
+    ("lon", "longitude"),
+    ("lat", "latitude"),
+    ("alt", "altitude", "height", "h"),
+    ("roll",),
+    ("pitch",),
+    ("yaw",),
+)
 CAMERA_KEYS = {
-    "name", "width", "height", "focal_length_mm", "sensor_mm", "pixel_pitch_um", "principal_point_mm", "distortion",
-}  # fmt: skip
+    "name",
+    "width",
+    "height",
+    "focal_length_mm",
+    "sensor_mm",
+    "pixel_pitch_um",
+    "principal_point_mm",
+    "distortion",
+}
 DISTORTION_KEYS = ("k1", "k2", "k3", "p1", "p2")
 
 
@@ -172,9 +184,16 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
     c_x, c_y = (_number(path, key, camera.get(key, 0.0)) for key in ("c_x", "c_y"))
     # Its y points down; different focal lengths of the axes are different pitches here.
     return _interior(
-        path, width, height, focal_x * size, 1e-6, 1e-6 * focal_x / focal_y,
-        x0=c_x * size, y0=-c_y * size * focal_x / focal_y, **brown,
-    )  # fmt: skip
+        path,
+        width,
+        height,
+        focal_x * size,
+        1e-6,
+        1e-6 * focal_x / focal_y,
+        x0=c_x * size,
+        y0=-c_y * size * focal_x / focal_y,
+        **brown,
+    )
 
 
 def _interior(path: str | PathLike[str], width: float, height: float, *values: float, **others: float) -> Interior:
@@ -251,9 +270,11 @@ def _shot(path: str | PathLike[str], image: Path) -> Shot:
     shot, place = _object(_object(part, "shots"), name), part.get("reference_lla")
     if not isinstance(place, dict):
         raise InputError(
-            "the reconstruction does not lie on the Earth", file=path, field="reference_lla",
+            "the reconstruction does not lie on the Earth",
+            file=path,
+            field="reference_lla",
             remedy="give the georeferenced reconstruction.json, or a table (docs/formats/frame.md)",
-        )  # fmt: skip
+        )
     keys = ("longitude", "latitude", "altitude")
     lon, lat, altitude = (_number(path, f"reference_lla.{key}", place.get(key)) for key in keys)
     if not (abs(lon) <= 360 and abs(lat) <= 90):

@@ -14,7 +14,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_ikonos.metadata import Component, Delivery, SourceImage, read_metadata
-from ortho_ikonos.order import ImageFile, Position, bands_of, position_of, rpc_file
+from ortho_ikonos.order import OrderImage, Position, bands_of, position_of, rpc_file
 from ortho_pipeline.plugin import (
     RPC,
     InputError,
@@ -66,7 +66,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 def recognises(dataset: gdal.Dataset) -> bool:
     """Tell whether it is named like an image of an order whose metadata, which lie beside it, are of IKONOS."""
-    image = ImageFile.of(place(dataset.GetDescription()))
+    image = OrderImage.of(place(dataset.GetDescription()))
     if image is None:
         return False
     try:
@@ -86,7 +86,7 @@ def open_scene(
 ) -> Scene:
     """Open an image of an IKONOS order."""
     path = place(dataset.GetDescription())
-    image = ImageFile.of(path)
+    image = OrderImage.of(path)
     if image is None and (metadata is None or bands != "one"):
         raise InputError(
             "this is not a name of an image of an order", file=path, field="metadata",
@@ -204,7 +204,7 @@ def _priors(models: Mapping[str, SensorModel]) -> dict[str, Prior]:
 
 
 def _pieces(
-    image: ImageFile, delivery: Delivery, component: Component, position: Position, with_models: bool
+    image: OrderImage, delivery: Delivery, component: Component, position: Position, with_models: bool
 ) -> tuple[tuple[Piece, ...], list[Notice]]:
     """Return the other files of the acquisition, of the same plane and maybe other pixels, and what is wrong."""
     found: list[Piece] = []
@@ -266,7 +266,7 @@ def _disagreement(models: dict[str, SensorModel]) -> list[Notice]:
 
 
 def _facts(
-    image: ImageFile | None,
+    image: OrderImage | None,
     delivery: Delivery,
     component: Component,
     source: SourceImage,

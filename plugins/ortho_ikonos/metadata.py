@@ -31,7 +31,7 @@ PIXELS = ("", "pixel", "pixels")
 
 
 @dataclass(frozen=True)
-class Entry:
+class MetadataLine:
     """One line ``key: value`` and the headings above it."""
 
     line: int
@@ -41,12 +41,12 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Record:
+class SectionRecord:
     """The entries of one record of a section, looked up by key wherever they are nested."""
 
     file: str
     name: str
-    entries: tuple[Entry, ...]
+    entries: tuple[MetadataLine, ...]
 
     def text(self, *keys: str) -> str | None:
         """Return the value of the first of these keys that is there and not empty; None without.
@@ -61,9 +61,11 @@ class Record:
             if len({entry.value for entry in found}) > 1:
                 lines = ", ".join(str(entry.line) for entry in found)
                 raise InputError(
-                    f"this key stands in lines {lines} with different values", file=self.file,
-                    field=f"{self.name}: {key}", remedy="remove the wrong one",
-                )  # fmt: skip
+                    f"this key stands in lines {lines} with different values",
+                    file=self.file,
+                    field=f"{self.name}: {key}",
+                    remedy="remove the wrong one",
+                )
             if found:
                 return found[0].value
         return None
@@ -98,9 +100,11 @@ class Record:
         value = self.number(*keys, units=units, low=0, high=1e7)
         if value is not None and value != int(value):
             raise InputError(
-                f"{value} is not whole number", file=self.file, field=f"{self.name}: {keys[0]}",
+                f"{value} is not whole number",
+                file=self.file,
+                field=f"{self.name}: {keys[0]}",
                 remedy="correct the file",
-            )  # fmt: skip
+            )
         return None if value is None else int(value)
 
 
@@ -124,7 +128,7 @@ class SourceImage:
 
 
 @dataclass(frozen=True)
-class Placement:
+class MapPlacement:
     """How an image lies on the map; None for what the file does not say.
 
     `upper_left` is the map position of the *centre* of the first pixel, `size` columns and rows.
@@ -135,9 +139,9 @@ class Placement:
     size: tuple[int, int] | None
     reference_height: float | None = None
 
-    def completed_by(self, other: Placement) -> Placement:
+    def completed_by(self, other: MapPlacement) -> MapPlacement:
         """Return this placement with what it does not say taken from another."""
-        return Placement(
+        return MapPlacement(
             self.upper_left or other.upper_left,
             self.pixel or other.pixel,
             self.size or other.size,
@@ -151,7 +155,7 @@ class Component:
 
     component: str
     product_image: str
-    placement: Placement
+    placement: MapPlacement
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ class Delivery:
     bits: int | None
     projection: str | None
     crs: str | None
-    product: Placement
+    product: MapPlacement
     sources: tuple[SourceImage, ...]
     components: tuple[Component, ...]
     notes: tuple[Notice, ...] = ()
@@ -188,12 +192,15 @@ class Delivery:
             known = ", ".join(one.component for one in self.components[:10])
             problem = "no component" if not found else "more than one component"
             raise InputError(
-                f"{problem} is called {name} (there are {known or 'none'})" if name is not None
+                f"{problem} is called {name} (there are {known or 'none'})"
+                if name is not None
                 else f"the name of the image does not say which component it is (there are {known or 'none'})",
-                file=self.file, field=f"{COMPONENTS}: Component ID",
-                remedy="give the metadata file that belongs to this image" if name is not None
+                file=self.file,
+                field=f"{COMPONENTS}: Component ID",
+                remedy="give the metadata file that belongs to this image"
+                if name is not None
                 else "name the image po_<order>_<band>_<component of 7 digits>.tif",
-            )  # fmt: skip
+            )
         return found[0]
 
     def source_of(self, component: Component) -> SourceImage:
@@ -209,8 +216,10 @@ class Delivery:
             raise InputError(
                 f"component {component.component} is of product image {component.product_image}, which "
                 f"{'no source image has' if not found else 'several source images have'}",
-                file=self.file, field=f"{SOURCES}: Product Image ID", remedy="ask for the whole metadata file",
-            )  # fmt: skip
+                file=self.file,
+                field=f"{SOURCES}: Product Image ID",
+                remedy="ask for the whole metadata file",
+            )
         return found[0]
 
 
@@ -259,7 +268,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
 
 
 @reads("copy the _hdr.txt again from the delivery")
-def read_header(path: str | PathLike[str]) -> Placement:
+def read_header(path: str | PathLike[str]) -> MapPlacement:
     """Read how an image lies on the map from its ``_hdr.txt``; its keys are those of a component.
 
     Raises
@@ -268,7 +277,7 @@ def read_header(path: str | PathLike[str]) -> Placement:
         As `read_metadata`.
     """
     entries = tuple(_entries(_lines(str(path), _text(path))))
-    return _placement(Record(str(path), "header", entries))
+    return _placement(SectionRecord(str(path), "header", entries))
 
 
 # -- text ------------------------------------------------------------------------------------------------------------
@@ -298,7 +307,7 @@ def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:
             yield number, line.expandtabs(3)
 
 
-def _sections(path: str, text: str) -> dict[str, list[Record]]:
+def _sections(path: str, text: str) -> dict[str, list[SectionRecord]]:
     """Return by title the records of each section; the first is what stands before any record."""
     blocks: list[list[tuple[int, str]]] = [[]]
     for number, line in _lines(path, text):
@@ -307,21 +316,23 @@ def _sections(path: str, text: str) -> dict[str, list[Record]]:
                 blocks.append([])
         else:
             blocks[-1].append((number, line))
-    sections: dict[str, list[Record]] = {}
+    sections: dict[str, list[SectionRecord]] = {}
     for block in blocks:
         if not block or ":" in block[0][1]:
             continue
         number, title = block[0][0], " ".join(block[0][1].split())
         if title in sections:
             raise InputError(
-                f"this section stands there twice, again in line {number}", file=path, field=title[:60],
+                f"this section stands there twice, again in line {number}",
+                file=path,
+                field=title[:60],
                 remedy="remove one of them",
-            )  # fmt: skip
+            )
         sections[title] = _split(path, title, list(_entries(iter(block[1:]))))
     return sections
 
 
-def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[Entry]:
+def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[MetadataLine]:
     above: list[tuple[int, str]] = []
     for number, line in lines:
         depth = len(line) - len(line.lstrip())
@@ -329,35 +340,41 @@ def _entries(lines: Iterator[tuple[int, str]]) -> Iterator[Entry]:
             above.pop()
         key, colon, value = (" ".join(part.split()) for part in line.partition(":"))
         if colon:
-            yield Entry(number, tuple(name for _, name in above), key, value)
+            yield MetadataLine(number, tuple(name for _, name in above), key, value)
         above.append((depth, " ".join(line.split())))
 
 
-def _split(path: str, title: str, entries: list[Entry]) -> list[Record]:
+def _split(path: str, title: str, entries: list[MetadataLine]) -> list[SectionRecord]:
     starts = [0, *(k for k, entry in enumerate(entries) if entry.key in RECORDS and not entry.groups), len(entries)]
     records = []
     for k, (start, end) in enumerate(itertools.pairwise(starts)):
         name = title if k == 0 else f"{title}, {entries[start].key} {entries[start].value[:40]}"
-        records.append(Record(path, name, tuple(entries[start:end])))
+        records.append(SectionRecord(path, name, tuple(entries[start:end])))
     return records
 
 
-def _records(path: str | PathLike[str], sections: dict[str, list[Record]], title: str) -> list[Record]:
+def _records(path: str | PathLike[str], sections: dict[str, list[SectionRecord]], title: str) -> list[SectionRecord]:
     if title not in sections:
         raise InputError(
-            "this section is missing", file=path, field=title,
+            "this section is missing",
+            file=path,
+            field=title,
             remedy="give the whole _metadata.txt of the delivery; a file that was cut off lacks the last sections",
-        )  # fmt: skip
+        )
     return sections[title]
 
 
-def _head(path: str | PathLike[str], sections: dict[str, list[Record]], title: str, *, needed: bool = True) -> Record:
+def _head(
+    path: str | PathLike[str], sections: dict[str, list[SectionRecord]], title: str, *, needed: bool = True
+) -> SectionRecord:
     if not needed and title not in sections:
-        return Record(str(path), title, ())
+        return SectionRecord(str(path), title, ())
     return _records(path, sections, title)[0]
 
 
-def _check_counts(path: str | PathLike[str], sections: dict[str, list[Record]], sources: int, components: int) -> None:
+def _check_counts(
+    path: str | PathLike[str], sections: dict[str, list[SectionRecord]], sources: int, components: int
+) -> None:
     for title, key, found in (
         (SOURCES, "Number of Source Images", sources),
         (COMPONENTS, "Number of Components", components),
@@ -366,14 +383,16 @@ def _check_counts(path: str | PathLike[str], sections: dict[str, list[Record]], 
         if found == 0 or (stated is not None and stated != found):
             raise InputError(
                 f"{found} are described, {'at least one' if stated is None else stated} should be",
-                file=path, field=f"{title}: {key}", remedy="the file is cut off or was edited: copy it again",
-            )  # fmt: skip
+                file=path,
+                field=f"{title}: {key}",
+                remedy="the file is cut off or was edited: copy it again",
+            )
 
 
 # -- meaning ---------------------------------------------------------------------------------------------------------
 
 
-def _source(record: Record) -> SourceImage:
+def _source(record: SectionRecord) -> SourceImage:
     time = record.text("Acquisition Date/Time")
     match = _TIME.fullmatch(time) if time else None
     return SourceImage(
@@ -390,7 +409,7 @@ def _source(record: Record) -> SourceImage:
     )
 
 
-def _component(record: Record) -> Component:
+def _component(record: SectionRecord) -> Component:
     return Component(
         component=_identity(record, "Component ID", "Tile ID"),
         product_image=_identity(record, "Product Image ID"),
@@ -398,30 +417,37 @@ def _component(record: Record) -> Component:
     )
 
 
-def _identity(record: Record, *keys: str) -> str:
+def _identity(record: SectionRecord, *keys: str) -> str:
     value = record.text(*keys)
     if value is None:
         raise InputError(
-            "this key is missing", file=record.file, field=f"{record.name}: {keys[0]}",
+            "this key is missing",
+            file=record.file,
+            field=f"{record.name}: {keys[0]}",
             remedy="it links components with acquisitions: give the whole metadata file",
-        )  # fmt: skip
+        )
     return value
 
 
-def _placement(record: Record) -> Placement:
+def _placement(record: SectionRecord) -> MapPlacement:
     x = record.number("UL Map X (Easting)", "UL Map X", units=METRES)
     y = record.number("UL Map Y (Northing)", "UL Map Y", units=METRES)
     dx = record.number("Pixel Size X", units=METRES, low=0.01, high=1000)
     dy = record.number("Pixel Size Y", units=METRES, low=0.01, high=1000)
     columns, rows = record.count("Columns"), record.count("Rows")
-    for first, second, key in ((x, y, "UL Map X, UL Map Y"), (dx, dy, "Pixel Size X, Pixel Size Y"),
-                               (columns, rows, "Columns, Rows")):  # fmt: skip
+    for first, second, key in (
+        (x, y, "UL Map X, UL Map Y"),
+        (dx, dy, "Pixel Size X, Pixel Size Y"),
+        (columns, rows, "Columns, Rows"),
+    ):
         if (first is None) != (second is None):
             raise InputError(
-                "one of the two is missing", file=record.file, field=f"{record.name}: {key}",
+                "one of the two is missing",
+                file=record.file,
+                field=f"{record.name}: {key}",
                 remedy="the file is cut off or was edited: copy it again",
-            )  # fmt: skip
-    return Placement(
+            )
+    return MapPlacement(
         upper_left=None if x is None or y is None else (x, y),
         pixel=None if dx is None or dy is None else (dx, dy),
         size=None if columns is None or rows is None else (columns, rows),
@@ -429,13 +455,13 @@ def _placement(record: Record) -> Placement:
     )
 
 
-def _bits(order: Record) -> int | None:
+def _bits(order: SectionRecord) -> int | None:
     text = order.text("Bits per Pixel per Band")
     match = re.match(r"\d{1,3}\b", text, re.ASCII) if text else None
     return int(match[0]) if match else None
 
 
-def _projection(order: Record) -> tuple[str | None, str | None]:
+def _projection(order: SectionRecord) -> tuple[str | None, str | None]:
     """Return what the file calls its map projection, and its CRS where that is UTM on WGS84."""
     name, datum = order.text("Map Projection"), order.text("Datum")
     if name is None:
@@ -447,7 +473,9 @@ def _projection(order: Record) -> tuple[str | None, str | None]:
     zone, hemisphere = order.count("Zone Number", "Zone", units=("",)), (order.text("Hemisphere") or "").upper()[:1]
     if zone is None or not 1 <= zone <= 60 or hemisphere not in ("N", "S"):
         raise InputError(
-            f"zone {zone} {hemisphere or '(no hemisphere)'} is not a UTM zone", file=order.file,
-            field=f"{order.name}: UTM Specific Parameters", remedy="Zone Number 1 to 60, Hemisphere N or S",
-        )  # fmt: skip
+            f"zone {zone} {hemisphere or '(no hemisphere)'} is not a UTM zone",
+            file=order.file,
+            field=f"{order.name}: UTM Specific Parameters",
+            remedy="Zone Number 1 to 60, Hemisphere N or S",
+        )
     return shown, f"EPSG:{(32600 if hemisphere == 'N' else 32700) + zone}"

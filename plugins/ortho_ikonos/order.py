@@ -11,7 +11,7 @@ from pathlib import Path
 import pyproj
 from osgeo import gdal
 
-from ortho_ikonos.metadata import Component, Delivery, Placement, read_header
+from ortho_ikonos.metadata import Component, Delivery, MapPlacement, read_header
 from ortho_pipeline.plugin import CrsError, InputError, Notice, listing, parse_crs, place, same_crs
 
 _NAME = re.compile(
@@ -26,7 +26,7 @@ _SAME = 0.05
 
 
 @dataclass(frozen=True)
-class ImageFile:
+class OrderImage:
     """One image of an order by its name ``po_<order>_<band>_<component>.tif``."""
 
     path: Path
@@ -35,7 +35,7 @@ class ImageFile:
     component: str
 
     @classmethod
-    def of(cls, path: Path) -> ImageFile | None:
+    def of(cls, path: Path) -> OrderImage | None:
         """Return what the name says; None for a name that is not the vendor's."""
         match = _NAME.fullmatch(path.name)
         return match and cls(path, match["order"], match["band"].lower(), match["component"])
@@ -50,10 +50,10 @@ class ImageFile:
         """Kind of pixels that images of an order share: separate colours; files of several may be sharpened."""
         return "colour" if self.band in SEPARATE else self.band
 
-    def others(self) -> Iterator[ImageFile]:
+    def others(self) -> Iterator[OrderImage]:
         """Yield the other images of the order, by name."""
         for name in listing(self.path.parent).names:
-            other = ImageFile.of(self.path.parent / name)
+            other = OrderImage.of(self.path.parent / name)
             if other is not None and name != self.path.name and other.order.lower() == self.order.lower():
                 yield other
 
@@ -72,7 +72,7 @@ def rpc_file(path: Path) -> Path | None:
     return found if found.is_file() else None
 
 
-def bands_of(image: ImageFile, wanted: str) -> tuple[Path, ...]:
+def bands_of(image: OrderImage, wanted: str) -> tuple[Path, ...]:
     """Return the files whose bands are stacked: none for ``one``, ``all`` separate bands, or names with commas.
 
     Raises
@@ -92,9 +92,10 @@ def bands_of(image: ImageFile, wanted: str) -> tuple[Path, ...]:
     if missing or image.band not in names:
         raise InputError(
             f"there is no band {missing[0]!r} beside it" if missing else f"band {image.band!r} is not one of them",
-            file=image.path, field="bands",
+            file=image.path,
+            field="bands",
             remedy=f"all, one, or some of {', '.join(sorted(there))} with the band of this image among them",
-        )  # fmt: skip
+        )
     return tuple(there[name] for name in names)
 
 
@@ -166,7 +167,7 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
     return Position(crs, corner, pixel, stated.reference_height, tuple(warnings), sources)
 
 
-def _factor(stated: Placement, size: tuple[int, int], path: Path, own_pixel: tuple[float, float] | None) -> int:
+def _factor(stated: MapPlacement, size: tuple[int, int], path: Path, own_pixel: tuple[float, float] | None) -> int:
     """Return how many stated pixels are one pixel of the image: 4 for colours beside panchromatic metadata.
 
     Colour and panchromatic images of one acquisition share their outer corner. A crop to a half, or to a quarter, has
@@ -179,20 +180,23 @@ def _factor(stated: Placement, size: tuple[int, int], path: Path, own_pixel: tup
         abs(whole - factor * part) < factor for whole, part in zip(stated.size, size, strict=True)
     )
     if own_pixel is not None and stated.pixel is not None:
-        fits &= all(math.isclose(own, factor * one, rel_tol=1e-3)
-                    for own, one in zip(own_pixel, stated.pixel, strict=True))  # fmt: skip
+        fits &= all(
+            math.isclose(own, factor * one, rel_tol=1e-3) for own, one in zip(own_pixel, stated.pixel, strict=True)
+        )
     else:
-        image = ImageFile.of(path)
+        image = OrderImage.of(path)
         fits &= factor == COARSER and not (image is not None and image.grid == "pan")
     if not fits:
         raise InputError(
             f"the image has {size[0]} x {size[1]} pixels, the metadata are of {stated.size[0]} x {stated.size[1]}",
-            file=path, field="Columns, Rows", remedy="give the whole image as delivered, and its own metadata",
-        )  # fmt: skip
+            file=path,
+            field="Columns, Rows",
+            remedy="give the whole image as delivered, and its own metadata",
+        )
     return factor
 
 
-def _corner(stated: Placement) -> tuple[float, float] | None:
+def _corner(stated: MapPlacement) -> tuple[float, float] | None:
     """Return the outer corner of the first pixel, whose centre is stated."""
     if stated.upper_left is None or stated.pixel is None:
         return None

@@ -77,10 +77,16 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     parts, said = parts_beside(isd, image, rigorous=found is None) if tile is None else ([], [])
     colours = colours_beside(isd, image, next(iter(models.values())))
     return Scene(
-        "maxar", name, *size, models, source, facts, (*warnings, *said),
+        "maxar",
+        name,
+        *size,
+        models,
+        source,
+        facts,
+        (*warnings, *said),
         pieces=(*tiles_beside(isd, image, tile), *parts, *colours),
         sources=(path,) if source != str(path) else (),
-    )  # fmt: skip
+    )
 
 
 def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None) -> tuple[RPC | None, str]:

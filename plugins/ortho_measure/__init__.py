@@ -15,7 +15,7 @@ def ortho_commands() -> Iterable[Subcommand]:
     """Add `ortho measure`."""
     yield Subcommand(
         "measure",
-        "Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.",
+        "Measure control points in the browser.",
         "ortho_measure.cli:measure",
         (
             (
@@ -23,4 +23,5 @@ def ortho_commands() -> Iterable[Subcommand]:
                 "ortho measure scene.tif --reference reference.tif --dem dem.tif -o points.geojson",
             ),
         ),
+        group="Control points",
     )

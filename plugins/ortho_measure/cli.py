@@ -33,30 +33,45 @@ if TYPE_CHECKING:
 @point_options
 @surface_options
 @click.option(
-    "--output", "-o", type=click.Path(dir_okay=False), metavar="FILE.geojson",
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False),
+    metavar="FILE.geojson",
     help="Points, with their journal beside them.  [default: <stems>_points.geojson]",
-)  # fmt: skip
+)
 @click.option("--no-browser", is_flag=True, help="Print the address, and open nothing.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="On this machine.  [default: any that is free]")
 @scenes_options
 @json_option
 def measure(
-    images: tuple[str, ...], match: MatchOptions, points: PointOptions, surface: SurfaceOptions, output: str | None,
-    no_browser: bool, port: int, scene: SceneOptions | list[SceneOptions], as_json: bool,
-) -> None:  # fmt: skip
-    """Measure points of an IMAGE in the browser, beside its reference in the geometry of the image, or of several.
+    images: tuple[str, ...],
+    match: MatchOptions,
+    points: PointOptions,
+    surface: SurfaceOptions,
+    output: str | None,
+    no_browser: bool,
+    port: int,
+    scene: SceneOptions | list[SceneOptions],
+    as_json: bool,
+) -> None:
+    """Measure control points in the browser.
 
-    A click is matched to a part of a pixel, the fit is solved after every point, and the page says where the next one
-    tells most. Everything stays on this machine; Ctrl-C ends. The file of points is for --gcps of 'ortho fit',
-    'rectify', 'compare' and 'export'; of several images, such as a stereo pair, for --points of 'ortho adjust'.
+    The page shows IMAGE beside its reference, in the geometry of the image. A click is matched to a fraction of a
+    pixel, the fit is updated after every point, and the page proposes the best next point. Everything stays on this
+    machine; Ctrl-C ends the command. Give the file of points to 'ortho fit', 'rectify', 'compare' or 'export' with
+    --gcps. Points of several images, such as a stereo pair, are for --points of 'ortho adjust'.
     """
     if not match.reference and len(images) == 1:
-        raise InputError("there is nothing to measure against", field="match.reference",
-                         remedy="give an orthoimage of the same place")  # fmt: skip
+        raise InputError(
+            "there is nothing to measure against",
+            field="match.reference",
+            remedy="give an orthoimage of the same place",
+        )
     missing = [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]
     if missing:
-        raise InputError(f"measuring in the browser needs {' and '.join(missing)}",
-                         remedy='pip install "ortho-pipeline[measure]"')  # fmt: skip
+        raise InputError(
+            f"measuring in the browser needs {' and '.join(missing)}", remedy='pip install "ortho-pipeline[measure]"'
+        )
     from ortho_measure.serving.server import serve
 
     session = _session(images, output, scene, points, surface, match)
@@ -93,9 +108,13 @@ def _first(scene: SceneOptions | list[SceneOptions]) -> SceneOptions:
 
 
 def _session(
-    images: tuple[str, ...], output: str | None, scene: SceneOptions | list[SceneOptions], points: PointOptions,
-    surface: SurfaceOptions, match: MatchOptions,
-) -> Project:  # fmt: skip
+    images: tuple[str, ...],
+    output: str | None,
+    scene: SceneOptions | list[SceneOptions],
+    points: PointOptions,
+    surface: SurfaceOptions,
+    match: MatchOptions,
+) -> Project:
     """Open the session of one image, or of several."""
     name = output or "_".join([*(Path(image).stem for image in images[:2]), "points.geojson"])
     if len(images) == 1:
@@ -106,12 +125,17 @@ def _session(
 
     for field in ("select", "fit_model", "model_crs", "prune", "params", "significance", "ridge", "near"):
         if getattr(points, field) != getattr(PointOptions, field):
-            raise InputError("this is said of one image, and there are several", field=f"points.{field}",
-                             remedy="leave it out")  # fmt: skip
+            raise InputError(
+                "this is said of one image, and there are several", field=f"points.{field}", remedy="leave it out"
+            )
     if points.gcps is not None and not isinstance(points.gcps, str):
         raise InputError("several images begin with a file of points", field="points.gcps", remedy="give a file")
     asked = BlockOptions(
-        points=points.gcps, crs=points.crs, vertical=points.vertical, pixel_origin=points.pixel_origin,
-        check=points.check, correction=points.correction,
-    )  # fmt: skip
+        points=points.gcps,
+        crs=points.crs,
+        vertical=points.vertical,
+        pixel_origin=points.pixel_origin,
+        check=points.check,
+        correction=points.correction,
+    )
     return open_block_session(images, name, scene=scene, points=asked, surface=surface, match=match)

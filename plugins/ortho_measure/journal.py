@@ -77,8 +77,11 @@ class Journal:
             If another process holds the journal, or it cannot be written.
         """
         if self._lock is None:
-            raise InputError("another process measures these points: this one only shows them", file=self.path,
-                             remedy="close the other one, and start again")  # fmt: skip
+            raise InputError(
+                "another process measures these points: this one only shows them",
+                file=self.path,
+                remedy="close the other one, and start again",
+            )
         try:
             self._lock.append(_line(action))
         except OSError as error:
@@ -157,8 +160,12 @@ def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
             if end + 1 == len(data):
                 # A power cut can leave the length of a line without its bytes.
                 return start, found
-            raise InputError("this journal is damaged, and what follows rests on it", file=path,
-                             field=f"line {len(found) + 1}", remedy=REMEDY)  # fmt: skip
+            raise InputError(
+                "this journal is damaged, and what follows rests on it",
+                file=path,
+                field=f"line {len(found) + 1}",
+                remedy=REMEDY,
+            )
         found.append(action)
         start = end + 1
     return start, found
@@ -175,5 +182,8 @@ def _action(line: bytes) -> dict[str, Any] | None:
 
 
 def _unwritable(path: Path, error: OSError) -> InputError:
-    return InputError(f"the journal cannot be written ({error.strerror or error})", file=path,
-                      remedy="choose an output in a folder that you may write to and that has room")  # fmt: skip
+    return InputError(
+        f"the journal cannot be written ({error.strerror or error})",
+        file=path,
+        remedy="choose an output in a folder that you may write to and that has room",
+    )

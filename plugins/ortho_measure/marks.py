@@ -32,7 +32,7 @@ MOST_MARKS, LONGEST_ID, LONGEST_NOTE = 20_000, 64, 500
 _SIGMAS, _GROUPS = (1e-6, 1e6), 1 << 31
 
 
-class Ray(Record):
+class RayMark(Record):
     """A point as it was measured in one of several images: as `Mark` has it of a single one."""
 
     image: tuple[float, float]
@@ -71,7 +71,7 @@ class Mark(Record):
     how: Literal["manual", "matched", "file"] = "manual"
     ground_from: Literal["reference", "typed", "file"] | None = None
     score: float | None = None
-    rays: dict[str, Ray] = pydantic.Field(default_factory=dict)
+    rays: dict[str, RayMark] = pydantic.Field(default_factory=dict)
     note: str = ""
     at: str = ""
 
@@ -113,7 +113,7 @@ def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) 
     return np.array([[column, both], [both, row]])
 
 
-def errors_of(measured: Sequence[Mark | Ray]) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(measured: Sequence[Mark | RayMark]) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviations ``(N,)`` and covariances ``(N, 2, 2)`` of measurements, as a file of them says."""
     covariance = np.array([one.matrix for one in measured], dtype=float).reshape(-1, 2, 2)
     sigma = sigma_of_covariance(covariance)
@@ -132,8 +132,9 @@ def checked(mark: Mark) -> Mark:
     """
     name = plain_id(mark.id)
     if not name or name != mark.id or len(name) > LONGEST_ID or not is_writable(name):
-        raise InputError("this is no name of a point", field="id",
-                         remedy=f"1 to {LONGEST_ID} characters, single blanks only within")  # fmt: skip
+        raise InputError(
+            "this is no name of a point", field="id", remedy=f"1 to {LONGEST_ID} characters, single blanks only within"
+        )
     if len(mark.note) > LONGEST_NOTE or not is_writable(mark.note):
         raise InputError("this note cannot be kept", field="note", remedy=f"write at most {LONGEST_NOTE} characters")
     _check_measurement(mark, "")
@@ -145,14 +146,13 @@ def checked(mark: Mark) -> Mark:
             raise InputError("this is no place on Earth", field="ground", remedy="check the coordinates and their CRS")
     for key in ("sigma_xy", "sigma_h", "sigma_common", "sigma_alike"):
         if not 0 <= getattr(mark, key) <= 1e6:
-            raise InputError("a standard deviation is not negative", field=key,
-                             remedy="give 0 or more")  # fmt: skip
+            raise InputError("a standard deviation is not negative", field=key, remedy="give 0 or more")
     if mark.group is not None and not 0 <= mark.group < _GROUPS:
         raise InputError("this is no number of a group", field="group", remedy=f"give 0 to {_GROUPS - 1}")
     return mark
 
 
-def _check_measurement(one: Mark | Ray, where: str) -> None:
+def _check_measurement(one: Mark | RayMark, where: str) -> None:
     if one.image is not None and max(map(abs, one.image)) > 1e8:
         raise InputError("this is no place in an image", field=f"{where}image")
     least, most = _SIGMAS
@@ -201,12 +201,16 @@ class Marks:
             ids=tuple(mark.id for mark in used),
             image=np.array([mark.image for mark in used], dtype=float).reshape(-1, 2),
             ground=np.array([mark.ground for mark in used], dtype=float).reshape(-1, 3),
-            roles=np.array([mark.role for mark in used], dtype="<U7"), sigma_image=sigma,
+            roles=np.array([mark.role for mark in used], dtype="<U7"),
+            sigma_image=sigma,
             sigma_ground=np.array([[mark.sigma_xy] * 2 + [mark.sigma_h] for mark in used], dtype=float).reshape(-1, 3),
-            crs=horizontal(parse_crs(GROUND_CRS)), source=source, covariance_image=covariance, groups=groups,
+            crs=horizontal(parse_crs(GROUND_CRS)),
+            source=source,
+            covariance_image=covariance,
+            groups=groups,
             sigma_common=np.array([mark.sigma_common for mark in used], dtype=float),
             sigma_alike=np.array([mark.sigma_alike for mark in used], dtype=float),
-        )  # fmt: skip
+        )
 
     def document(self, source: str) -> dict[str, Any]:
         """Return the GeoJSON of the points, each with its provenance; readers of points ignore what is not theirs.
@@ -217,9 +221,12 @@ class Marks:
         features = [feature_of(point) for point in points]
         for feature, mark in zip(features, (self.by_id[name] for name in points.ids), strict=True):
             feature["properties"] |= {
-                "measured": mark.how, "ground_from": mark.ground_from, "score": mark.score, "at": mark.at,
+                "measured": mark.how,
+                "ground_from": mark.ground_from,
+                "score": mark.score,
+                "at": mark.at,
                 **({"note": mark.note} if mark.note else {}),
-            }  # fmt: skip
+            }
         left = [mark.to_json() for mark in self.by_id.values() if not mark.counts]
         return {"type": "FeatureCollection", "features": features, **({"left_out": left} if left else {})}
 
@@ -249,15 +256,26 @@ def marks_of(points: Points, at: str) -> list[Mark]:
     found = []
     for k, point in enumerate(points.to_crs(GROUND_CRS)):
         (column, both), (_, row) = point.covariance_image
-        found.append(checked(Mark(
-            id=point.id, image=point.image,
-            ground=point.ground if all(map(math.isfinite, point.ground)) else None,
-            role=point.role,  # type: ignore[arg-type]
-            sigma_image=None if more[k] else point.sigma_image, covariance=(column, row, both) if more[k] else None,
-            sigma_xy=max(point.sigma_ground[:2]), sigma_h=point.sigma_ground[2], sigma_common=point.sigma_common,
-            sigma_alike=point.sigma_alike, group=point.group if point.group >= 0 else None,
-            how="file", ground_from="file", at=at,
-        )))  # fmt: skip
+        found.append(
+            checked(
+                Mark(
+                    id=point.id,
+                    image=point.image,
+                    ground=point.ground if all(map(math.isfinite, point.ground)) else None,
+                    role=point.role,  # type: ignore[arg-type]
+                    sigma_image=None if more[k] else point.sigma_image,
+                    covariance=(column, row, both) if more[k] else None,
+                    sigma_xy=max(point.sigma_ground[:2]),
+                    sigma_h=point.sigma_ground[2],
+                    sigma_common=point.sigma_common,
+                    sigma_alike=point.sigma_alike,
+                    group=point.group if point.group >= 0 else None,
+                    how="file",
+                    ground_from="file",
+                    at=at,
+                )
+            )
+        )
     return found
 
 
@@ -335,8 +353,11 @@ def _changed(marks: Marks, action: Mapping[str, Any]) -> Marks:
 
 def _require_members(action: Mapping[str, Any], members: set[str]) -> None:
     if not set(action) <= members | {"do"}:
-        raise InputError("this action has members that it cannot have", field="action",
-                         remedy=f"leave out all but {', '.join(sorted(members | {'do'}))}")  # fmt: skip
+        raise InputError(
+            "this action has members that it cannot have",
+            field="action",
+            remedy=f"leave out all but {', '.join(sorted(members | {'do'}))}",
+        )
 
 
 def _begun(marks: Sequence[Mark]) -> Marks:
@@ -368,5 +389,6 @@ def _refuse_twin(others: Sequence[Mark], mark: Mark) -> None:
     for other in others:
         if other.counts and (same := mark.places & other.places):
             name = str(min(same, key=str)[0])
-            raise InputError(f"{other.id} has the same {name}", field=name,
-                             remedy=f"measure {other.id} anew, or switch it off")  # fmt: skip
+            raise InputError(
+                f"{other.id} has the same {name}", field=name, remedy=f"measure {other.id} anew, or switch it off"
+            )

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ortho_measure.marks import GROUND_CRS
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
-from ortho_pipeline.imaging.matching import Reference, Target, View
+from ortho_pipeline.imaging.matching import Reference, SceneView, Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.surface.base import Surface
@@ -76,18 +76,18 @@ class Sheet:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SceneGeometry:
     """A scene, and what shows the same ground, as one geometry.
 
     Parameters
     ----------
-    view : View
+    view : SceneView
         The scene by the model that the reference is rendered with.
     references : tuple of Target
         Orthoimages, or other scenes.
     """
 
-    view: View
+    view: SceneView
     references: tuple[Target, ...]
 
     @property
@@ -100,7 +100,7 @@ class Places:
         """The heights."""
         return self.view.surface
 
-    def by(self, model: SensorModel) -> Places:
+    def by(self, model: SensorModel) -> SceneGeometry:
         """Return the same by another model."""
         return replace(self, view=replace(self.view, model=model))
 
@@ -130,7 +130,7 @@ class Places:
             height = np.where(np.isfinite(there), there, height)
         return to_ground(self.model.image_to_ground(given, height))
 
-    def moved(self, shift: ArrayLike) -> Places:
+    def moved(self, shift: ArrayLike) -> SceneGeometry:
         """Return the same where the model puts everything `shift` (column, row; px) farther."""
         step = np.zeros(6)
         step[[0, 3]] = np.asarray(shift, dtype=float)
@@ -168,8 +168,11 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
     for field, text in (("crs", crs), ("vertical", vertical or "ellipsoid")):
         # What else PROJ understands may name files, and a page opens none.
         if not re.fullmatch(_NAMED, text.strip(), re.ASCII | re.IGNORECASE):
-            raise InputError("this is not known by that name", field=field,
-                             remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008")  # fmt: skip
+            raise InputError(
+                "this is not known by that name",
+                field=field,
+                remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008",
+            )
     if len(values) != 3 or values[0] is None or values[1] is None:
         raise InputError("ground has x and y, and a height or none", field="ground")
     plane = horizontal(parse_crs(crs))

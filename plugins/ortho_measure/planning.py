@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_measure.places import Places
+from ortho_measure.places import SceneGeometry
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.imaging.matching.candidates import candidates
 from ortho_pipeline.imaging.matching.chip_search import SIDE
@@ -26,7 +26,7 @@ OFFERED = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class PlanningGrid:
     """Places of a scene that a reference shows, and all over the scene.
 
     Parameters
@@ -42,7 +42,7 @@ class Grid:
     everywhere: Array
 
     @classmethod
-    def over(cls, places: Places, side: int = _SIDE) -> Grid:
+    def over(cls, places: SceneGeometry, side: int = _SIDE) -> PlanningGrid:
         """Return the places of a scene, one in each of `side` x `side` cells."""
         width, height = places.view.size
         steps = (np.arange(side) + 0.5) / side
@@ -57,13 +57,13 @@ class Grid:
         image, on_ground = _shown(places, np.asarray(origins + SIDE * factor / 2, dtype=np.float64))
         return cls(image, on_ground, ground) if len(image) else cls(regular, ground, ground)
 
-    def without(self, taken: Array) -> Grid:
+    def without(self, taken: Array) -> PlanningGrid:
         """Return the places at which there is no point: a second one of the same pixels tells nothing new."""
         near = (np.abs(self.image[:, None] - taken).max(axis=2) < SIDE / 2).any(axis=1)
-        return Grid(self.image[~near], self.ground[~near], self.everywhere)
+        return PlanningGrid(self.image[~near], self.ground[~near], self.everywhere)
 
 
-def _shown(places: Places, image: Array) -> tuple[Array, Array]:
+def _shown(places: SceneGeometry, image: Array) -> tuple[Array, Array]:
     """Return those of image points whose ground a reference shows, and that ground."""
     ground = meet_surface(places.model, image, places.surface)
     good = np.flatnonzero(np.isfinite(ground).all(axis=1))
@@ -89,7 +89,7 @@ class Next:
     role: str = "control"
 
 
-def measure_next(grid: Grid, fit: Fit | None, taken: Array) -> list[Next]:
+def measure_next(grid: PlanningGrid, fit: Fit | None, taken: Array) -> list[Next]:
     """Return places whose predicted image is least certain, the best first; none where the references show nothing.
 
     Parameters

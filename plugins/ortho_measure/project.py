@@ -16,13 +16,13 @@ import numpy as np
 from ortho_measure.journal import REMEDY as JOURNAL_REMEDY
 from ortho_measure.journal import Journal
 from ortho_measure.marks import GROUND_CRS, History, Mark, Marks, Written
-from ortho_measure.places import Geometry, Places, Sheet, ground_typed, linked
+from ortho_measure.places import Geometry, SceneGeometry, Sheet, ground_typed, linked
 from ortho_measure.planning import Next
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.json.values import json_position, json_value
-from ortho_pipeline.imaging.matching import View
+from ortho_pipeline.imaging.matching import SceneView
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.runtime.process_limits import Progress
@@ -37,7 +37,7 @@ _MOVED = 0.2
 class _Shown(abc.ABC):
     """What a page is shown of a project: its points, their places in every view, and the figures."""
 
-    views: tuple[View, ...]
+    views: tuple[SceneView, ...]
     sheets: tuple[Sheet, ...]
     surface: Surface
     _history: History
@@ -58,7 +58,7 @@ class _Shown(abc.ABC):
         """Number of the models that references are rendered with now."""
 
     @abc.abstractmethod
-    def places_of(self, number: int) -> Places:
+    def places_of(self, number: int) -> SceneGeometry:
         """Return the geometry of an image as it is adjusted now."""
 
     @abc.abstractmethod
@@ -86,12 +86,15 @@ class _Shown(abc.ABC):
         told = [self._written.of(mark) for mark in marks]
         return {
             "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
-            "version": version, "undo": history.can_undo, "redo": history.can_redo, **self._figures(),
+            "version": version,
+            "undo": history.can_undo,
+            "redo": history.can_redo,
+            **self._figures(),
             "next": [
                 {**json_value(one), "places": places}
                 for one, places in zip(ahead, self._places(version, there), strict=True)
             ],
-        }  # fmt: skip
+        }
 
     # -- places ------------------------------------------------------------------------------------------------------
 
@@ -106,8 +109,13 @@ class _Shown(abc.ABC):
             raise InputError("there is no such view", field="at")
         return known[name]
 
-    def predict(self, version: int, at: str | None = None, place: Sequence[float] | None = None,
-                ground: Sequence[float] | None = None) -> dict[str, Any]:  # fmt: skip
+    def predict(
+        self,
+        version: int,
+        at: str | None = None,
+        place: Sequence[float] | None = None,
+        ground: Sequence[float] | None = None,
+    ) -> dict[str, Any]:
         """Return where a place of a geometry, or of the ground, lies in all of them.
 
         Parameters
@@ -129,9 +137,10 @@ class _Shown(abc.ABC):
             else:
                 found = self._geometry(str(at), version).ground_of(np.array([place], dtype=float))
             return {
-                "ground": json_position(found[0]), "places": self._places(version, found)[0],
+                "ground": json_position(found[0]),
+                "places": self._places(version, found)[0],
                 "sigma": self._sigma(found),
-            }  # fmt: skip
+            }
 
     @abc.abstractmethod
     def _sigma(self, ground: Array) -> list[float] | None:
@@ -159,7 +168,7 @@ class Project(_Shown):
         The GeoJSON of the points; its journal lies beside it.
     surface : Surface
         The heights.
-    views : sequence of View
+    views : sequence of SceneView
         The images.
     sheets : sequence of Sheet
         The references as maps.
@@ -173,7 +182,7 @@ class Project(_Shown):
     _solution: Any
     rendered: list[Any]
 
-    def __init__(self, output: Path, surface: Surface, views: Sequence[View], sheets: Sequence[Sheet]) -> None:
+    def __init__(self, output: Path, surface: Surface, views: Sequence[SceneView], sheets: Sequence[Sheet]) -> None:
         self.output, self.surface, self.views, self.sheets = output, surface, tuple(views), tuple(sheets)
         self._lock = threading.RLock()
         self._saved = -1
@@ -213,7 +222,7 @@ class Project(_Shown):
         """Return all geometries by their names."""
 
     @abc.abstractmethod
-    def rendering(self, name: str, version: int) -> Places | None:
+    def rendering(self, name: str, version: int) -> SceneGeometry | None:
         """Return what a view is rendered from by a model; None if it is the raster itself.
 
         Raises
@@ -244,14 +253,19 @@ class Project(_Shown):
                 if not self.journal.read_only:
                     self.journal.append(self._first())
             elif self.journal.actions[0].get("image") != self._identity():
-                raise InputError("this journal is of another image", file=self.journal.path, field="output",
-                                 remedy="choose another output, or move the journal away")  # fmt: skip
+                raise InputError(
+                    "this journal is of another image",
+                    file=self.journal.path,
+                    field="output",
+                    remedy="choose another output, or move the journal away",
+                )
             elif source is not None and source != self.journal.actions[0].get("source"):
                 raise InputError(
-                    "there is a journal of these points, which began with others", file=self.journal.path,
+                    "there is a journal of these points, which began with others",
+                    file=self.journal.path,
                     field="points.gcps",
                     remedy=Text("leave out ", Setting("points.gcps"), " to go on, or choose another output"),
-                )  # fmt: skip
+                )
             with completed(self.journal.path, remedy=JOURNAL_REMEDY):
                 count = self._take(self.journal.actions)
             if self.stopped:
@@ -286,11 +300,19 @@ class Project(_Shown):
         """Return the action that a journal begins with."""
         given = self._given()
         if given is None and self.output.exists():
-            raise InputError("there are points here, and no journal of them", file=self.output, field="output",
-                             remedy=Text("give them as ", Setting("points.gcps"), " to go on, or choose another "
-                                         "output"))  # fmt: skip
-        return {"do": "begin", "marks": [mark.to_json() for mark in given or ()], "source": self._source(),
-                "image": self._identity(), "at": now()}  # fmt: skip
+            raise InputError(
+                "there are points here, and no journal of them",
+                file=self.output,
+                field="output",
+                remedy=Text("give them as ", Setting("points.gcps"), " to go on, or choose another output"),
+            )
+        return {
+            "do": "begin",
+            "marks": [mark.to_json() for mark in given or ()],
+            "source": self._source(),
+            "image": self._identity(),
+            "at": now(),
+        }
 
     def save(self) -> None:
         """Write the GeoJSON, whole, unless it holds all actions already."""
@@ -365,8 +387,9 @@ def points_file(output: str | os.PathLike[str]) -> Path:
     """
     path = Path(output)
     if path.suffix.lower() != ".geojson":
-        raise InputError("measured points are written as GeoJSON", file=path, field="output",
-                         remedy="a name with `.geojson`")  # fmt: skip
+        raise InputError(
+            "measured points are written as GeoJSON", file=path, field="output", remedy="a name with `.geojson`"
+        )
     return path
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_measure.places import Places
+from ortho_measure.places import SceneGeometry
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.files.json.values import json_position, json_value
@@ -67,12 +67,12 @@ class Proposal:
     scattered: int
 
 
-def propose(places: Places, image: Sequence[float], radius: float) -> Proposal:
+def propose(places: SceneGeometry, image: Sequence[float], radius: float) -> Proposal:
     """Match the scene about an image point with the references, which are looked through so many px about it.
 
     Parameters
     ----------
-    places : Places
+    places : SceneGeometry
         With a model that puts the wanted ground at the click, as well as is known.
     """
     factor = chip_factor(places.view, places.references, np.asarray(image, dtype=float)[None])
@@ -98,7 +98,7 @@ def propose(places: Places, image: Sequence[float], radius: float) -> Proposal:
     return Proposal(shift, covariance, float(measured.correlation[0]), REASONS.get(doubt, ""), scattered)
 
 
-def proposal_of(places: Places, click: Array | None, ground: Array | None, radius: float) -> dict[str, Any]:
+def proposal_of(places: SceneGeometry, click: Array | None, ground: Array | None, radius: float) -> dict[str, Any]:
     """Return a match for a click, as JSON values: its `image` and `ground`, score and covariance, or the `reason`.
 
     Parameters
@@ -130,20 +130,26 @@ def proposal_of(places: Places, click: Array | None, ground: Array | None, radiu
             on_ground = places.ground_of([click + found.shift])[0]
     reason = found.reason or ("" if np.isfinite(on_ground).all() else "the heights do not reach here")
     (column, both), (_, row) = found.covariance
-    told: dict[str, Any] = json_value({
-        "image": json_position(place), "ground": json_position(on_ground), "score": found.score,
-        "covariance": json_position([column, row, both]), "scattered": found.scattered, "reason": reason,
-    })  # fmt: skip
+    told: dict[str, Any] = json_value(
+        {
+            "image": json_position(place),
+            "ground": json_position(on_ground),
+            "score": found.score,
+            "covariance": json_position([column, row, both]),
+            "scattered": found.scattered,
+            "reason": reason,
+        }
+    )
     return told
 
 
-def _rendered(places: Places, origins: NDArray[np.int_], radius: int, factor: int) -> NDArray[np.float32]:
+def _rendered(places: SceneGeometry, origins: NDArray[np.int_], radius: int, factor: int) -> NDArray[np.float32]:
     renderer = Renderer(places.view, places.references, origins - radius * factor, SIDE + 2 * radius, factor)
     return renderer.render(np.arange(len(origins)))
 
 
 def _measured(
-    places: Places, origins: NDArray[np.int_], shift: Array, factor: int, scene: NDArray[np.float32]
+    places: SceneGeometry, origins: NDArray[np.int_], shift: Array, factor: int, scene: NDArray[np.float32]
 ) -> Measured:
     """Measure what is left of a shift (px) where the reference is rendered with it taken out."""
     wide = _rendered(places.moved(-shift), origins, MEASURED, factor)
@@ -151,7 +157,7 @@ def _measured(
 
 
 def _covariance(
-    places: Places, origin: NDArray[np.int_], shift: Array, factor: int, measured: Measured
+    places: SceneGeometry, origin: NDArray[np.int_], shift: Array, factor: int, measured: Measured
 ) -> tuple[Array, int]:
     """Return the covariance ``(2, 2)`` px^2 of a match, and how many neighbours it is from."""
     own = measured.covariance[0] * factor**2

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from ortho_measure.marks import Mark, marks_of
-from ortho_measure.places import Geometry, Places, Sheet
-from ortho_measure.planning import Grid, Next, measure_next
+from ortho_measure.places import Geometry, SceneGeometry, Sheet
+from ortho_measure.planning import Next, PlanningGrid, measure_next
 from ortho_measure.project import Project, moved, now, points_file
 from ortho_measure.proposals import proposal_of
-from ortho_measure.solution import Solution, figures, solve
+from ortho_measure.solution import LiveAdjustment, figures, solve
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.matching import open_reference_views, search_of
@@ -29,7 +29,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.files.json.values import json_position
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.imaging.matching import Reference, View
+from ortho_pipeline.imaging.matching import Reference, SceneView
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -46,7 +46,7 @@ class Session(Project):
     Parameters
     ----------
     scene : Scene
-    places : Places
+    places : SceneGeometry
         By the model as delivered.
     output : Path
         The GeoJSON of the points; its journal lies beside it.
@@ -54,18 +54,18 @@ class Session(Project):
         How image and heights were opened, what is adjusted (as for `ortho fit`), and how far the model may be off.
     """
 
-    _solution: Solution
+    _solution: LiveAdjustment
     rendered: list[SensorModel]
 
-    def __init__(self, scene: Scene, places: Places, output: Path, request: Request) -> None:
+    def __init__(self, scene: Scene, places: SceneGeometry, output: Path, request: Request) -> None:
         maps = [Sheet(one, places.surface) for one in places.references if isinstance(one, Reference)]
         super().__init__(output, places.surface, [places.view], maps)
         self.scene, self.places = scene, places
         self._request = request
         self.search = search_of(scene, request.match, metres_per_pixel(places.view))
-        self.grid = Grid.over(places)
+        self.grid = PlanningGrid.over(places)
         self.rendered = [places.model]
-        self._solution = Solution(scene.model, None)
+        self._solution = LiveAdjustment(scene.model, None)
         self._begin()
 
     # -- as any project ----------------------------------------------------------------------------------------------
@@ -93,14 +93,15 @@ class Session(Project):
     def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
         for mark in marks:
             if mark.rays or mark.role == "tie":
-                raise InputError("there is one image, and this is a point of several", field="rays",
-                                 remedy="load the page anew")  # fmt: skip
+                raise InputError(
+                    "there is one image, and this is a point of several", field="rays", remedy="load the page anew"
+                )
 
     def _solve(self) -> None:
         marks = self._history.marks
         self._solution = solve(
             self.scene, marks.points(self._called), self._request, self.places.surface, marks.correction
-        )  # fmt: skip
+        )
         if moved(self.rendered[-1], self._solution.model, self.grid.everywhere):
             self.rendered = [*self.rendered, self._solution.model]
 
@@ -109,7 +110,7 @@ class Session(Project):
         return os.fspath(self.output)
 
     @property
-    def solution(self) -> Solution:
+    def solution(self) -> LiveAdjustment:
         """The adjustment to the points as they are now."""
         return self._solution
 
@@ -129,10 +130,10 @@ class Session(Project):
 
     # -- places ------------------------------------------------------------------------------------------------------
 
-    def places_of(self, number: int) -> Places:
+    def places_of(self, number: int) -> SceneGeometry:
         return self.places.by(self._solution.model)
 
-    def at(self, version: int) -> Places:
+    def at(self, version: int) -> SceneGeometry:
         """Return the geometry that the reference was rendered with."""
         if not 0 <= version < len(self.rendered):
             raise InputError("there is no such rendering", field="version")
@@ -142,7 +143,7 @@ class Session(Project):
         maps = {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
         return {"scene-0": self.places_of(0), "reference-0": self.at(version), **maps}
 
-    def rendering(self, name: str, version: int) -> Places | None:
+    def rendering(self, name: str, version: int) -> SceneGeometry | None:
         return self.at(version) if name == "reference-0" else None
 
     def _sigma(self, ground: Array) -> list[float] | None:
@@ -178,14 +179,24 @@ class Session(Project):
             correction = self.marks.correction or self._request.points.correction
         # The saved points say themselves where they are and which of them check.
         points = replace(
-            self._request.points, gcps=self.output, crs=None, vertical=None, pixel_origin="corner", check=None,
-            select=None, correction=correction,
-        )  # fmt: skip
+            self._request.points,
+            gcps=self.output,
+            crs=None,
+            vertical=None,
+            pixel_origin="corner",
+            check=None,
+            select=None,
+            correction=correction,
+        )
         with confined(self.output.parent):
             return rectify(
-                self.scene.path, self.output.with_name(f"{self.output.stem}_ortho"), scene=self._request.scene,
-                points=points, surface=self._request.surface, progress=progress,
-            )  # fmt: skip
+                self.scene.path,
+                self.output.with_name(f"{self.output.stem}_ortho"),
+                scene=self._request.scene,
+                points=points,
+                surface=self._request.surface,
+                progress=progress,
+            )
 
     def _radius(self, click: Array | None) -> float:
         """Return within how many px of the prediction a click is looked for."""
@@ -219,8 +230,11 @@ def open_session(
     """
     path = points_file(output)
     if points.fit_model is not None:
-        raise InputError("the reference is shown by the scene's own model", field="points.fit_model",
-                         remedy="leave it out, and fit the model to the saved points")  # fmt: skip
+        raise InputError(
+            "the reference is shown by the scene's own model",
+            field="points.fit_model",
+            remedy="leave it out, and fit the model to the saved points",
+        )
     require_heights(surface)
     request = Request(image, scene, points, surface, match)
     opened = open_by_evidence(request)
@@ -228,5 +242,5 @@ def open_session(
     opened = on_surface(opened, heights)
     view, references = open_reference_views(opened, match, heights, scene)
     inputs.check_paths({"points": path}, replace(request, points=PointOptions()))
-    places = Places(View(view.intensity, opened.model, heights), references)
+    places = SceneGeometry(SceneView(view.intensity, opened.model, heights), references)
     return Session(opened, places, path, request)

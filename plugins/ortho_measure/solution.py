@@ -32,7 +32,7 @@ SUSPICIOUS = 0.001
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class LiveAdjustment:
     """An adjustment, or why there is none.
 
     Parameters
@@ -54,23 +54,23 @@ class Solution:
         return None if self.adjusted is None else self.adjusted.fit
 
 
-def solve(scene: Scene, points: Points, request: Request, surface: Surface, correction: str | None) -> Solution:
+def solve(scene: Scene, points: Points, request: Request, surface: Surface, correction: str | None) -> LiveAdjustment:
     """Adjust the model of a scene to points as `ortho fit` does."""
     if not len(points):
-        return Solution(scene.model, None)
+        return LiveAdjustment(scene.model, None)
     chosen = request.points.correction if correction is None else correction
     alone = replace(request, points=replace(request.points, correction=chosen), match=MatchOptions())
     try:
         done = adjust(Resolved(alone, scene, surface, points, None, Ledger()))
     except OrthoError as error:
-        return Solution(scene.model, None, error.message)
+        return LiveAdjustment(scene.model, None, error.message)
     except np.linalg.LinAlgError as error:
         # What is in the journal has to open again, whatever it is.
-        return Solution(scene.model, None, f"the points cannot be adjusted ({error})")
-    return Solution(done.model, done)
+        return LiveAdjustment(scene.model, None, f"the points cannot be adjusted ({error})")
+    return LiveAdjustment(done.model, done)
 
 
-def figures(solution: Solution, surface: Surface) -> dict[str, Any]:
+def figures(solution: LiveAdjustment, surface: Surface) -> dict[str, Any]:
     """Return what the page shows of a solution, as JSON values."""
     fit = solution.fit
     if fit is None or solution.adjusted is None:
@@ -78,27 +78,37 @@ def figures(solution: Solution, surface: Surface) -> dict[str, Any]:
     residuals_m, tests = in_metres(fit, fit.residuals), normalised_residuals(fit)
     points = {
         name: {
-            "residual": json_position(fit.residuals[k]), "residual_m": json_position(residuals_m[k]),
-            "loo": json_position(fit.loo_residuals[k]), "predicted": json_position(fit.predicted[k]),
-            "used": bool(fit.used[k]), "w": json_value(tests[k]),
+            "residual": json_position(fit.residuals[k]),
+            "residual_m": json_position(residuals_m[k]),
+            "loo": json_position(fit.loo_residuals[k]),
+            "predicted": json_position(fit.predicted[k]),
+            "used": bool(fit.used[k]),
+            "w": json_value(tests[k]),
             "suspicious": bool(tests[k] ** 2 > -2 * math.log(SUSPICIOUS)),
         }
         for k, name in enumerate(fit.points.ids)
-    }  # fmt: skip
+    }
     for name, reason in fit.rejected:
         points[name] |= {"suspicious": True, "reason": reason}
     for one in fit.outlying:
         points[one.id] |= {"suspicious": True, "reason": one.reason}
     return {
-        "error": "", "model": fit.model_name, "points": points, "headline": _headline(fit),
-        "parameters": json_value({
-            name: {"value": value, "sigma": sigma}
-            for name, value, sigma in zip(fit.param_names, fit.values, fit.sigmas, strict=True)
-        }),
-        "rmse": fit.rmses.given(), "rmse_m": rmse_metres(fit).given(), "sigma0": fit.sigma0,
+        "error": "",
+        "model": fit.model_name,
+        "points": points,
+        "headline": _headline(fit),
+        "parameters": json_value(
+            {
+                name: {"value": value, "sigma": sigma}
+                for name, value, sigma in zip(fit.param_names, fit.values, fit.sigmas, strict=True)
+            }
+        ),
+        "rmse": fit.rmses.given(),
+        "rmse_m": rmse_metres(fit).given(),
+        "sigma0": fit.sigma0,
         "redundancy": fit.redundancy,
         "notices": [str(one) for one in solution.adjusted.warnings(surface)],
-    }  # fmt: skip
+    }
 
 
 def normalised_residuals(fit: Fit) -> Array:

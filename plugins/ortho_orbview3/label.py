@@ -34,19 +34,19 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True)
-class Group:
+class LabelGroup:
     """A group of a label: texts and lists of texts by key, and groups by name, with the file and its own place."""
 
     file: str
     path: str = ""
     values: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
-    groups: Mapping[str, Group] = field(default_factory=dict)
+    groups: Mapping[str, LabelGroup] = field(default_factory=dict)
 
     def place(self, key: str) -> str:
         """Return ``group.key``, for messages."""
         return f"{self.path}.{key}" if self.path else key
 
-    def group(self, name: str) -> Group:
+    def group(self, name: str) -> LabelGroup:
         """Return a group within this one.
 
         Raises
@@ -131,7 +131,7 @@ class Group:
 
 
 @reads("copy the .pvl again from the delivery")
-def read_label(path: str | PathLike[str]) -> Group:
+def read_label(path: str | PathLike[str]) -> LabelGroup:
     """Read a label.
 
     Raises
@@ -185,18 +185,18 @@ class _Reader:
     def wrong(self, message: str, field: str) -> InputError:
         return InputError(f"{message} (line {self.line})", file=self.file, field=field or f"line {self.line}")
 
-    def read(self) -> Group:
+    def read(self) -> LabelGroup:
         found = self.group("", 0)
         if not found.values and not found.groups:
             raise InputError("there is nothing in this label", file=self.file)
         return found
 
-    def group(self, path: str, depth: int) -> Group:
+    def group(self, path: str, depth: int) -> LabelGroup:
         """Read statements up to END_GROUP, or to END outside of all groups."""
         if depth > MAX_DEPTH:
             raise self.wrong("groups are nested too deeply", path)
         values: dict[str, str | tuple[str, ...]] = {}
-        groups: dict[str, Group] = {}
+        groups: dict[str, LabelGroup] = {}
         last = ""
         while True:
             token = self.advance()
@@ -212,10 +212,10 @@ class _Reader:
             if word == "END" and not (self.next is not None and self.next.text == "="):
                 if path:
                     raise self.wrong("END stands within this group: its END_GROUP is missing", path)
-                return Group(self.file, path, values, groups)
+                return LabelGroup(self.file, path, values, groups)
             if word in _CLOSE:
                 self.close(path)
-                return Group(self.file, path, values, groups)
+                return LabelGroup(self.file, path, values, groups)
             value = self.value(place)
             if word in _OPEN:
                 last = value if isinstance(value, str) else ""

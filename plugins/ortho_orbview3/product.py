@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ortho_orbview3.label import Group, read_label
+from ortho_orbview3.label import LabelGroup, read_label
 from ortho_pipeline.plugin import (
     RPC,
     Array,
@@ -28,19 +28,31 @@ from ortho_pipeline.plugin import (
 
 #: Keys of the label by the names that RPC text has for them.
 SCALAR_KEYS = {
-    "LINE_OFF": "lineOffset", "SAMP_OFF": "pixelOffset", "LAT_OFF": "latitudeOffset", "LONG_OFF": "longitudeOffset",
-    "HEIGHT_OFF": "heightOffset", "LINE_SCALE": "lineScale", "SAMP_SCALE": "pixelScale", "LAT_SCALE": "latitudeScale",
-    "LONG_SCALE": "longitudeScale", "HEIGHT_SCALE": "heightScale",
-}  # fmt: skip
+    "LINE_OFF": "lineOffset",
+    "SAMP_OFF": "pixelOffset",
+    "LAT_OFF": "latitudeOffset",
+    "LONG_OFF": "longitudeOffset",
+    "HEIGHT_OFF": "heightOffset",
+    "LINE_SCALE": "lineScale",
+    "SAMP_SCALE": "pixelScale",
+    "LAT_SCALE": "latitudeScale",
+    "LONG_SCALE": "longitudeScale",
+    "HEIGHT_SCALE": "heightScale",
+}
 COEFFICIENT_KEYS = {
-    "LINE_NUM_COEFF": "lineNumeratorCoefficients", "LINE_DEN_COEFF": "lineDenominatorCoefficients",
-    "SAMP_NUM_COEFF": "pixelNumeratorCoefficients", "SAMP_DEN_COEFF": "pixelDenominatorCoefficients",
-}  # fmt: skip
+    "LINE_NUM_COEFF": "lineNumeratorCoefficients",
+    "LINE_DEN_COEFF": "lineDenominatorCoefficients",
+    "SAMP_NUM_COEFF": "pixelNumeratorCoefficients",
+    "SAMP_DEN_COEFF": "pixelDenominatorCoefficients",
+}
 ERROR_KEYS = {"ERR_BIAS": "errorBias", "ERR_RAND": "errorRand"}
 #: Corners as the label names them, with the column and row of their pixel's centre in parts of the last one.
 CORNERS = {
-    "upperLeftCorner": (0, 0), "upperRightCorner": (1, 0), "lowerRightCorner": (1, 1), "lowerLeftCorner": (0, 1),
-}  # fmt: skip
+    "upperLeftCorner": (0, 0),
+    "upperRightCorner": (1, 0),
+    "lowerRightCorner": (1, 1),
+    "lowerLeftCorner": (0, 1),
+}
 #: The vendor's word for a number that is not known.
 UNKNOWN = 999.0
 #: RPCs of label and text file that differ by more than the first (px) are reported, by more than the second refused.
@@ -175,12 +187,17 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
     if not difference <= CONTRADICTORY:
         raise InputError(
             f"the RPC in this file and that of {Path(product.file).name} differ by {difference:.3g} px",
-            file=text, field="rpc",
+            file=text,
+            field="rpc",
             remedy=Text(
-                "choose one: ", Setting("scene.rpc", "label"), ", ", Setting("scene.rpc", "text"), ", or ",
-                Setting("scene.rpc", "FILE")
+                "choose one: ",
+                Setting("scene.rpc", "label"),
+                ", ",
+                Setting("scene.rpc", "text"),
+                ", or ",
+                Setting("scene.rpc", "FILE"),
             ),
-        )  # fmt: skip
+        )
     differ = f"the RPCs of label and text differ by {difference:.2g} px; that of the text is taken"
     return rpc, str(text), (Notice("rpcs-differ", differ, difference_px=difference),)
 
@@ -197,21 +214,21 @@ def _box(rpc: RPC) -> Array:
     return centre + signs * half
 
 
-def _positive(group: Group, key: str) -> float:
+def _positive(group: LabelGroup, key: str) -> float:
     value = group.number(key)
     if not value > 0:
         raise InputError(f"{value:g} is not a spacing", file=group.file, field=group.place(key))
     return value
 
 
-def _known(group: Group, key: str) -> float | None:
+def _known(group: LabelGroup, key: str) -> float | None:
     if not group.has(key):
         return None
     value = group.number(key)
     return None if value < 0 or value == UNKNOWN else value
 
 
-def _time(group: Group, key: str) -> datetime.datetime | None:
+def _time(group: LabelGroup, key: str) -> datetime.datetime | None:
     if not group.has(key):
         return None
     text = group.text(key)
@@ -222,10 +239,11 @@ def _time(group: Group, key: str) -> datetime.datetime | None:
     return time if time.tzinfo is not None else time.replace(tzinfo=datetime.UTC)
 
 
-def _corners(product: Group) -> Array:
+def _corners(product: LabelGroup) -> Array:
     group = product.group("geodeticCorners")
-    found = np.array([[group.group(name).number(key) for key in ("longitude", "latitude", "height")]
-                      for name in CORNERS])  # fmt: skip
+    found = np.array(
+        [[group.group(name).number(key) for key in ("longitude", "latitude", "height")] for name in CORNERS]
+    )
     for name, (lon, lat, height) in zip(CORNERS, found.tolist(), strict=True):
         if abs(lat) > 90 or abs(lon) > 360 or not -1000 < height < 10_000:
             raise InputError(
@@ -234,7 +252,7 @@ def _corners(product: Group) -> Array:
     return found
 
 
-def _rpc(group: Group) -> RPC:
+def _rpc(group: LabelGroup) -> RPC:
     fields = {key: repr(group.number(name)) for key, name in SCALAR_KEYS.items()}
     for key, name in COEFFICIENT_KEYS.items():
         fields[key] = " ".join(map(repr, group.numbers(name, 20)))

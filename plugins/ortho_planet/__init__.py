@@ -32,12 +32,20 @@ MAX_SIZE = 5_000_000
 _METADATA = re.compile(r".*_metadata\.json$", re.IGNORECASE | re.DOTALL)
 _REMEDY = "download the item's metadata again"
 #: What of an item is worth showing, and what it is called here.
-_TEXTS = {"acquired": "acquired", "satellite_id": "satellite", "instrument": "instrument", "item_type": "item_type",
-          "strip_id": "strip"}  # fmt: skip
+_TEXTS = {
+    "acquired": "acquired",
+    "satellite_id": "satellite",
+    "instrument": "instrument",
+    "item_type": "item_type",
+    "strip_id": "strip",
+}
 _NUMBERS = {
-    "sun_azimuth": "sun_azimuth_deg", "sun_elevation": "sun_elevation_deg", "view_angle": "view_angle_deg",
-    "cloud_cover": "cloud_cover", "gsd": "stated_gsd_m",
-}  # fmt: skip
+    "sun_azimuth": "sun_azimuth_deg",
+    "sun_elevation": "sun_elevation_deg",
+    "view_angle": "view_angle_deg",
+    "cloud_cover": "cloud_cover",
+    "gsd": "stated_gsd_m",
+}
 
 
 @hookimpl
@@ -84,18 +92,26 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     facts = read_item(path)
     if rpc is None and not has_rpc(dataset):
         raise InputError(
-            "there is no RPC: orthorectified assets have none, and are orthoimages already", file=name,
+            "there is no RPC: orthorectified assets have none, and are orthoimages already",
+            file=name,
             remedy="take the basic product (level 1B, or SkySat's 1A) with its RPC",
-        )  # fmt: skip
+        )
     model, source = rpc_of_dataset(dataset, rpc)
     warnings = []
     if not str(facts.get("item_type", "PS")).startswith(("PS", "SkySat")):
         text = f"items of the type {facts['item_type']} were not at hand to check this reader with"
         warnings.append(Notice("unchecked-product", text))
     return Scene(
-        "planet", name, dataset.RasterXSize, dataset.RasterYSize, {"rpc": model}, source, facts, tuple(warnings),
+        "planet",
+        name,
+        dataset.RasterXSize,
+        dataset.RasterYSize,
+        {"rpc": model},
+        source,
+        facts,
+        tuple(warnings),
         sources=(path,),
-    )  # fmt: skip
+    )
 
 
 @reads(_REMEDY)

@@ -87,17 +87,24 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
     )
     facts: dict[str, Any] = {"arrays": [Path(one).name for one in files], "max_error_px": round(worst, 3)}
     return Scene(
-        "geolocation", name, *size, {family: model}, files[0], facts,
-        (Notice("only-a-start", text, max_error_px=worst),), sources=(files[1],),
-    )  # fmt: skip
+        "geolocation",
+        name,
+        *size,
+        {family: model},
+        files[0],
+        facts,
+        (Notice("only-a-start", text, max_error_px=worst),),
+        sources=(files[1],),
+    )
 
 
 def _layout_of(dataset: gdal.Dataset) -> Layout:
     """Return what the domain ``GEOLOCATION`` says; its files have to lie beside the image."""
     name = dataset.GetDescription()
     # GDAL gives bytes where a text is none.
-    fields = {key: text if isinstance(text, str) else "?" for key, text in
-              (dataset.GetMetadata("GEOLOCATION") or {}).items()}  # fmt: skip
+    fields = {
+        key: text if isinstance(text, str) else "?" for key, text in (dataset.GetMetadata("GEOLOCATION") or {}).items()
+    }
     if not has_arrays(dataset) or not fields.get("Y_DATASET"):
         raise InputError("this image names no geolocation arrays", file=name, field="GEOLOCATION", remedy=_REMEDY)
     folder = place(name).parent
@@ -108,9 +115,11 @@ def _layout_of(dataset: gdal.Dataset) -> Layout:
         # Whatever folder the metadata name, only the image's own is looked into.
         if ":" in text or not _is_file(beside):
             raise InputError(
-                f"the array {text[:200]!r} is no file beside the image", file=name, field=f"{axis}_DATASET",
+                f"the array {text[:200]!r} is no file beside the image",
+                file=name,
+                field=f"{axis}_DATASET",
                 remedy=_REMEDY,
-            )  # fmt: skip
+            )
         files.append(str(beside))
 
     def number(key: str, default: str) -> float:
@@ -166,9 +175,11 @@ def _nodes(name: str, layout: Layout, sources: tuple[gdal.Dataset, ...], size: t
     good &= np.isfinite(ground).all(axis=1) & (np.abs(ground[:, 1]) <= 90) & (np.abs(ground[:, 0]) <= 360)
     if good.sum() < max(16, 0.5 * len(good)):
         raise InputError(
-            f"{good.sum()} of {len(good)} nodes have a longitude and a latitude", file=name, field="GEOLOCATION",
+            f"{good.sum()} of {len(good)} nodes have a longitude and a latitude",
+            file=name,
+            field="GEOLOCATION",
             remedy=_REMEDY,
-        )  # fmt: skip
+        )
     lon = ground[good, 0]
     around = lon[len(lon) // 2]
     return image[good], np.column_stack([around + np.remainder(lon - around + 180, 360) - 180, ground[good, 1]])
@@ -180,10 +191,15 @@ def _fitted(image: Array, ground: Array, size: tuple[int, int]) -> tuple[SensorM
     ground = np.column_stack([ground, np.zeros(count)])
     half = np.arange(count) % 2 == 0
     points = Points(
-        ids=tuple(map(str, range(int(half.sum())))), image=image[half], ground=ground[half],
-        roles=np.full(int(half.sum()), "control"), sigma_image=np.ones(int(half.sum())),
-        sigma_ground=np.zeros((int(half.sum()), 3)), crs=pyproj.CRS.from_epsg(4326), source="geolocation arrays",
-    )  # fmt: skip
+        ids=tuple(map(str, range(int(half.sum())))),
+        image=image[half],
+        ground=ground[half],
+        roles=np.full(int(half.sum()), "control"),
+        sigma_image=np.ones(int(half.sum())),
+        sigma_ground=np.zeros((int(half.sum()), 3)),
+        crs=pyproj.CRS.from_epsg(4326),
+        source="geolocation arrays",
+    )
     for family in ("affine2d", "poly2", "poly3", "poly4", "poly5"):
         model = fit_family(family, points, size=size, heights=_HEIGHTS, ridge=None, robust=False).model
         worst = float(np.abs(model.ground_to_image(ground[~half]) - image[~half]).max())

@@ -85,8 +85,9 @@ def second_version(file: DimapFile) -> Scan:
     if profile not in PROFILES:
         raise file.error(
             f"the conventions of {profile[:40]} could not be checked against numbers of the vendor; read are"
-            f" {', '.join(PROFILES)}", "METADATA_PROFILE",
-        )  # fmt: skip
+            f" {', '.join(PROFILES)}",
+            "METADATA_PROFILE",
+        )
     size = "Raster_Data/Raster_Dimensions"
     rows, columns = file.integer(f"{size}/NROWS"), file.integer(f"{size}/NCOLS")
     stamp = f"{SECOND}/Time/Time_Stamp/LINE_PERIOD"

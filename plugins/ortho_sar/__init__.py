@@ -109,14 +109,21 @@ def open_scene(
         )
     if not _STEEPEST <= facts["incidence_deg"] <= _FLATTEST:
         raise InputError(
-            f"{facts['incidence_deg']:g} degrees are not the incidence of a radar", field="incidence",
+            f"{facts['incidence_deg']:g} degrees are not the incidence of a radar",
+            field="incidence",
             remedy=f"it is from {_STEEPEST:g} to {_FLATTEST:g} degrees from the vertical",
-        )  # fmt: skip
+        )
     height = facts["plane_m"]
     model = MapPlane.from_view(
-        crs, corner, pixel, size, height, math.radians(facts["azimuth_deg"]) + math.pi,
-        math.radians(facts["incidence_deg"]), (height - HALF_RANGE, height + HALF_RANGE),
-    )  # fmt: skip
+        crs,
+        corner,
+        pixel,
+        size,
+        height,
+        math.radians(facts["azimuth_deg"]) + math.pi,
+        math.radians(facts["incidence_deg"]),
+        (height - HALF_RANGE, height + HALF_RANGE),
+    )
     facts["relief_px_per_100_m"] = round(100 * math.hypot(*model.relief) / pixel[0], 2)
     return Scene("sar", name, *size, {"geo": model}, str(path or name), facts, _warnings(path is not None))
 
@@ -154,8 +161,12 @@ def read_extended(path: Path) -> dict[str, Any]:
     if not isinstance(vectors, list) or not vectors:
         raise InputError("there are no places of the satellite", file=path, field="collect.state.state_vectors")
     target = _place(at("collect", "image", "center_pixel", "target_position"), path, "center_pixel.target_position")
-    places = np.array([_place(one.get("position") if isinstance(one, dict) else None, path, "state_vectors.position")
-                       for one in vectors])  # fmt: skip
+    places = np.array(
+        [
+            _place(one.get("position") if isinstance(one, dict) else None, path, "state_vectors.position")
+            for one in vectors
+        ]
+    )
     # The middle of the aperture is where the radar is nearest, within what the vectors' distance leaves open.
     line = places[int(np.argmin(np.linalg.norm(places - target, axis=1)))] - target
     ground = geodetic(target[None])
@@ -186,9 +197,10 @@ def _map_of(dataset: gdal.Dataset) -> tuple[str, tuple[float, float], tuple[floa
     crs = parse_crs(text)
     if not crs.is_projected or steps[2] or steps[4] or not (steps[1] > 0 > steps[5]):
         raise InputError(
-            f"an image in {crs.name} is not read, only in a map projection with north on top", file=name,
+            f"an image in {crs.name} is not read, only in a map projection with north on top",
+            file=name,
             remedy="project it to UTM (gdalwarp -t_srs EPSG:326zz), which leaves the plane a plane",
-        )  # fmt: skip
+        )
     return crs.to_string(), (steps[0], steps[3]), (steps[1], -steps[5])
 
 

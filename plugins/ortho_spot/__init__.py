@@ -80,6 +80,12 @@ def open_scene(dataset: gdal.Dataset, *, attitude: str = "vendor") -> Scene:
         priors[f"{axis}_offset"] = Prior(0.0, sigma)
         priors[f"{axis}_drift"] = Prior(0.0, sigma * _DRIFT)
     return Scene(
-        "spot", name, *size, {"pushbroom": spot.model}, str(path), spot.facts | {"attitude": attitude},
-        tuple(warnings), priors=priors,
-    )  # fmt: skip
+        "spot",
+        name,
+        *size,
+        {"pushbroom": spot.model},
+        str(path),
+        spot.facts | {"attitude": attitude},
+        tuple(warnings),
+        priors=priors,
+    )

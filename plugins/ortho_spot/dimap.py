@@ -56,9 +56,17 @@ _STRIP, _CONFIGURATION = "Data_Strip", "Data_Strip/Sensor_Configuration"
 _ATTITUDES = f"{_STRIP}/Satellite_Attitudes"
 _SOURCE = "Dataset_Sources/Source_Information/Scene_Source"
 _SAID = (
-    "MISSION", "MISSION_INDEX", "INSTRUMENT", "INSTRUMENT_INDEX", "SENSOR_CODE", "IMAGING_DATE", "IMAGING_TIME",
-    "SUN_AZIMUTH", "SUN_ELEVATION", "INCIDENCE_ANGLE",
-)  # fmt: skip
+    "MISSION",
+    "MISSION_INDEX",
+    "INSTRUMENT",
+    "INSTRUMENT_INDEX",
+    "SENSOR_CODE",
+    "IMAGING_DATE",
+    "IMAGING_TIME",
+    "SUN_AZIMUTH",
+    "SUN_ELEVATION",
+    "INCIDENCE_ANGLE",
+)
 #: Camera axes (along the line, forward, to the ground) in those of the vendor on board.
 _VENDOR_FROM_CAMERA = np.diag([-1.0, 1.0, -1.0])
 #: The frame and the attitude are followed by rows of a table so far apart (s); where the vendor has rows, by those.
@@ -137,9 +145,15 @@ def read_spot(path: PathLike[str], *, attitude: str = "vendor", heights: tuple[f
         raise InputError(error.message, file=path, field=error.field, remedy=error.remedy) from error
     pixel = np.ptp(psi_y) / (len(psi_y) - 1) * (len(psi_y) - 1) / columns
     others = [_look_angles(file, line, columns) for line in lines[1:]]
-    differ = max((np.abs(theirs - ours).max() / pixel for other in others
-                  for theirs, ours in zip(other, (psi_x, psi_y), strict=True) if len(theirs) == len(ours)),
-                 default=0.0)  # fmt: skip
+    differ = max(
+        (
+            np.abs(theirs - ours).max() / pixel
+            for other in others
+            for theirs, ours in zip(other, (psi_x, psi_y), strict=True)
+            if len(theirs) == len(ours)
+        ),
+        default=0.0,
+    )
     return SpotScene(model, _facts(file), float(differ))
 
 
@@ -212,9 +226,10 @@ def _attitude(
     corrected = file.has(f"{_ATTITUDES}/Corrected_Attitudes")
     if corrected and kind == "speeds":
         raise file.error(
-            "this scene has a corrected attitude, which is better than angular speeds", "Corrected_Attitudes",
+            "this scene has a corrected attitude, which is better than angular speeds",
+            "Corrected_Attitudes",
             "leave the attitude to the vendor",
-        )  # fmt: skip
+        )
     if corrected:
         times, angles = _rows(file, f"{_ATTITUDES}/Corrected_Attitudes/Corrected_Attitude//Angles")
     elif kind == "vendor":

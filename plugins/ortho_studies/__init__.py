@@ -12,8 +12,10 @@ from ortho_pipeline.plugin import Subcommand, hookimpl
 @hookimpl
 def ortho_commands() -> Iterable[Subcommand]:
     """Add `ortho simulate` and `ortho reproduce`."""
-    yield Subcommand("simulate", "Make scenes of known truth.", "ortho_studies.cli:simulate")
+    yield Subcommand("simulate", "Write scenes of known truth.", "ortho_studies.cli:simulate", group="Set-up")
     yield Subcommand(
-        "reproduce", "Compute the tables of the papers that this package implements, beside the papers' numbers.",
+        "reproduce",
+        "Recompute the tables of four papers.",
         "ortho_studies.cli:reproduce",
-    )  # fmt: skip
+        group="Set-up",
+    )

@@ -44,12 +44,15 @@ def _offered() -> dict[str, Study]:
 
 @click.group(cls=_Studies)
 def simulate() -> None:
-    """Make scenes of known truth."""
+    """Write scenes of known truth."""
 
 
 @click.group(cls=_Studies)
 def reproduce() -> None:
-    """Compute the tables of the papers that this package implements, beside the papers' numbers."""
+    """Recompute the tables of four papers.
+
+    Each table shows the paper's numbers beside ours.
+    """
 
 
 def _simulation(study: Study) -> click.Command:
@@ -74,9 +77,12 @@ def _experiment(study: Study) -> click.Command:
         "--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page."
     )
     @click.option(
-        "--realisations", type=click.IntRange(min=1), default=study.realisations, show_default=True,
+        "--realisations",
+        type=click.IntRange(min=1),
+        default=study.realisations,
+        show_default=True,
         help="How often noise is drawn.",
-    )  # fmt: skip
+    )
     @json_option
     def run(folder: str | None, realisations: int, as_json: bool) -> None:
         from ortho_studies import studies
@@ -100,9 +106,14 @@ def _option(option: StudyOption) -> Any:
         of_range: Any = click.IntRange if kind is int else click.FloatRange
         kind = of_range(option.low, option.high)
     return click.option(
-        flag, option.name, type=kind, default=option.default, show_default=shown, metavar=option.unit or None,
+        flag,
+        option.name,
+        type=kind,
+        default=option.default,
+        show_default=shown,
+        metavar=option.unit or None,
         help=option.help,
-    )  # fmt: skip
+    )
 
 
 def _help(study: Study, group: str) -> str | None:

@@ -322,7 +322,7 @@ def test_formats_in_place_of_names_never_reach_proj(text: str) -> None:
 
 
 def test_a_refusal_says_what_to_do() -> None:
-    with pytest.raises(CrsError, match="names a file by its path") as caught:
+    with pytest.raises(CrsError, match="refers to a file by its path") as caught:
         parse_crs("+proj=longlat +ellps=bessel +nadgrids=/data/grid.gsb")
     assert "EPSG:n" in str(caught.value)
 

@@ -200,8 +200,8 @@ def test_a_format_that_this_gdal_was_built_without_is_named(tmp_path):
     assert len(said) == len(files), done.stderr
     for line, (name, (driver, _)) in zip(said, files.items(), strict=True):
         assert name in line
-        assert f"GDAL's driver {driver}, and this GDAL" in line
-        assert "Remedy: take a GDAL that has it" in line
+        assert f"GDAL's driver {driver}, but this GDAL" in line
+        assert "Remedy: use a GDAL that has it" in line
 
 
 # -- texts that are no text, places that are no place ------------------------------------------------------------------

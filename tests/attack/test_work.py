@@ -14,7 +14,7 @@ from osgeo import gdal, osr
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.source import RasterSource, open_dataset, open_pixels
 
 #: Beyond the default of 512 MB.

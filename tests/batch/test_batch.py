@@ -276,7 +276,7 @@ def test_paths_stay_inside_of_the_root(block, change):
     block.scene(str(elsewhere / "x.tif"))
     (block.folder / "linked").symlink_to(elsewhere)
     block.write(FILE.replace(*change))
-    with pytest.raises(InputError, match=r"outside of the root|not a path of a file|opened unasked"):
+    with pytest.raises(InputError, match=r"outside of the root|not a path of a file|network access is off"):
         batch_plan.plan(block.file)
 
 
@@ -319,7 +319,7 @@ def test_a_run_writes_through_no_link_in_its_output_folder(block, where):
         said = "" if outcome is None else outcome["message"]
     except InputError as error:
         said = error.message
-    assert "a symbolic link is in the way" in said
+    assert "this is a symbolic link" in said
     assert {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()} == before
     assert target.is_file() or not list(target.iterdir())
 

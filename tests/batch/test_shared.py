@@ -397,7 +397,7 @@ def test_a_pipeline_file_in_a_store_names_images_there(store: str, tiny: Any, mo
     objects_in.put("items/c.json", json.dumps(item).encode())
     objects_in.put("pipeline.yaml", FAR.encode())
     address = f"{store}/in/pipeline.yaml"
-    with pytest.raises(InputError, match="unasked"):
+    with pytest.raises(InputError, match="network access is off"):
         plan(address)
     with pytest.raises(InputError, match="goes to a store"):
         runner.run(address, allow_network=True)
@@ -444,7 +444,7 @@ def test_a_file_on_this_machine_may_name_addresses_if_that_is_allowed(tiny: Any)
             f"scenes:\n  - image: {public.address}/{tiny.image.name}\n"
             f"    surface: {{dem: {public.address}/dem.tif, vertical: ellipsoid}}\n    output: {{format: GTiff}}\n"
         )
-        with pytest.raises(InputError, match="unasked") as caught:
+        with pytest.raises(InputError, match="network access is off") as caught:
             plan(file)
         assert caught.value.field == "scenes[0].image"
         made = runner.run(file, allow_network=True, executor="sequential")

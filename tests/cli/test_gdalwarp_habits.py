@@ -330,7 +330,7 @@ def refused(tiny, tmp_path):
 
 def test_metres_given_as_degrees_are_refused_with_the_usual_size(refused, tmp_path):
     said = refused("-t_srs", "EPSG:4326", "-tr", 30, 30, "-o", tmp_path / "out")
-    assert "smaller than one pixel of 30 degrees" in said
+    assert "a resolution of 30 means 30 degrees" in said
     # 400 x 300 pixels cover 0.02 x 0.013 degrees.
     assert "did you mean --resolution 0.000047?" in said
 

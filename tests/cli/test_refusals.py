@@ -184,7 +184,7 @@ def test_no_number_beyond_numbers_is_a_sigma_of_ground(sample, tmp_path):
 def test_a_pixel_larger_than_the_earth_is_none(tiny, tmp_path, text):
     box = ["-te", "530600", "4122000", "530700", "4122100"]
     words = ["rectify", str(tiny.image), "--height", "500", *box, "-o", str(tmp_path / "out"), "--resolution", text]
-    assert "no pixel is" in document(words)["message"]
+    assert "is not a pixel size" in document(words)["message"]
 
 
 @pytest.mark.parametrize("box", [("-1e99", "0", "1e99", "1"), ("0", "0", "1e60", "1"), ("1e20", "0", "2e20", "1")])

@@ -190,7 +190,7 @@ def test_a_filled_dem_covers_all(tiny, tmp_path, fill):
 
 
 def test_a_dem_of_unknown_datum_is_refused(tiny, tmp_path):
-    with pytest.raises(DatumError, match="measured above"):
+    with pytest.raises(DatumError, match="does not state its height datum"):
         rectify(tiny, tmp_path / "out", surface=SurfaceOptions(dem=tiny.dem))
 
 
@@ -408,13 +408,13 @@ def test_a_void_between_the_rays_is_reported_with_its_share(tiny, tmp_path):
     dem.WriteArray(heights)
     dem = None
     report = rectify(tiny, tmp_path / "out", surface=dem_of(tiny, dem=fine)).document["report"]
-    found = [text for text in report["warnings"] if "(1 sample without a height within it)" in text]
+    found = [text for text in report["warnings"] if "(1 sample without a height inside it)" in text]
     assert len(found) == 1
     # The scene has 1.92 x 1.44 km, a sample 5 x 5 m.
     assert 1 - report["surface"]["coverage"] == pytest.approx(25 / (1920 * 1440), rel=0.1)
     assert "100 % of the scene" not in (tmp_path / "out" / "tiny_report.html").read_text()
     filled = rectify(tiny, tmp_path / "filled", surface=dem_of(tiny, dem=fine, fill="nearest")).document["report"]
-    assert any("were filled" in text for text in filled["warnings"])
+    assert any("was filled" in text for text in filled["warnings"])
 
 
 def moved(tiny, tmp_path, lon):

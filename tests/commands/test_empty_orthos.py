@@ -39,7 +39,7 @@ def refused(tiny, folder, match, kind=InputError, **options):
 
 def test_an_extent_beside_the_scene_is_refused(tiny, tmp_path):
     output = OutputOptions(extent=(0.0, 0.0, 1000.0, 1000.0), resolution=10.0)
-    error = refused(tiny, tmp_path / "out", "lies beside the scene", output=output)
+    error = refused(tiny, tmp_path / "out", "does not overlap the scene", output=output)
     assert error.field == "output.extent"
 
 
@@ -71,7 +71,11 @@ def test_a_height_that_the_model_is_not_good_for_is_refused(tiny, tmp_path, heig
 def test_a_dem_elsewhere_is_refused(tiny, tmp_path, fill):
     dem = moved(tiny, tmp_path / "far.tif", east=100_000.0)
     error = refused(
-        tiny, tmp_path / "out", "covers (nothing|0)", CoverageError, surface=dem_of(tiny, dem=dem, fill=fill)
+        tiny,
+        tmp_path / "out",
+        "(not cover the scene|covers 0)",
+        CoverageError,
+        surface=dem_of(tiny, dem=dem, fill=fill),
     )
     assert error.file == str(dem)
 

@@ -50,7 +50,7 @@ def test_it_stays_as_it_is():
 
 @pytest.mark.parametrize("code", ["", "Few", "few points", "few_points", "-few", "few-", "few--points"])
 def test_codes_have_one_form(code):
-    with pytest.raises(ValueError, match="not a code"):
+    with pytest.raises(ValueError, match="not a notice code"):
         Notice(code, "text")
 
 

@@ -131,7 +131,7 @@ def test_a_journal_of_somebody_else_leads_nowhere(tmp_path):
         assert victim.read_text() == "precious"
         assert contents(folder) == {"a.txt": "a"}
     lock.symlink_to(victim)
-    with pytest.raises(InputError, match="symbolic link is in the way"), together(folder, "scene"):
+    with pytest.raises(InputError, match="this is a symbolic link"), together(folder, "scene"):
         pass
     assert victim.read_text() == "precious"
 
@@ -142,7 +142,7 @@ def test_odd_output_paths_are_typed_errors(tmp_path, make):
     if make == "folder":
         path.mkdir()
     before = sorted(tmp_path.iterdir())
-    with pytest.raises(InputError, match=r"folder lies|too long"):
+    with pytest.raises(InputError, match=r"folder with this name|too long"):
         write_text(path, "x")
     assert sorted(tmp_path.iterdir()) == before
 
@@ -150,7 +150,7 @@ def test_odd_output_paths_are_typed_errors(tmp_path, make):
 def test_a_folder_that_links_to_itself_is_a_typed_error(tmp_path):
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")
-    with pytest.raises(InputError, match=r"leads nowhere|cannot write here|symbolic link is in the way"):
+    with pytest.raises(InputError, match=r"cannot be resolved|cannot write here|this is a symbolic link"):
         write_text(tmp_path / "a" / "x.txt", "x")
 
 

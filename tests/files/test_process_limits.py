@@ -87,7 +87,7 @@ def test_a_run_with_little_memory_ends_within_seconds(tmp_path, megabytes):
     words = [sys.executable, "-c", line, tools, str(tmp_path), str(megabytes), *rectify()]
     ended = subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
     assert ended.stdout.startswith("1 False"), ended.stdout + ended.stderr
-    assert "there is not enough memory: a limit on this process leaves" in ended.stdout
+    assert "not enough memory: the limit of this process leaves" in ended.stdout
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="heaps of threads are glibc's")

@@ -27,6 +27,7 @@ from ortho_pipeline.geodesy.crs import (
     utm_crs,
 )  # fmt: skip
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
+from ortho_pipeline.geodesy.missing_grids import grid_remedy
 from ortho_pipeline.geodesy.naming import crs_definition, crs_text
 from ortho_pipeline.geodesy.proj_grids import grids, proj_info
 
@@ -94,8 +95,8 @@ def test_a_missing_grid_is_an_error_that_names_it_and_the_remedy(name: str) -> N
 
 
 def test_only_egm96_is_to_be_had_from_debian() -> None:
-    assert "Debian's proj-data" in module._grid_remedy("us_nga_egm96_15.tif", "or give a grid")
-    assert "Debian" not in module._grid_remedy("us_nga_egm08_25.tif", "or give a grid")
+    assert "Debian's proj-data" in grid_remedy("us_nga_egm96_15.tif", "or give a grid")
+    assert "Debian" not in grid_remedy("us_nga_egm08_25.tif", "or give a grid")
 
 
 def test_ellipsoid_needs_nothing() -> None:
@@ -127,7 +128,7 @@ def test_what_is_no_height_datum(text: str) -> None:
 def test_a_file_that_is_no_geoid(tmp_path: Path) -> None:
     path = tmp_path / "notes.gtx"
     path.write_text("this is no grid")
-    with pytest.raises(DatumError, match="not a geoid grid"):
+    with pytest.raises(DatumError, match="as a geoid grid"):
         Vertical.parse(str(path))
 
 
@@ -146,7 +147,7 @@ def test_a_geoid_whose_header_lies(tmp_path: Path, change: tuple[bytes, tuple]) 
     # PROJ fills gigabytes with zeros for the first two.
     path = tmp_path / "geoid.gtx"
     path.write_bytes(struct.pack(change[0], *change[1]) + bytes(256))
-    with pytest.raises(DatumError, match="not a geoid grid"):
+    with pytest.raises(DatumError, match="as a geoid grid"):
         Vertical.parse(str(path))
     path.write_bytes(struct.pack(">ddddii", 30.0, 33.0, 1.0, 1.0, 8, 8) + bytes(256))
     assert Vertical.parse(str(path)).undulation([34.0], [33.0]) == 0
@@ -241,7 +242,7 @@ def test_a_geotiff_geoid_whose_header_lies(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["pipe.gtx", "pipe.tif"])
 def test_a_geoid_that_is_a_pipe(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / name)
-    with pytest.raises(DatumError, match="not a geoid grid"):
+    with pytest.raises(DatumError, match="as a geoid grid"):
         Vertical.parse(str(tmp_path / name))
 
 

@@ -152,7 +152,7 @@ def test_nodata_beside_the_edge_is_left_out():
     holed[20:24] = np.nan
     assert analyse_edge(holed, segment).psf_sigma == pytest.approx(reference.psf_sigma, rel=0.05)
     holed[:, 32:] = np.nan
-    with pytest.raises(InputError, match=r"no value|to one side"):
+    with pytest.raises(InputError, match=r"no value|on one side"):
         analyse_edge(holed, segment)
 
 

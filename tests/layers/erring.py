@@ -25,9 +25,9 @@ from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.models import RPC, ImageCorrection, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.warp.layers.accuracy import Budget, Parts, parts_at, predictive
-from ortho_pipeline.warp.layers.error_ellipse import circular_error
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.accuracy import Budget, Parts, parts_at, predictive
+from ortho_pipeline.warp.quality.error_ellipse import circular_error
+from ortho_pipeline.warp.quality.sight import Sight
 
 SENSORS = ("ikonos", "cartosat", "orbview3", "bilsat")
 #: UTM zone of each simulated place.
@@ -76,7 +76,7 @@ def scene_of(sensor: str, seed: int, count: int, *, bent: bool) -> Truth:
         points = points.with_roles(["control"] * count)
         return Truth(vendor_rpc(scene), points, (scene.columns, scene.rows), scene.meet, scene.terrain, zone)
     if sensor == "cartosat":
-        bias = cartosat.Bias(*random.normal(0, 5, 2), *(random.normal(0, 2e-4, 3) if bent else (0.0, 0.0, 0.0)))
+        bias = cartosat.RpcBias(*random.normal(0, 5, 2), *(random.normal(0, 2e-4, 3) if bent else (0.0, 0.0, 0.0)))
         pair = cartosat.StereoPair.make(seed=seed, points=count)
         camera, sigma = pair.cameras["fore"], 0.3
         points = pair.measure(seed, sigma_column=sigma, sigma_row={"fore": sigma, "aft": sigma})["fore"]

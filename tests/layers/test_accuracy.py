@@ -12,9 +12,9 @@ from osgeo import gdal
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp.layers.accuracy import Budget, layer_grid, parts_at, write_accuracy
-from ortho_pipeline.warp.layers.error_ellipse import circular_error
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, write_accuracy
+from ortho_pipeline.warp.quality.error_ellipse import circular_error
+from ortho_pipeline.warp.quality.sight import Sight
 
 UTM = pyproj.CRS.from_epsg(32634)
 SIZE = (400, 300)

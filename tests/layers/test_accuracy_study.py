@@ -18,8 +18,8 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
-from ortho_pipeline.warp.layers.accuracy import Budget, parts_at, predictive
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.accuracy import Budget, parts_at, predictive
+from ortho_pipeline.warp.quality.sight import Sight
 
 
 def test_errors_are_as_large_as_predicted():

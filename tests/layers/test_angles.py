@@ -18,9 +18,9 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp.layers.angles import Sun, write_angles, write_shadows
-from ortho_pipeline.warp.layers.hiding import Hiding
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.angles import Sun, write_angles, write_shadows
+from ortho_pipeline.warp.quality.hiding import Hiding
+from ortho_pipeline.warp.quality.sight import Sight
 
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (30, 150, 150, 162, 18.0), (180, 60, 220, 66, 25.0)))
 SUN = Sun(142.0, 40.0)

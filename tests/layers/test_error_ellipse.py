@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from ortho_pipeline.warp.layers.error_ellipse import circular_error, circular_error_of_all, radii
+from ortho_pipeline.warp.quality.error_ellipse import circular_error, circular_error_of_all, radii
 
 
 def test_a_line_and_a_circle_are_those_of_the_normal_and_the_rayleigh_distribution():

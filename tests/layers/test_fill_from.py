@@ -22,7 +22,7 @@ from ortho_pipeline.report.document import read_report
 from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp import engine
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (30, 150, 150, 162, 18.0)))
 HEIGHTS = (FLOOR, FLOOR + 60)
@@ -186,7 +186,7 @@ def test_an_ortho_that_cannot_fill_is_refused_before_the_first_pixel(tiny, steep
     kind = other_ortho(tmp_path / "kind.tif", grid, dtype="float32")
     bare = tmp_path / "bare.tif"
     gdal.GetDriverByName("GTiff").Create(str(bare), 20, 20, 1, gdal.GDT_Byte).FlushCache()
-    for path, words in ((elsewhere, "lies elsewhere"), (bands, "2 bands"), (kind, "float32"), (bare, "CRS"),
+    for path, words in ((elsewhere, "does not overlap the scene"), (bands, "2 bands"), (kind, "float32"), (bare, "CRS"),
                         (tmp_path / "none.tif", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=words) as caught:
             commands.check(tiny.image, **common, output=dataclasses.replace(output, fill_from=path))

@@ -17,9 +17,9 @@ from space import Hills, Satellite, angles, axes, between, radius_of, to_space, 
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp.layers.accuracy import Budget, layer_grid, write_accuracy
-from ortho_pipeline.warp.layers.angles import Sun, write_angles, write_shadows
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, write_accuracy
+from ortho_pipeline.warp.quality.angles import Sun, write_angles, write_shadows
+from ortho_pipeline.warp.quality.sight import Sight
 
 #: East of the middle of its UTM zone by 2.9°, of that of EPSG:3035 by 7.9°.
 LON = 17.9

@@ -9,8 +9,8 @@ from osgeo import gdal
 from scipy.ndimage import binary_dilation
 
 from ortho_pipeline.raster.source import RasterSource
-from ortho_pipeline.warp.layers.hiding import Hiding
 from ortho_pipeline.warp.mosaic import Ortho, lay_out, owners_of, write_cog
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: Houses with streets between them, some of them narrow; each roof has a brightness of its own.
 BLOCK = City(tuple(

@@ -15,10 +15,10 @@ from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
-from ortho_pipeline.warp.layers import visibility
-from ortho_pipeline.warp.layers.sight import Sight
-from ortho_pipeline.warp.layers.visibility import Visibility
-from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+from ortho_pipeline.warp.quality import visibility
+from ortho_pipeline.warp.quality.sight import Sight
+from ortho_pipeline.warp.quality.visibility import Visibility
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Streets, a tower, a low house beside it, a long block, and a cliff: half of the square lies 35 m higher.
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (130, 96, 142, 112, 8.0), (30, 150, 150, 162, 18.0)))

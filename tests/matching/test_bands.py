@@ -48,7 +48,7 @@ def matched(
     scene: Path, model: SensorModel, surface: Surface, reference: Path, *bands: int, search: float = 20.0,
     points: int = 60,
 ) -> matching.Matches:  # fmt: skip
-    view = matching.View(Intensity(RasterSource(scene)), model, surface)
+    view = matching.SceneView(Intensity(RasterSource(scene)), model, surface)
     references = matching.open_references([reference], bands)
     return matching.match(view, references, matching.MatchSettings(search, points))
 

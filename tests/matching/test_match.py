@@ -114,7 +114,7 @@ def test_matches_do_not_depend_on_threads(tmp_path):
 def test_chips_show_the_same_where_it_was_found(tmp_path):
     # A reference that errs from place to place, or all chips would lie within a hundredth of a pixel of each other.
     case = Case(replace(PLAIN, reference_sigma=0.5, reference_length=80.0), tmp_path).write()
-    seen = matching.View(
+    seen = matching.SceneView(
         Intensity(RasterSource(case.scene_file)), case.model, open_dem(case.dem_file, "ellipsoid")
     )  # fmt: skip
     settings = matching.MatchSettings(search=30.0, points=60, threads=1)

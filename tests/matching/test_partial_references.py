@@ -48,7 +48,7 @@ def displaced(case: Case, share: float, by: int, path: Path) -> Path:
 
 def matched(case: Case, reference: Path, search: float = 40.0) -> matching.Matches:
     surface = open_dem(case.dem_file, "ellipsoid")
-    view = matching.View(Intensity(RasterSource(case.scene_file)), case.model, surface)
+    view = matching.SceneView(Intensity(RasterSource(case.scene_file)), case.model, surface)
     return matching.match(view, matching.open_references([reference]), matching.MatchSettings(search, 80))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ortho_pipeline.imaging.matching.targets import View, near
+from ortho_pipeline.imaging.matching.targets import SceneView, near
 from ortho_pipeline.models import RPC
 
 SIZE = 1000
@@ -28,7 +28,7 @@ class Square:
 
 
 @pytest.fixture
-def view() -> View:
+def view() -> SceneView:
     """A scene of 1000 px of 1 m on the equator."""
     one, zero = np.eye(20)[0], np.zeros(20)
     col, row = zero.copy(), zero.copy()
@@ -36,7 +36,7 @@ def view() -> View:
     scale = SIZE / 2 / 111_319.5
     half = SIZE / 2
     model = RPC(half, half, 20.0, 0.0, 500.0, half, half, scale, scale, 300.0, col, one, row, one)
-    return View(SimpleNamespace(width=SIZE, height=SIZE), model, None)
+    return SceneView(SimpleNamespace(width=SIZE, height=SIZE), model, None)
 
 
 @pytest.mark.parametrize(

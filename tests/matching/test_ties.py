@@ -47,11 +47,11 @@ class Look(Case):
     def scene_file(self) -> Path:
         return self.folder / f"scene{self.number}.tif"
 
-    def view(self, surface: Surface) -> matching.View:
-        return matching.View(Intensity(RasterSource(self.scene_file)), self.model, surface)
+    def view(self, surface: Surface) -> matching.SceneView:
+        return matching.SceneView(Intensity(RasterSource(self.scene_file)), self.model, surface)
 
 
-def looks(folder: Path, angles: list[float], **changes: object) -> tuple[list[Look], list[matching.View]]:
+def looks(folder: Path, angles: list[float], **changes: object) -> tuple[list[Look], list[matching.SceneView]]:
     """Return scenes off nadir by so many degrees, and how a matcher sees them."""
     settings = {"side": 420, "relief": 6.0, "error": 6.0, "margin": 250.0, **changes}
     found = [Look(Setting(off_nadir_deg=angle, **settings), folder, k) for k, angle in enumerate(angles)]

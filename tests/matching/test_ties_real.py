@@ -18,7 +18,7 @@ from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_of_dataset
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.imaging.matching import MatchSettings, View, match, open_references
+from ortho_pipeline.imaging.matching import MatchSettings, SceneView, match, open_references
 from ortho_pipeline.imaging.ties import Ties, TieSettings, tie
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points.image_errors import sigma_of_covariance
@@ -57,7 +57,7 @@ def pleiades(real: Path, name: str) -> tuple[dict[str, Path], dict[str, RPC], Su
 
 def tied(images: Mapping[str, Path], models: Mapping[str, RPC], surface: Surface, dem_sigma: float) -> Ties:
     """Return the ties between images."""
-    views = [View(Intensity(RasterSource(path)), models[name], surface) for name, path in images.items()]
+    views = [SceneView(Intensity(RasterSource(path)), models[name], surface) for name, path in images.items()]
     return tie(views, TieSettings(search=15.0, points=700, dem_sigma=dem_sigma))
 
 
@@ -106,7 +106,7 @@ def test_matches_with_an_ortho_of_the_other_image_are_the_ties(real, tmp_path):
     x, y = ground_transform("EPSG:4979", "EPSG:32636")(ground)[:, :2].T
     grid = Grid.of_extent(pyproj.CRS(32636), (x.min(), y.min(), x.max(), y.max()), (0.5, 0.5))
     rectify(models[other], source, surface, grid, path, resampling="cubic", driver="GTiff")
-    view = View(Intensity(RasterSource(images[one])), models[one], surface)
+    view = SceneView(Intensity(RasterSource(images[one])), models[one], surface)
     matches = match(view, open_references([path]), MatchSettings(30.0, 700, 15.0)).points
     there = models[other].ground_to_image(matches.to_crs("EPSG:4979").ground)
     ties = tied(images, models, surface, 15.0)

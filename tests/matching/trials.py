@@ -42,11 +42,11 @@ def matches(
     OrthoError
         If it refuses.
     """
-    from ortho_pipeline.imaging.matching import MatchSettings, View, match, open_references
+    from ortho_pipeline.imaging.matching import MatchSettings, SceneView, match, open_references
     from ortho_pipeline.raster.intensity import Intensity
     from ortho_pipeline.raster.source import RasterSource
 
-    view = View(Intensity(RasterSource(scene)), model, surface)
+    view = SceneView(Intensity(RasterSource(scene)), model, surface)
     settings = MatchSettings(search, points, dem_sigma, reference_sigma, threads, rotation_deg=rotation_deg)
     return match(view, open_references(references), settings).points
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_measure.project import Project
-from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.entry import PageEntry
 from ortho_measure.serving.server import application
 from starlette.testclient import TestClient
 
@@ -190,7 +190,7 @@ def check(opening: Callable[[], Project], count: int, seed: int, between: int) -
     session = opening()
     person = Person(seed, list(getattr(getattr(session, "images", None), "labels", ())))
     while True:
-        entry = Entry()
+        entry = PageEntry()
         with TestClient(
             application(session, entry, {HOST}), base_url=f"http://{HOST}", raise_server_exceptions=False
         ) as client:

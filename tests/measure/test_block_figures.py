@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ortho_measure.block.left_out import LeftOut
+from ortho_measure.block.left_out import LeftOutResiduals
 from ortho_measure.block.planning import BlockGrid, next_of_block
 from ortho_measure.block.solution import figures, solve
 from ortho_studies.simulation.scanner import LineScanner
@@ -91,7 +91,7 @@ def test_a_control_point_left_out_is_as_if_it_had_checked(cameras: Any, sigma: A
         starts["fore"] = replace(starts["fore"], priors={first: Prior(0.0, 2.0)})
     table = table_of(cameras, ground_of(30), ["control", "tie", "check"], np.random.default_rng(4), sigma)
     fit = adjusted(starts, table)
-    without = LeftOut.of(fit, starts, None)
+    without = LeftOutResiduals.of(fit, starts, None)
     # Which sigmas are found depends on all points; with those of all of them one is left out.
     table = table if sigma else table.with_ground_sigma(fit.variances.sigma_xy, fit.variances.sigma_h)
     for k in (0, 3, 6):
@@ -111,7 +111,7 @@ def test_a_ray_left_out_is_where_the_others_put_it_and_of_two_only_across_the_ot
     starts = starts_of(cameras)
     table = table_of(cameras, ground_of(30), ["control", "tie", "tie"], np.random.default_rng(5))
     fit = adjusted(starts, table)
-    without = LeftOut.of(fit, starts, None)
+    without = LeftOutResiduals.of(fit, starts, None)
     for ray in (1, 31, 62):
         kept = table.of_rays(np.arange(table.rays) != ray)
         again = adjusted(starts, kept)
@@ -125,7 +125,7 @@ def test_a_ray_left_out_is_where_the_others_put_it_and_of_two_only_across_the_ot
     two = replace(two, images=("fore", "aft"), image=two.image // 2)
     pair = {name: starts[name] for name in two.images}
     fit = adjusted(pair, two)
-    of_ties = LeftOut.of(fit, pair, None).rays[fit.points.roles[fit.points.point] == "tie"].reshape(2, -1, 2)
+    of_ties = LeftOutResiduals.of(fit, pair, None).rays[fit.points.roles[fit.points.point] == "tie"].reshape(2, -1, 2)
     assert np.isfinite(of_ties).all()
     np.testing.assert_allclose(np.linalg.norm(of_ties[0], axis=1), np.linalg.norm(of_ties[1], axis=1), rtol=0.02)
 
@@ -135,7 +135,7 @@ def test_w_is_as_large_as_chance_has_it_and_names_what_is_wrong(cameras: Any) ->
     chances = []
     for turn in range(3):
         table = table_of(cameras, ground_of(60, turn), ["control", "tie", "check"], rng)
-        chances.append(LeftOut.of(adjusted(starts, table), starts, None).chance)
+        chances.append(LeftOutResiduals.of(adjusted(starts, table), starts, None).chance)
     # The least of a tie's three and a known point's four, which depend on each other: between one and four chances.
     share = np.mean(np.concatenate(chances) < 0.05)
     assert 0.04 < share < 0.22

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from ortho_measure.block.session import BlockSession, open_block_session
 from ortho_measure.serving.guard import MAX_BODY
-from ortho_measure.serving.tiles import Tiles
+from ortho_measure.serving.tiles import TileServer
 
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.errors import InputError
@@ -136,7 +136,7 @@ def test_without_a_reference_ties_alone_hold_the_images_together(
     assert found[0]["ground"] is None
     assert state["error"] == ""
     assert "not tested" in state["headline"]["what"]
-    assert "reference-0" not in Tiles(session).bands
+    assert "reference-0" not in TileServer(session).bands
     places = state["marks"][0]["places"]
     assert np.hypot(*np.subtract(places["scene-1"], found[0]["rays"]["second"]["image"])) < 1.0
     # One ray alone says nothing, stays in the file, and is shown in the other image where it is expected.
@@ -253,12 +253,12 @@ def test_what_several_images_have_not_is_refused_in_a_line(block_client: Any, wh
 @pytest.fixture(scope="module")
 def block_client(stereo: Any, tmp_path_factory: pytest.TempPathFactory):
     testclient = pytest.importorskip("starlette.testclient", reason="the extra 'measure' is not installed")
-    from ortho_measure.serving.entry import Entry
+    from ortho_measure.serving.entry import PageEntry
     from ortho_measure.serving.server import application
 
     output = tmp_path_factory.mktemp("block") / "p.geojson"
     session = open_block_session([SAMPLE / "scene.tif", stereo.path], output, surface=SURFACE)
-    entry = Entry("folder")
+    entry = PageEntry("folder")
     with testclient.TestClient(application(session, entry, {"127.0.0.1:1"}), base_url="http://127.0.0.1:1") as client:
         client.get(entry.path)
         facts = client.post("/folder/api/begin", json={"window": "window-one"}).json()

@@ -20,7 +20,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 
 pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
-from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.entry import PageEntry
 from ortho_measure.serving.guard import MAX_BODY, REPORT_POLICY
 from ortho_measure.serving.server import PAGE, application
 from starlette.testclient import TestClient
@@ -32,7 +32,7 @@ FOLDER, HOST, WINDOW = "a-folder-of-tests", "127.0.0.1:4321", "window-one"
 @contextlib.contextmanager
 def entered(session: Project) -> Iterator[TestClient]:
     """Give a client that has the cookie."""
-    entry = Entry(FOLDER)
+    entry = PageEntry(FOLDER)
     with TestClient(application(session, entry, {HOST}), base_url=f"http://{HOST}") as client:
         assert client.get(entry.path).status_code == 200
         yield client
@@ -82,8 +82,8 @@ def test_nothing_is_answered_without_the_cookie(client: TestClient) -> None:
 
 
 def test_an_address_lets_one_browser_in_and_that_one_again() -> None:
-    entry = Entry()
-    path, other = entry.path, Entry()
+    entry = PageEntry()
+    path, other = entry.path, PageEntry()
     query = path.split("?")[1].encode()
     assert entry.exchange(other.path.split("?")[1].encode()) is None
     cookie = entry.exchange(query)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ortho_measure.serving.tiles import Tiles
+from ortho_measure.serving.tiles import TileServer
 from ortho_measure.session import Session, open_session
 
 from ortho_pipeline import commands
@@ -179,7 +179,7 @@ def test_typed_ground_is_understood(opens: Opens) -> None:
 
 def test_tiles_show_the_pixels_that_are_there(opens: Opens, truth, features: np.ndarray) -> None:
     session = opens()
-    tiles = Tiles(session)
+    tiles = TileServer(session)
     from ortho_pipeline.raster.source import RasterSource
 
     pixels = RasterSource(SAMPLE / "scene.tif").read(0, 0, 1000, 1000)[0].astype(float)
@@ -221,7 +221,7 @@ def test_the_reference_as_a_map_has_its_own_pixels_and_the_places_of_the_truth(
     session = opens(gcps=SAMPLE / "gcps.geojson")
     from ortho_pipeline.raster.source import RasterSource
 
-    tiles = Tiles(session)
+    tiles = TileServer(session)
     pixels = RasterSource(reference).read(512, 256, 256, 256)[0]
     shown = tiles.pixels("map-0", 0, 1, 512, 256, 0)
     np.testing.assert_array_equal(np.nan_to_num(shown), pixels)

@@ -16,7 +16,7 @@ from ortho_studies.bilsat.truth import (
     SIZE,
     XS_CAMERAS,
     BilsatScene,
-    Hills,
+    BilsatTerrain,
     Snapshot,
     render,
 )
@@ -218,7 +218,7 @@ def test_transformations_are_fitted_exactly(kind):
 
 
 def test_four_cameras_become_one_stack(tmp_path):
-    base, hills = Snapshot.over_ankara(8.0, size=512), Hills()
+    base, hills = Snapshot.over_ankara(8.0, size=512), BilsatTerrain()
     cameras = {name: base.misaligned(*angles) for name, angles in XS_CAMERAS.items()}
     paths = {
         name: write_image(tmp_path / f"{name}.tif", render(camera, hills, name, seed=k))

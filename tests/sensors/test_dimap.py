@@ -543,9 +543,9 @@ def test_a_volume_of_several_products_names_them_and_one_whose_product_is_missin
     for one in (given, given.parent):
         with pytest.raises(InputError, match=r"several products: .*DIM_A.XML, .*DIM_B.XML") as caught:
             open_scene(one)
-        assert caught.value.remedy == "name one of them"
+        assert caught.value.remedy == "give one of them"
     volume(given, "IMG_01/DIM_C.XML")
-    with pytest.raises(InputError, match=r"its product 'IMG_01/DIM_C.XML' is not there"):
+    with pytest.raises(InputError, match=r"its product 'IMG_01/DIM_C.XML' is missing"):
         open_scene(given)
 
 

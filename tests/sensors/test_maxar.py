@@ -299,7 +299,7 @@ def test_a_til_leads_nowhere_else(folder: Path) -> None:
     (folder / f"{STEM}.XML").write_text(isd_text(size=SIZE))
     pixels(folder.parent / "other.TIF", (40, 50))
     (folder / f"{STEM}.TIL").write_text(til_text((("../other.TIF", 0, 0, 60, 50),)))
-    with pytest.raises(InputError, match="outside of its own folder"):
+    with pytest.raises(InputError, match="outside its own folder"):
         open_scene(folder / f"{STEM}.TIL")
 
 

@@ -14,7 +14,7 @@ from ortho_pipeline.commands import check, rectify
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.raster.far.ahead import ReadAhead, read_ahead
+from ortho_pipeline.raster.caching.read_ahead import ReadAhead, read_ahead
 from ortho_pipeline.raster.source import RasterSource
 
 gdal.UseExceptions()

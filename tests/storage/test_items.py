@@ -71,7 +71,7 @@ def test_an_item_on_disk_and_behind_a_url_is_its_image_with_its_rpc(delivery: Pa
     assert used["delivered_RPC.TXT"] == "RPC"
     with serving(delivery) as public:
         far = SurfaceOptions(dem=f"{public.address}/heights.json", vertical="ellipsoid")
-        with pytest.raises(InputError, match="not opened unasked"):
+        with pytest.raises(InputError, match="off by default"):
             rectify(f"{public.address}/item.json", tmp_path / "c", surface=far, output=output)
         scene = SceneOptions(allow_network=True)
         made = rectify(f"{public.address}/item.json", tmp_path / "c", scene=scene, surface=far, output=output)
@@ -143,7 +143,7 @@ def test_an_rpc_that_gdal_finds_is_left_to_it(tiny: Any) -> None:
         image=asset("a.tif", "data"), one=asset("b_RPC.TXT", type=TEXT), two=asset("c_RPC.TXT", type=TEXT)
     )
     ambiguous = item_of(several, str(tiny.folder / "i.json"))
-    with pytest.raises(InputError, match="several assets may be the RPC of 'image': one, two"):
+    with pytest.raises(InputError, match="several assets could be the RPC of 'image': one, two"):
         ambiguous.rpc_of(ambiguous.image())
     assert resolved(tiny.folder / "i.json", SceneOptions())[1].rpc == str(tiny.folder / "b_RPC.TXT")
     assert resolved(tiny.folder / "i.json", SceneOptions(rpc="tag"))[1].rpc == "tag", "what the user says comes first"

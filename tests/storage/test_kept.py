@@ -117,7 +117,7 @@ def test_what_is_not_there_or_not_sound_is_not_kept(cache: Path) -> None:
 
     with pytest.raises(FileNotFoundError):
         kept.kept("dem", ADDRESS, missing)
-    with pytest.raises(InputError, match="not sound: no heights"):
+    with pytest.raises(InputError, match="not valid: no heights"):
         kept.kept("dem", ADDRESS, fetched, fault=lambda path: "no heights")
     assert names(cache) == []
     assert kept.kept("dem", ADDRESS, fetched).read_bytes() == DATA

@@ -117,7 +117,7 @@ def test_of_two_that_write_one_object_one_is_told(moto: Address, monkeypatch: py
 
 
 def test_nothing_is_asked_without_leave_and_no_secret_is_told(moto: Address, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match="not opened unasked"):
+    with pytest.raises(InputError, match="off by default"):
         Objects("s3://bucket/x", allow_network=False)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -255,7 +255,7 @@ def test_an_ortho_from_a_bucket_to_a_bucket(
         store.put(path.name, path)
     scene = SceneOptions(allow_network=True)
     given = SurfaceOptions(dem="s3://bucket/in/dem.tif", vertical="ellipsoid")
-    with pytest.raises(InputError, match="not opened unasked"):
+    with pytest.raises(InputError, match="off by default"):
         rectify(tiny.image, "s3://bucket/out/", surface=SurfaceOptions(dem=str(tiny.dem), vertical="ellipsoid"))
     made = rectify("s3://bucket/in/tiny.tif", "s3://bucket/out/", surface=given, scene=scene)
     local = rectify(tiny.image, tmp_path / "out", surface=SurfaceOptions(dem=str(tiny.dem), vertical="ellipsoid"))

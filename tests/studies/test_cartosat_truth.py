@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ortho_studies.cartosat import truth as simulated
-from ortho_studies.cartosat.truth import BIASES, PLANE, Attitude, Scanner, StereoPair, aim
+from ortho_studies.cartosat.truth import BIASES, PLANE, Attitude, CartosatPass, StereoPair, aim
 from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.geodesy.ellipsoid import geocentric
@@ -44,7 +44,7 @@ def test_the_cameras_see_what_the_paper_says(view, width):
 def test_the_scanner_agrees_with_the_one_that_was_written_apart():
     other = LineScanner.over(147.4, -42.9, 200.0, image_width=2000, image_height=2000, gsd=2.5, off_nadir_deg=0.0)
     other = other.with_params((0.004, -np.radians(20.0), 0.02))
-    camera = Scanner(
+    camera = CartosatPass(
         2000, np.array(other.radial), np.array(other.along), other.radius, np.radians(20.0), 0.0, other.line_period,
         other.pixel_tan, Attitude((0.004, 0.0, 0.02)),
     )  # fmt: skip

@@ -14,7 +14,7 @@ from ortho_studies.ikonos.truth import (
     EXTENT,
     MAP_CRS,
     GeoScene,
-    Scan,
+    IkonosPass,
     Slope,
     VendorModel,
     to_map,
@@ -65,7 +65,7 @@ def test_relief_is_displaced_away_from_the_satellite_by_height_over_tangent():
 
 
 def test_the_satellite_sees_a_point_when_its_scan_plane_passes():
-    scan = Scan.over_tehran(azimuth_deg=40.0, reverse=False)
+    scan = IkonosPass.over_tehran(azimuth_deg=40.0, reverse=False)
     ground = geocentric(np.array([[51.40, 35.70, 1100.0], [51.45, 35.78, 1600.0]]))
     time, origin = scan.passes(ground, np.eye(3))
     look = scan.aim + scan.speed * time[:, None] * scan.direction - origin
@@ -114,7 +114,7 @@ def test_the_vendors_model_is_one_and_an_rpc_stands_for_it(reverse):
 
 def test_an_impossible_tilt_is_refused():
     with pytest.raises(InputError, match="off nadir"):
-        Scan.over_tehran(off_nadir_deg=50)
+        IkonosPass.over_tehran(off_nadir_deg=50)
 
 
 def view_gradients(model, crs):

@@ -23,7 +23,7 @@ from ortho_pipeline.geodesy.crs import GroundTransform, Vertical
 from ortho_pipeline.geodesy.datum import dem_unit
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import TILE, Tiles, open_dem
+from ortho_pipeline.surface.dem import TILE, TileCache, open_dem
 from ortho_pipeline.surface.dem_file import DemFile
 from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.footprint import image_grid, lay
@@ -129,7 +129,7 @@ def test_the_grid_has_to_reach_the_dem(tmp_path: Path) -> None:
     geoid = write_dem(
         tmp_path / "geoid.tif", np.full((20, 20), 30.0), "EPSG:4326", (0, 0.1, 0, 10, 0, -0.1), kind=gdal.GDT_Float32
     )
-    with pytest.raises(DatumError, match="does not reach"):
+    with pytest.raises(DatumError, match="does not cover"):
         open_dem(write_dem(tmp_path / "d.tif", hills()), str(geoid))
 
 
@@ -399,7 +399,7 @@ def test_rays_that_stand_far_apart_read_every_tile_once(tmp_path: Path, monkeypa
 
 
 def test_heights_that_are_kept_take_no_more_memory_than_they_may(tmp_path: Path) -> None:
-    kept, made = Tiles(3 * 80), []
+    kept, made = TileCache(3 * 80), []
 
     def make(key: int) -> np.ndarray:
         return kept.get(key, lambda: made.append(key) or np.full(10, float(key)))
@@ -407,7 +407,7 @@ def test_heights_that_are_kept_take_no_more_memory_than_they_may(tmp_path: Path)
     for key in (1, 2, 3, 1, 4, 1, 2):  # 4 drives out 2, which was used longest ago
         assert (make(key) == key).all()
     assert made == [1, 2, 3, 4, 2]
-    large = Tiles(8)
+    large = TileCache(8)
     assert large.get("a", lambda: np.zeros(10)) is large.get("a", lambda: np.ones(10)), "the last one stays"
     path = write_dem(tmp_path / "d.tif", hills())
     assert open_dem(path, "ellipsoid", memory=80_000_000).cache_bytes == 10_000_000

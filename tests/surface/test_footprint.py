@@ -76,8 +76,8 @@ def test_what_a_dem_does_not_cover_is_one_notice(tmp_path):
     found = replace(laid(drone(), surface(tmp_path, west=0.0, fill="mask")), beyond=beyond)
     (note,) = found.notes()
     assert (note.code, note.fields["coverage"]) == ("dem-covers-part", found.coverage)
-    assert note.startswith(f"{beyond}: such places have no pixels; the DEM covers 50.0 % of the scene")
-    assert [str(one) for one in replace(found, coverage=1.0).notes()] == [f"{beyond}: such places have no pixels"]
+    assert note.startswith(f"{beyond}: these places have no pixels; the DEM covers 50.0 % of the scene")
+    assert [str(one) for one in replace(found, coverage=1.0).notes()] == [f"{beyond}: these places have no pixels"]
     assert replace(found, coverage=1.0, beyond="").notes() == []
 
 

@@ -124,7 +124,7 @@ def test_cells_of_several_widths_are_each_sampled_in_their_own_grid(tmp_path: Pa
 def test_columns_without_a_common_multiple_are_refused(tmp_path: Path) -> None:
     odd = write_cell(tmp_path, 30, 41, 31)
     write_cell(tmp_path, 30, 42, 30)
-    with pytest.raises(CrsError, match=r"no common columns.*N42") as caught:
+    with pytest.raises(CrsError, match=r"the columns of this file do not match.*N42") as caught:
         open_dem(tmp_path / "*.tif", "ellipsoid")
     assert caught.value.file == str(odd)
     assert caught.value.remedy
@@ -145,7 +145,7 @@ def test_cells_on_both_sides_of_the_antimeridian_are_neighbours(tmp_path: Path) 
         ({"crs": "EPSG:4326+5773"}, DatumError, "EGM96"),
         ({"unit": "ft"}, DatumError, "'ft'|\\(ft\\)"),
         ({"crs": "EPSG:4258"}, CrsError, "ETRS89"),
-        ({"shift": 0.02}, CrsError, "between the samples"),
+        ({"shift": 0.02}, CrsError, "not on the grid of the other"),
     ],
 )
 def test_what_is_not_one_dem_is_refused_by_the_name_of_the_file(
@@ -167,7 +167,7 @@ def test_a_pattern_without_files_is_refused(tmp_path: Path) -> None:
 def test_few_files_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for lon in range(10):
         write_cell(tmp_path, lon, 0)
-    monkeypatch.setattr("ortho_pipeline.surface.mosaic._OPEN_FILES", 3)
+    monkeypatch.setattr("ortho_pipeline.surface.dem_mosaic._OPEN_FILES", 3)
     dem = open_dem(tmp_path / "*.tif", "ellipsoid", fill="mask")
     whole = dem.window(0, 0, *dem.shape[::-1])
     assert not np.isnan(whole).any()

@@ -11,7 +11,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.job import WarpJob, WarpRecord
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 
 def rectify(

@@ -34,7 +34,7 @@ from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp.engines import engine_of
 from ortho_pipeline.warp.gdal_engine import EXPRESSED, Exact, Transformer
 from ortho_pipeline.warp.job import WarpJob, WarpRecord
-from ortho_pipeline.warp.layers.hiding import Hiding
+from ortho_pipeline.warp.quality.hiding import Hiding
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0
@@ -139,7 +139,7 @@ def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple
 
 
 def test_an_unknown_engine_is_refused_with_the_names_of_those_there_are():
-    with pytest.raises(InputError, match="no engine is called 'warp9'") as refused:
+    with pytest.raises(InputError, match="unknown engine 'warp9'") as refused:
         engine_of("warp9")
     assert (refused.value.field, refused.value.remedy) == ("output.engine", "ortho or gdal")
 
@@ -147,7 +147,7 @@ def test_an_unknown_engine_is_refused_with_the_names_of_those_there_are():
 def test_gdals_warper_refuses_to_look_for_what_terrain_hides(tmp_path):
     source, surface = ramp(tmp_path), FlatSurface(500.0)
     job = WarpJob(frame(), source, surface, GRID)
-    with pytest.raises(InputError, match="hides") as refused:
+    with pytest.raises(InputError, match="cannot detect occlusions") as refused:
         engine_of("gdal").rectify(job, Hiding(tmp_path / "ortho.tif", (400.0, 600.0)))
     assert refused.value.field == "output.visibility"
     assert not (tmp_path / "ortho.tif").exists()

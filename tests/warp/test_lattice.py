@@ -28,7 +28,7 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.warp.job import WarpRecord
-from ortho_pipeline.warp.lattice import Lattices, OutputBlock, Terrain
+from ortho_pipeline.warp.lattice import Lattices, OutputBlock, TileHeights
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0
@@ -268,7 +268,7 @@ def test_a_block_more_takes_few_calls(tmp_path, calls):
     for count in (1, 1, 16):
         blocks = [OutputBlock(number // 4, number % 4) for number in range(count)]
         with calls:
-            assert len(lattices.build(blocks, Terrain(surface, False, 64_000_000))) == count
+            assert len(lattices.build(blocks, TileHeights(surface, False, 64_000_000))) == count
         taken.append(calls.count)
         calls.count = 0
     assert taken[2] - taken[1] < 15 * 60

@@ -107,7 +107,7 @@ def test_a_mosaic_larger_than_its_windows(tmp_path, landscape, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"off": 0.5}, "off by 0.250 px"),
+        ({"off": 0.5}, "off the grid of a .* by 0.250 px"),
         ({"step": 2.5}, "2.5 x 2.5"),
         ({"crs": pyproj.CRS("EPSG:32636")}, "zone 36N"),
         ({"dtype": "uint8"}, "1 band of uint8"),
@@ -238,7 +238,7 @@ def test_a_mosaic_says_what_is_missing_and_parts_make_none(block):
     )
     wrong = CliRunner().invoke(cli, ["run", str(block / "p.yaml"), "--executor", "sequential"])
     assert wrong.exit_code == 3
-    assert "is not on the grid of" in wrong.stdout
+    assert "is off the grid of" in wrong.stdout
     for field in ("crs", "resolution"):
         text = FILE.replace('crs: "EPSG:32734", ', "") if field == "crs" else FILE.replace(", resolution: 5", "")
         (block / "p.yaml").write_text(text.replace("FORMAT", "VRT"))
@@ -269,5 +269,5 @@ def test_the_most_accurate_ortho_has_each_pixel(tmp_path, landscape):
     np.testing.assert_array_equal(values[:16][valid[:16]], one[0][:16][valid[:16]])
     with pytest.raises(InputError, match="pixel by pixel"):
         write_vrt(lay_out(made, "most-accurate"), tmp_path / "m.vrt")
-    with pytest.raises(InputError, match="how accurate"):
+    with pytest.raises(InputError, match="no accuracy raster"):
         lay_out([made[0], dataclasses.replace(made[1], accuracy=None)], "most-accurate")

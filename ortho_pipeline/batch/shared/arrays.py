@@ -25,9 +25,10 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
     if len(kinds) != 1:
         what = "no array of jobs" if not kinds else f"several arrays of jobs ({', '.join(kinds)})"
         raise InputError(
-            f"the environment is that of {what}", field="shard",
+            f"the environment is that of {what}",
+            field="shard",
             remedy=f"say the part itself, such as 1/4; one of {_AWS}, {_KUBERNETES}, {_SLURM} is looked for",
-        )  # fmt: skip
+        )
     kind = kinds[0]
     index, first, step = _number(environment, kind, 0), 0, 1
     count: int | None = None
@@ -41,9 +42,10 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
         count = _number(environment, COUNT, 1)
     if count is None:
         raise InputError(
-            f"{kind} says which worker this is, and nothing how many there are", field="shard",
+            f"{kind} says which worker this is, and nothing how many there are",
+            field="shard",
             remedy=f"set the environment variable {COUNT} to the number of workers",
-        )  # fmt: skip
+        )
     part, rest = divmod(index - first, step)
     if rest or not 0 <= part < count:
         raise InputError(

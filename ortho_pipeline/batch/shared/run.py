@@ -197,9 +197,7 @@ def run_shared(
         if not left:
             break
         now = time.monotonic()
-        dead = {
-            name: lease for name, (lease, since) in watched.items() if lease and now - since > where.patience
-        }  # fmt: skip
+        dead = {name: lease for name, (lease, since) in watched.items() if lease and now - since > where.patience}
         go(Order(job, dead.get(job.name)) for job in left)
         if any(job.name not in outcomes for job in left):
             time.sleep(min(where.patience / 4, _LONGEST_NAP))

@@ -25,7 +25,7 @@ import numpy as np
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import Misfits
-from ortho_pipeline.block.equations.reduced_system import NormalSystem, Solution
+from ortho_pipeline.block.equations.reduced_system import NormalSolution, NormalSystem
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.runtime.process_limits import parts_of, side_by_side
 
@@ -49,10 +49,18 @@ class Elimination:
 
         linear, ordering = self.linear, self.linear.ordering
         return point_kernel.Rows(
-            ordering.rays, ordering.starts, ordering.numbers, ordering.known, ordering.image,
-            linear.problem.levels.pairs.slot, linear.by_params, linear.by_point, linear.ground_by_point,
-            linear.misfits.rays, linear.misfits.ground,
-        )  # fmt: skip
+            ordering.rays,
+            ordering.starts,
+            ordering.numbers,
+            ordering.known,
+            ordering.image,
+            linear.problem.levels.pairs.slot,
+            linear.by_params,
+            linear.by_point,
+            linear.ground_by_point,
+            linear.misfits.rays,
+            linear.misfits.ground,
+        )
 
     @property
     def _parts(self) -> list[tuple[int, int]]:
@@ -116,7 +124,7 @@ class Step:
     """
 
     points: Elimination
-    solution: Solution
+    solution: NormalSolution
     shift: Array
     change: Misfits
 

@@ -80,9 +80,13 @@ class Linear:
         ground, grounded = problem.ground_misfits(local, self.ordering, self.weights), self.ordering.grounded
         ground_by_point[grounded] = problem.on_points(local, grounded).partials(self.weights.ground_weights[grounded])
         return replace(
-            self, state=replace(self.state, local=local), by_point=by_point, by_params=by_params,
-            ground_by_point=ground_by_point, misfits=replace(self.misfits, rays=rays, ground=ground),
-        )  # fmt: skip
+            self,
+            state=replace(self.state, local=local),
+            by_point=by_point,
+            by_params=by_params,
+            ground_by_point=ground_by_point,
+            misfits=replace(self.misfits, rays=rays, ground=ground),
+        )
 
     def reweighted(self, weights: Selection) -> Linear:
         """Return these equations with other weights of what takes part; they take the partials of these along."""
@@ -93,9 +97,13 @@ class Linear:
         by_point *= of_rays[:, None, None]
         ground_by_point *= of_ground[:, None, None]
         return replace(
-            self, weights=weights, by_params=by_params, by_point=by_point, ground_by_point=ground_by_point,
+            self,
+            weights=weights,
+            by_params=by_params,
+            by_point=by_point,
+            ground_by_point=ground_by_point,
             misfits=replace(misfits, rays=misfits.rays * of_rays[:, None], ground=misfits.ground * of_ground[:, None]),
-        )  # fmt: skip
+        )
 
     @property
     def pseudo_design(self) -> Array:

@@ -37,7 +37,7 @@ class Rows(NamedTuple):
     of_ground: Array
 
 
-class Point(NamedTuple):
+class FactoredPoint(NamedTuple):
     """The rows of one point, factored: B = Q R, with `q` ``(3, rows)``, and `turned` ``(3, k p)``, which is Q' A.
 
     What has a column for each parameter of the images of a point has some more, which are zero, so that loops over them
@@ -62,7 +62,7 @@ def _room(rows, begin, end):
     for t in range(begin, end):
         most = max(most, rows.starts[t + 1] - rows.starts[t])
     wide = _padded(most * rows.by_params.shape[2])
-    return Point(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, wide))), most, wide
+    return FactoredPoint(np.empty((3, 2 * most + 3)), np.empty((3, 3)), np.empty((3, wide))), most, wide
 
 
 @inlined
@@ -283,8 +283,10 @@ def _spread(rows, t, fresh, blocks, point, whole, product, inner):
         for k in range(columns):
             value = turned[c, k]
             inner[c, 0], inner[c, 1], inner[c, 2] = (
-                inner[c, 0] + value * east[k], inner[c, 1] + value * north[k], inner[c, 2] + value * up[k],
-            )  # fmt: skip
+                inner[c, 0] + value * east[k],
+                inner[c, 1] + value * north[k],
+                inner[c, 2] + value * up[k],
+            )
     return size
 
 

@@ -17,7 +17,7 @@ from ortho_pipeline.models.base import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class NormalSolution:
     """Values ``(P,)`` of normal equations; NaN where these are not positive definite (no `factor`)."""
 
     values: Array
@@ -59,11 +59,11 @@ class NormalSystem:
         """Return normal equations ``(P, P)`` with a diagonal of ones."""
         return LevelMatrix(self.levels, self.blocks).dense()
 
-    def solve(self, damping: float) -> Solution:
+    def solve(self, damping: float) -> NormalSolution:
         """Return the solution; with `damping`, steps are shortened relative to the diagonal."""
         right = self.right[self.levels.columns.padded >= 0]
         try:
             factor = LevelFactor(self.levels, self.blocks, damping)
         except np.linalg.LinAlgError:
-            return Solution(np.full_like(right, np.nan), self.levels, None)
-        return Solution(factor.solve(right), self.levels, factor)
+            return NormalSolution(np.full_like(right, np.nan), self.levels, None)
+        return NormalSolution(factor.solve(right), self.levels, factor)

@@ -50,9 +50,14 @@ class CommonHeights(CommonUnknown):
         """Return them before the adjustment."""
         count, modes = loads.shape
         return cls(
-            sigma=bias, points=points, value=np.zeros(modes), told=np.zeros((modes, modes)), loads=loads,
-            by_params=np.zeros((parameters, modes)), by_points=np.zeros((count, 3, modes)),
-        )  # fmt: skip
+            sigma=bias,
+            points=points,
+            value=np.zeros(modes),
+            told=np.zeros((modes, modes)),
+            loads=loads,
+            by_params=np.zeros((parameters, modes)),
+            by_points=np.zeros((count, 3, modes)),
+        )
 
     @property
     def offset(self) -> Array:

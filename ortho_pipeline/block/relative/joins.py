@@ -56,8 +56,11 @@ class Join:
         """Return its members of a `block.network.ImagePairRecord`; beyond a limit (px) it is weak."""
         sigma = self.sigma
         return {
-            "sigma_px": sigma, "sigma_m": sigma * self.pixel, "azimuth_deg": self.azimuth_deg, "weak": sigma > limit,
-        }  # fmt: skip
+            "sigma_px": sigma,
+            "sigma_m": sigma * self.pixel,
+            "azimuth_deg": self.azimuth_deg,
+            "weak": sigma > limit,
+        }
 
 
 def joins_of(fit: BlockFit) -> tuple[Join, ...]:
@@ -115,14 +118,17 @@ def weak_joins(joins: tuple[Join, ...], limit: float, *, with_heights: bool) -> 
         return ()
     named = "; ".join(
         f"{join.first} and {join.second} by {join.sigma:.1f} px ({join.sigma * join.pixel:.2g} m) along azimuth "
-        f"{join.azimuth_deg:.0f}°" for join in weak[:_NAMED]
-    )  # fmt: skip
+        f"{join.azimuth_deg:.0f}°"
+        for join in weak[:_NAMED]
+    )
     more = f"; and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
     dem = ("give a more accurate DEM",) if with_heights else ("give a DEM (", Setting("surface.dem"), ")")
     text = Text(
         f"{counted(len(weak), 'pair of images', 'pairs of images')} may be shifted against each other (sigma): "
-        f"{named}{more}; ", *dem, ", control points, or another view",
-    )  # fmt: skip
+        f"{named}{more}; ",
+        *dem,
+        ", control points, or another view",
+    )
     worst = weak[0]
     fields = {"worst": [worst.first, worst.second], "sigma_px": worst.sigma, "limit_px": limit}
     return (Notice("weak-join", text, pairs=len(weak), **fields),)

@@ -130,9 +130,13 @@ def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals:
     )
     text = f"{who}: RMSE {_both(every)} over all {tested.sum()}{without}; {places}"
     fields = {
-        "count": int(tested.sum()), "off": int(off.sum()), "rmse_m": every, "points": names[:NAMED],
-        "rest_m": rest if without else None, "alike": are_alike(np.nan_to_num(residuals[off])),
-    }  # fmt: skip
+        "count": int(tested.sum()),
+        "off": int(off.sum()),
+        "rmse_m": every,
+        "points": names[:NAMED],
+        "rest_m": rest if without else None,
+        "alike": are_alike(np.nan_to_num(residuals[off])),
+    }
     others = [one.notice() for one in doubts if one.role == "control" or one.point not in names[:NAMED]]
     return [Notice("checks-apart", text, **fields), *others]
 

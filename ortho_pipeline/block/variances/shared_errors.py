@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.common_error import CommonError
+from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
@@ -43,14 +43,14 @@ class SharedByImage:
     inner: Array
 
     @classmethod
-    def of(cls, solved: Solved, common: CommonError | None = None) -> SharedByImage | None:
+    def of(cls, solved: Solved, common: BlockCommonError | None = None) -> SharedByImage | None:
         """Return it of the measurements of a solution that have groups, and stand on known ground.
 
         None without any, and of a block with more than `MOST_PARAMETERS`.
 
         Parameters
         ----------
-        common : CommonError, optional
+        common : BlockCommonError, optional
             What known ground has in common, as it was settled: its estimate errs with these measurements, too.
         """
         from scipy.linalg import block_diag

@@ -17,7 +17,7 @@ _FAILED = 1
 
 @click.group(cls=Group)
 def cache() -> None:
-    """Show, check or remove what is kept of the network: cells of DEMs."""
+    """List, verify or clear the downloaded DEM cells."""
 
 
 @cache.command("list")

@@ -14,7 +14,7 @@ from ortho_pipeline.cli.printing import print_json
 @click.option("--fetch-grids", is_flag=True, help="Fetch the geoid grids that are missing from PROJ's store, once.")
 @json_option
 def doctor(fetch_grids: bool, as_json: bool) -> None:
-    """Show what is installed: GDAL, PROJ, geoid grids, plugins."""
+    """Show versions, drivers, geoid grids and plugins."""
     from ortho_pipeline import commands
     from ortho_pipeline.cli.program import cli
 

@@ -13,7 +13,7 @@ from ortho_pipeline.cli.printing import print_json, print_models
 @click.command(cls=Command)
 @json_option
 def sensors(as_json: bool) -> None:
-    """List the sensors that are installed."""
+    """List the installed sensors."""
     from ortho_pipeline import commands
 
     document = commands.sensors()
@@ -31,7 +31,7 @@ def sensors(as_json: bool) -> None:
 @click.command(cls=Command)
 @json_option
 def models(as_json: bool) -> None:
-    """List the models that can be fitted to points alone."""
+    """List the models that can be fitted to points."""
     from ortho_pipeline import commands
 
     listed = commands.models()

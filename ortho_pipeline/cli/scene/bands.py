@@ -18,7 +18,10 @@ from ortho_pipeline.options import SceneOptions
 @network_option
 @json_option
 def edge(image: str, edge: str | None, band: int, folder: str | None, scene: SceneOptions, as_json: bool) -> None:
-    """Measure the effective resolution of IMAGE from straight edges (edge spread, line spread, width in pixels)."""
+    """Measure how sharp IMAGE is, from straight edges.
+
+    The result is the edge spread, the line spread and the width in pixels.
+    """
     from ortho_pipeline import commands
 
     print_result(commands.edge(image, folder, edge=edge, band=band, allow_network=scene.allow_network), as_json)
@@ -39,10 +42,10 @@ def edge(image: str, edge: str | None, band: int, folder: str | None, scene: Sce
 def register(
     images: tuple[str, ...], folder: str, reference: str | None, transform: str, scene: SceneOptions, as_json: bool
 ) -> None:
-    """Bring single bands IMAGES onto one of them and write one image of all, which opens as the reference did.
+    """Align the bands of separate cameras in one image.
 
-    For bands of one acquisition that were taken by cameras of their own. The metadata file of the reference is carried
-    along, or its model written as a model file.
+    Use it for bands of one acquisition. The result opens as the reference did: its metadata file is copied, or its
+    model is written as a model file.
     """
     from ortho_pipeline.commands import bands
 

@@ -32,7 +32,10 @@ def fit(
     surface: SurfaceOptions,
     as_json: bool,
 ) -> None:
-    """Adjust the model of IMAGE to control points and show every residual (measured minus predicted, pixels)."""
+    """Adjust the model of IMAGE to control points.
+
+    Every residual is shown: measured minus predicted, in pixels.
+    """
     from ortho_pipeline import commands
 
     result = commands.fit(image, points, scene, surface, match)
@@ -63,17 +66,17 @@ def compare(
     surface: SurfaceOptions,
     as_json: bool,
 ) -> None:
-    """Fit many models to the same points of IMAGE and recommend one.
+    """Compare models on the same points and recommend one.
 
     The image's own model takes part with each of its corrections (rpc, rpc+shift, rpc+shift-drift, rpc+affine). With
-    -o the report of the recommended model is written, with the comparison in it.
+    -o the report of the recommended model is written; it contains the comparison.
     """
     from ortho_pipeline import commands
 
     command = click.get_current_context().meta["command"]
     result = commands.compare(
         image, points, models=models, folder=folder, scene=scene, surface=surface, match=match, command=command
-    )  # fmt: skip
+    )
     if as_json:
         return print_json(result.to_json())
     return print_comparison(result, units)

@@ -26,7 +26,10 @@ def dem_check(
     scene: SceneOptions,
     as_json: bool,
 ) -> None:
-    """Compare a DEM with check heights: bias, RMSE, NMAD and LE90, also by the slope of the terrain."""
+    """Compare a DEM with check heights.
+
+    The result has bias, RMSE, NMAD and LE90, also by slope of the terrain.
+    """
     from ortho_pipeline import commands
 
     given = {"crs": points_crs, "vertical": points_vertical}

@@ -57,7 +57,10 @@ def rectify(
     output: OutputOptions,
     as_json: bool,
 ) -> None:
-    """Make the orthoimage of IMAGE, its adjusted model, and the accuracy report."""
+    """Make the ortho of IMAGE, with its accuracy report.
+
+    The command also writes the adjusted model.
+    """
     from ortho_pipeline import commands
 
     if dry_run:
@@ -112,10 +115,10 @@ def export(
     surface: SurfaceOptions,
     as_json: bool,
 ) -> None:
-    """Write the model of IMAGE for GDAL and every GIS, adjusted if --gcps or a --reference are given.
+    """Write the model of IMAGE for other programs.
 
-    RPC as text, RPB, VRT and tag of a copy; control points (the measured ones, or else a grid) as VRT and copy; or
-    geolocation arrays.
+    With --gcps or --reference the model is adjusted first. Formats: RPC as text, RPB, VRT, or tag of a copy; control
+    points (measured ones, otherwise a grid) as VRT and copy; geolocation arrays.
     """
     from ortho_pipeline import commands
 
@@ -123,7 +126,7 @@ def export(
     given: dict[str, Any] = {"formats": chosen} if chosen else {}
     result = commands.export(
         image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **given
-    )  # fmt: skip
+    )
     print_result(result, as_json)
 
 
@@ -136,7 +139,7 @@ def export(
 @network_option
 @json_option
 def report(report_file: str, folder: str, kind: str, scene: SceneOptions, as_json: bool) -> None:
-    """Write the plots of a report, each as a picture of its own."""
+    """Write the plots of a report as pictures."""
     from ortho_pipeline import commands
 
     print_result(commands.write_plots(report_file, folder, kind, allow_network=scene.allow_network), as_json)

@@ -19,7 +19,7 @@ from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
-    from ortho_pipeline.commands.survey.folder import Kind, Survey
+    from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind
 
 #: What belongs to a scene.
 _KINDS: tuple[Kind, ...] = ("dem", "points", "map image")
@@ -39,7 +39,7 @@ STEPS = (
 def print_steps() -> None:
     """Print the five things that one does."""
     wide = max(len(what) for what, _ in STEPS)
-    say("Orthorectify satellite scenes, and say honestly how good the result is.\n")
+    say("Orthorectify satellite images and report how accurate the result is.\n")
     for what, line in STEPS:
         say(f"  {what:<{wide}}   {line}")
     say(
@@ -52,10 +52,10 @@ def print_steps() -> None:
 @scene_options
 @json_option
 def info(image: str, scene: SceneOptions, as_json: bool) -> None:
-    """Describe an image: sensor, model and where it was read from, position, ground sample distance.
+    """Describe an image, a DEM, an ortho or a folder.
 
-    Of a DEM or an ortho: what it is, and which option takes it. Of a FOLDER: which scenes, DEMs and points lie there,
-    and what to do next.
+    For an image: sensor, model and its file, position, ground sample distance. For a DEM or an ortho: what it is, and
+    which option takes it. For a FOLDER: its scenes, DEMs and points, and the next command.
     """
     from ortho_pipeline import commands
 
@@ -79,11 +79,11 @@ def info(image: str, scene: SceneOptions, as_json: bool) -> None:
         "Pixel": f"{document['gsd_m']:.3g} m at {document['reference_height']:.0f} m",
         "View": view_text(document["view"]),
         "UTM": document["utm"],
-        "Corners": "lon,lat " + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in
-                                          document["corners_lon_lat"]),
+        "Corners": "lon,lat "
+        + "  ".join("outside" if lon is None else f"{lon:.5f},{lat:.5f}" for lon, lat in document["corners_lon_lat"]),
         **({"Belongs to": ", ".join(document["same_acquisition"])} if document["same_acquisition"] else {}),
         **{name: str(value) for name, value in document["facts"].items()},
-    }  # fmt: skip
+    }
     for name, value in lines.items():
         say(f"{name:<10} {value}")
     print_warnings(document["warnings"])
@@ -95,7 +95,8 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
     option = FLAGS[document["option"]]
     lines = {
         "Raster": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
-        "Looks like": "a DEM: one band of numbers with a sign, on a map" if dem
+        "Looks like": "a DEM: one band of numbers with a sign, on a map"
+        if dem
         else "an orthoimage or another raster on a map; it has no sensor model",
         "Bands": f"{document['bands']}, {document['type']}, nodata {document['nodata']}",
         "CRS": document["crs"],
@@ -103,7 +104,7 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
         "Pixel": "{:.6g} x {:.6g} ".format(*document["pixel"]) + document["unit"],
         "Extent": " ".join(f"{value:.10g}" for value in document["extent"]),
         "Use it as": f"{option} {document['image']}" + (" --dem-vertical DATUM" * (dem and not document["vertical"])),
-    }  # fmt: skip
+    }
     for name, value in lines.items():
         say(f"{name:<10} {value}")
 
@@ -128,7 +129,7 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
     return None
 
 
-def next_steps(seen: Survey) -> list[str]:
+def next_steps(seen: FolderSurvey) -> list[str]:
     """Return what to do next with what lies in a folder: sentences, and commands that work when they are pasted."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
 
@@ -180,13 +181,22 @@ def next_steps(seen: Survey) -> list[str]:
 
 @click.command(cls=Command)
 @click.argument("folder", type=click.Path(file_okay=False))
-@click.option("--output", "-o", "path", type=click.Path(dir_okay=False), metavar="FILE",
-              help="Where to  [default: pipeline.yaml in the folder]")  # fmt: skip
+@click.option(
+    "--output",
+    "-o",
+    "path",
+    type=click.Path(dir_okay=False),
+    metavar="FILE",
+    help="Where to  [default: pipeline.yaml in the folder]",
+)
 @click.option("--overwrite", is_flag=True, help="Replace the file if it is there.")
 @scene_options
 @json_option
 def init(folder: str, path: str | None, overwrite: bool, scene: SceneOptions, as_json: bool) -> None:
-    """Write the file of a run over the scenes of FOLDER, with comments, for 'ortho run'."""
+    """Write a pipeline file for the scenes of FOLDER.
+
+    The file has comments and is for 'ortho run'.
+    """
     from ortho_pipeline.commands.survey.pipeline_file import init as write
 
     print_result(write(folder, path, options=scene, overwrite=overwrite), as_json)

@@ -144,10 +144,19 @@ class Tiles:
         with self._lock:
             if self._maker is None:
                 model, _, surface, grid, output = self._parts
-                self._maker = _tile_maker_of(output)(WarpJob(
-                    model, self._source, surface, grid, output.resampling, output.dem_interpolation, output.tolerance,
-                    Resources(output.memory), profile=self.profile,
-                ))  # fmt: skip
+                self._maker = _tile_maker_of(output)(
+                    WarpJob(
+                        model,
+                        self._source,
+                        surface,
+                        grid,
+                        output.resampling,
+                        output.dem_interpolation,
+                        output.tolerance,
+                        Resources(output.memory),
+                        profile=self.profile,
+                    )
+                )
             return self._maker
 
 
@@ -158,9 +167,10 @@ def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
         import xarray
     except ImportError as error:
         raise InputError(
-            f"lazy arrays need {error.name}, which is not installed", field="ortho_array",
+            f"lazy arrays need {error.name}, which is not installed",
+            field="ortho_array",
             remedy="pip install 'ortho-pipeline[xarray]'",
-        ) from error  # fmt: skip
+        ) from error
     grid, profile = placed.grid, tiles.profile
     maker = dask.delayed(tiles, traverse=False)
     pixels: list[list[Any]] = []

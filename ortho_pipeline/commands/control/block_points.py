@@ -131,12 +131,16 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
     """
     if options.points is None and options.ties is None:
         raise InputError(
-            "the images have no points in common", field="points.points",
+            "the images have no points in common",
+            field="points.points",
             remedy=Text(
-                "give measured points with ", Setting("points.points", "FILE"), ", or ",
-                Setting("points.ties", "auto"), " to find ties"
+                "give measured points with ",
+                Setting("points.points", "FILE"),
+                ", or ",
+                Setting("points.ties", "auto"),
+                " to find ties",
             ),
-        )  # fmt: skip
+        )
     if options.points is None:
         for name in ("gcps", "check", "ground_sigma"):
             if getattr(options, name) is not None:
@@ -144,27 +148,29 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
                     Text(Setting(f"points.{name}"), " chooses among points of a file, and there is no file"),
                     field=f"points.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.points")),
-                )  # fmt: skip
+                )
     if options.ties is None and not match.reference:
         for name in ("search", "points"):
             if getattr(match, name) != getattr(MatchOptions, name):
                 raise InputError(
-                    "this is said of matching, and nothing is matched", field=f"match.{name}",
+                    "this is said of matching, and nothing is matched",
+                    field=f"match.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.ties", "auto")),
-                )  # fmt: skip
+                )
         if has_surface(surface) and not observes(options, surface):
             raise InputError(
                 "heights serve matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",
                 remedy=Text("leave them out, or give ", Setting("points.ties", "auto")),
-            )  # fmt: skip
+            )
     _refuse_of_heights(options, surface)
     for name in ("reference_bands", "search_rotation", "reference_sigma"):
         if getattr(match, name) is not None and not match.reference:
             raise InputError(
-                "this is said of a reference, and there is none", field=f"match.{name}",
+                "this is said of a reference, and there is none",
+                field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
-            )  # fmt: skip
+            )
     if options.ties is not None or match.reference:
         require_heights(surface)
 
@@ -175,9 +181,10 @@ def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
     for name in ("dem_bias", "dem_correlation", "dem_shift_sigma"):
         if getattr(options, name) is not None and not observes(options, surface):
             raise InputError(
-                "this describes DEM heights that are observations, and there are none", field=f"points.{name}",
+                "this describes DEM heights that are observations, and there are none",
+                field=f"points.{name}",
                 remedy=Text("leave it out, or give ", remedy),
-            )  # fmt: skip
+            )
 
 
 def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
@@ -273,7 +280,7 @@ def read_points(
         crs=None if options.crs is None else parse_crs(options.crs),
         vertical=None if options.vertical is None else Vertical.parse(options.vertical),
         pixel_origin=options.pixel_origin,
-    )  # fmt: skip
+    )
     table, strangers = points_of_images(read, images, labels, whole=whole)
     if options.check is not None:
         table = assign_roles(table, options.check)
@@ -296,7 +303,8 @@ def _sigmas(text: str) -> list[float]:
     found = numbers_of(text)
     if len(found) not in (1, 2) or not all(sigma > 0 for sigma in found):
         raise InputError(
-            f"{text!r} is not one sigma, or two", field="points.ground_sigma",
+            f"{text!r} is not one sigma, or two",
+            field="points.ground_sigma",
             remedy="give metres in plan, or in plan and height, such as 0.5,1",
-        )  # fmt: skip
+        )
     return found

@@ -64,9 +64,11 @@ def match(
     files = {"points": Path(output)}
     if files["points"].suffix.lower() not in _SUFFIXES:
         raise InputError(
-            "matches are not written in this format", file=output, field="output",
+            "matches are not written in this format",
+            file=output,
+            field="output",
             remedy=f"one of {', '.join(_SUFFIXES)}",
-        )  # fmt: skip
+        )
     files |= _page(report)
     require_heights(surface)
     request = Request(image, scene, surface=surface, match=match)
@@ -108,9 +110,13 @@ def _write_page(
 ) -> None:
     """Write what there is to see of the matches and of the model that they make."""
     made = reports.build_report(
-        scene=adjusted.scene, fit=adjusted.fit, surface=surface, provenance=record, matching=adjusted.matching,
+        scene=adjusted.scene,
+        fit=adjusted.fit,
+        surface=surface,
+        provenance=record,
+        matching=adjusted.matching,
         warnings=adjusted.warnings(surface),
-    )  # fmt: skip
+    )
     reports.write_report_json(made, files["report"])
     matches = None if adjusted.matched is None else adjusted.matched.matches
     reports.write_report_html(made, files["html"], matches=matches)

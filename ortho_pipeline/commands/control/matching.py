@@ -23,7 +23,7 @@ from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
-from ortho_pipeline.raster.block_cache import cache_restored
+from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
@@ -41,7 +41,7 @@ from ortho_pipeline.surface.base import Surface
 
 if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
-    from ortho_pipeline.imaging.matching import Matches, Reference, View
+    from ortho_pipeline.imaging.matching import Matches, Reference, SceneView
 
 #: How far a model may be off (m) of which nothing is known, and at most this part of the scene's shorter side.
 DEFAULT_SEARCH, _PART = 100.0, 0.25
@@ -137,8 +137,13 @@ class Matched:
             check=int(points.check.sum()),
             reasons={name: count for name, count in reasons.items() if count},
             levels=tuple(
-                MatchLevel(factor=one.factor, radius=one.radius, chips=one.chips, agreeing=one.agreeing,
-                           shift_px=(-one.shift[0], -one.shift[1]))
+                MatchLevel(
+                    factor=one.factor,
+                    radius=one.radius,
+                    chips=one.chips,
+                    agreeing=one.agreeing,
+                    shift_px=(-one.shift[0], -one.shift[1]),
+                )
                 for one in matches.levels
             ),
             shift_px=(shift[0], shift[1]),
@@ -155,7 +160,7 @@ class Matched:
             ),
             relative=None,
             absolute=None,
-        )  # fmt: skip
+        )
 
     def tested_by(self, fit: Fit) -> MatchingRecord:
         """Return the record with what matches and measured points say of a fit that they took no part in."""
@@ -190,17 +195,28 @@ class Matched:
         )
         sigma = self.options.reference_sigma
         return [
-            ("reference", ", ".join(Path(one).name for one in self.references)
-             + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated")),
+            (
+                "reference",
+                ", ".join(Path(one).name for one in self.references)
+                + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated"),
+            ),
             ("matches", f"{said.kept} of {said.tried} tried{': ' + reasons if reasons else ''}"),
-            ("", f"{said.control} control, {said.check} check (every fifth cell), in "
-             f"{said.coverage.share:.0%} of the fields of the image"),
+            (
+                "",
+                f"{said.control} control, {said.check} check (every fifth cell), in "
+                f"{said.coverage.share:.0%} of the fields of the image",
+            ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
-            ("model off", f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
-             f"{metres(said.shift_m)}"),
-            ("accuracy", f"{px(said.sigma_px)} in the middle of the matches, relative to the reference: "
-             f"{said.components.text()}"),
-        ]  # fmt: skip
+            (
+                "model off",
+                f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), {metres(said.shift_m)}",
+            ),
+            (
+                "accuracy",
+                f"{px(said.sigma_px)} in the middle of the matches, relative to the reference: "
+                f"{said.components.text()}",
+            ),
+        ]
 
 
 @one_blas_thread()
@@ -238,17 +254,23 @@ def match_scene(
     pixel = metres_per_pixel(view)
     search = search_of(scene, options, pixel)
     settings = MatchSettings(
-        search=search.distance, points=options.points, dem_sigma=typical_sigma(view.surface) or 0.0,
-        reference_sigma=options.reference_sigma or 0.0, threads=threads or os.cpu_count() or 1, memory=memory,
+        search=search.distance,
+        points=options.points,
+        dem_sigma=typical_sigma(view.surface) or 0.0,
+        reference_sigma=options.reference_sigma or 0.0,
+        threads=threads or os.cpu_count() or 1,
+        memory=memory,
         rotation_deg=rotation_of(scene, options),
-    )  # fmt: skip
+    )
     with _of_references():
         matches = match(view, references, settings)
     paths = tuple(one.path for one in references)
     notices = [
-        *_default_search(search), *_made_of_scene(scene, references, matches), *_partial(matches),
+        *_default_search(search),
+        *_made_of_scene(scene, references, matches),
+        *_partial(matches),
         *_bands_apart(matches),
-    ]  # fmt: skip
+    ]
     return Matched(
         matches, paths, options, search, (scene.width, scene.height), pixel, tuple(notices), typical_sigma(view.surface)
     )
@@ -256,7 +278,7 @@ def match_scene(
 
 def open_reference_views(
     scene: Scene, options: MatchOptions, surface: Surface | None, opened: SceneOptions = SceneOptions()
-) -> tuple[View, tuple[Reference, ...]]:
+) -> tuple[SceneView, tuple[Reference, ...]]:
     """Open a scene and its references as a matcher sees them.
 
     Raises
@@ -264,27 +286,33 @@ def open_reference_views(
     InputError
         For references that are none, and a scene without model or heights.
     """
-    from ortho_pipeline.imaging.matching import View, open_references
+    from ortho_pipeline.imaging.matching import SceneView, open_references
 
     if surface is None:
         raise InputError(
-            "matching needs heights", field="surface.dem",
+            "matching needs heights",
+            field="surface.dem",
             remedy=Text(
-                "give ", Setting("surface.dem", "FILE"), ", or ", Setting("surface.height", "METRES"),
-                " above the ellipsoid for flat ground"
+                "give ",
+                Setting("surface.dem", "FILE"),
+                ", or ",
+                Setting("surface.height", "METRES"),
+                " above the ellipsoid for flat ground",
             ),
-        )  # fmt: skip
+        )
     if not scene.models:
         raise InputError(
-            "this image has no model of its own to begin matching with", file=scene.path, field="match.reference",
+            "this image has no model of its own to begin matching with",
+            file=scene.path,
+            field="match.reference",
             remedy=Text("give control points by hand with ", Setting("points.gcps")),
-        )  # fmt: skip
+        )
     with _of_references():
         references = open_references(options.reference, options.reference_bands or (), **opened.access)
     for one in references:
         _refuse_scene(scene, one)
     rasters = scene.rasters or (scene.path,)
-    return View(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
+    return SceneView(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
 
 
 @contextmanager
@@ -402,9 +430,11 @@ def _refuse_scene(scene: Scene, reference: Reference) -> None:
     shown = {os.path.realpath(name) for name in reference.intensity.source.dataset.GetFileList() or ()}
     if own & {os.path.realpath(reference.path), *shown}:
         raise InputError(
-            "the reference is the scene itself: that says nothing of where it lies", file=reference.path,
-            field="match.reference", remedy="give an orthoimage that was made of other images",
-        )  # fmt: skip
+            "the reference is the scene itself: that says nothing of where it lies",
+            file=reference.path,
+            field="match.reference",
+            remedy="give an orthoimage that was made of other images",
+        )
 
 
 def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Matches) -> list[Notice]:

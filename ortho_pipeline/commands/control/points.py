@@ -62,9 +62,10 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
         _refuse_idle(match)
         if points.gcps is None and points.correction not in (None, "none"):
             raise InputError(
-                f"the correction {points.correction!r} needs control points", field="points.gcps",
+                f"the correction {points.correction!r} needs control points",
+                field="points.gcps",
                 remedy="give a file of points",
-            )  # fmt: skip
+            )
         return
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
     if chosen is not None and points.gcps is None:
@@ -72,12 +73,13 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
             Text(Setting(f"points.{chosen}"), " chooses among ", Setting("points.gcps"), ", and there are none"),
             field=f"points.{chosen}",
             remedy="leave it out: every fifth cell of the matches checks",
-        )  # fmt: skip
+        )
     if chosen is not None and match.gcps_as == "check":
         raise InputError(
-            Text(Setting(f"points.{chosen}"), " chooses among points that all check"), field=f"points.{chosen}",
+            Text(Setting(f"points.{chosen}"), " chooses among points that all check"),
+            field=f"points.{chosen}",
             remedy=Text("leave it out, or give ", Setting("match.gcps_as", "control")),
-        )  # fmt: skip
+        )
 
 
 def _refuse_idle(match: MatchOptions) -> None:
@@ -91,9 +93,10 @@ def _refuse_idle(match: MatchOptions) -> None:
     for name in ("reference_bands", "search", "search_rotation", "points", "reference_sigma", "gcps_as"):
         if getattr(match, name) != getattr(MatchOptions, name):
             raise InputError(
-                "this is said of matching, and there is no reference", field=f"match.{name}",
+                "this is said of matching, and there is no reference",
+                field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
-            )  # fmt: skip
+            )
 
 
 def _joined(surveyed: Points, matches: Points) -> Points:
@@ -108,12 +111,19 @@ def _joined(surveyed: Points, matches: Points) -> Points:
         return np.concatenate([getattr(surveyed, name), getattr(matches, name)])
 
     return Points(
-        ids=(*surveyed.ids, *(prefix + name for name in matches.ids)), image=both("image"), ground=both("ground"),
-        roles=both("roles"), sigma_image=both("sigma_image"), sigma_ground=both("sigma_ground"), crs=matches.crs,
-        source=f"{surveyed.source}, {matches.source}", covariance_image=both("covariance_image"),
-        groups=np.concatenate([surveyed.groups, groups]), sigma_common=both("sigma_common"),
+        ids=(*surveyed.ids, *(prefix + name for name in matches.ids)),
+        image=both("image"),
+        ground=both("ground"),
+        roles=both("roles"),
+        sigma_image=both("sigma_image"),
+        sigma_ground=both("sigma_ground"),
+        crs=matches.crs,
+        source=f"{surveyed.source}, {matches.source}",
+        covariance_image=both("covariance_image"),
+        groups=np.concatenate([surveyed.groups, groups]),
+        sigma_common=both("sigma_common"),
         sigma_alike=both("sigma_alike"),
-    )  # fmt: skip
+    )
 
 
 def read_control(scene: Scene, request: Request, surface: Surface | None = None) -> Points:
@@ -152,12 +162,17 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
     if path is None or os.fspath(path) == OWN_POINTS:
         if origin != "corner" or (path is None and not (crs is vertical is None)):
             raise InputError(
-                "these points say themselves what their coordinates are", field="points.pixel_origin",
+                "these points say themselves what their coordinates are",
+                field="points.pixel_origin",
                 remedy=Text(
-                    "leave ", Setting("points.pixel_origin"), " out, and of points that are read already ",
-                    Setting("points.crs"), " and ", Setting("points.vertical")
+                    "leave ",
+                    Setting("points.pixel_origin"),
+                    " out, and of points that are read already ",
+                    Setting("points.crs"),
+                    " and ",
+                    Setting("points.vertical"),
                 ),
-            )  # fmt: skip
+            )
         if isinstance(options.gcps, Points):
             return options.gcps
         return gcps_of_dataset(raster.open_dataset(scene.path, **request.scene.access), crs=crs, vertical=vertical)
@@ -194,22 +209,32 @@ def _taken_over(
     if lost.any():
         raise InputError(
             f"the point {points.ids[int(np.argmax(lost))]!r}, measured in {Path(piece.path).name}, is not seen here",
-            file=points.source, field="image", remedy="leave it out for this image",
-        )  # fmt: skip
+            file=points.source,
+            field="image",
+            remedy="leave it out for this image",
+        )
     scale = np.where(there, piece.scale, 1.0)
     return replace(
-        points, image=np.where(there[:, None], image, points.image), sigma_image=points.sigma_image * scale,
+        points,
+        image=np.where(there[:, None], image, points.image),
+        sigma_image=points.sigma_image * scale,
         covariance_image=points.covariance_image * (scale**2)[:, None, None],
-    )  # fmt: skip
+    )
 
 
 def no_points() -> Points:
     """Return an empty table of points."""
     none = np.zeros(0)
     return Points(
-        ids=(), image=np.zeros((0, 2)), ground=np.zeros((0, 3)), roles=np.zeros(0, dtype="<U7"), sigma_image=none,
-        sigma_ground=np.zeros((0, 3)), crs=pyproj.CRS.from_epsg(4326), source="",
-    )  # fmt: skip
+        ids=(),
+        image=np.zeros((0, 2)),
+        ground=np.zeros((0, 3)),
+        roles=np.zeros(0, dtype="<U7"),
+        sigma_image=none,
+        sigma_ground=np.zeros((0, 3)),
+        crs=pyproj.CRS.from_epsg(4326),
+        source="",
+    )
 
 
 def with_heights(points: Points, surface: Surface | None) -> Points:
@@ -220,10 +245,11 @@ def with_heights(points: Points, surface: Surface | None) -> Points:
     if surface is None:
         names = ", ".join(np.array(points.ids)[missing][:5])
         raise InputError(
-            f"{int(missing.sum())} of {counted(len(points), 'point')} without a height "
-            f"({names})", file=points.source, field="h",
+            f"{int(missing.sum())} of {counted(len(points), 'point')} without a height ({names})",
+            file=points.source,
+            field="h",
             remedy=Text("give heights in the file, or a DEM with ", Setting("surface.dem"), " to take them from"),
-        )  # fmt: skip
+        )
     ground = points.ground.copy()
     ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)
     return points.with_ground(ground)

@@ -32,7 +32,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points.image_errors import sigma_of_covariance
-from ortho_pipeline.raster.block_cache import cache_restored
+from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.runtime.process_limits import one_blas_thread
@@ -131,7 +131,7 @@ def tie_scenes(
     InputError
         For a scene without a model, fewer than two scenes, and scenes that cannot be tied together.
     """
-    from ortho_pipeline.imaging.matching import View
+    from ortho_pipeline.imaging.matching import SceneView
     from ortho_pipeline.imaging.matching.targets import metres_per_pixel
     from ortho_pipeline.imaging.ties import TieSettings, tie
 
@@ -140,11 +140,13 @@ def tie_scenes(
     for scene in scenes.values():
         if not scene.models:
             raise InputError(
-                "this image has no model of its own to begin matching with", file=scene.path, field="images",
+                "this image has no model of its own to begin matching with",
+                file=scene.path,
+                field="images",
                 remedy="measure tie points by hand",
-            )  # fmt: skip
+            )
     views = [
-        View(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
+        SceneView(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
         for scene in (on_surface(one, surface) for one in scenes.values())
     ]
     searches = [
@@ -168,12 +170,19 @@ def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
     count = int(ties.track.max()) + 1
     digits = len(str(count))
     return BlockPoints(
-        ids=tuple(f"tie{number + 1:0{digits}}" for number in range(count)), ground=np.full((count, 3), np.nan),
-        roles=np.full(count, "tie"), sigma_ground=np.zeros((count, 3)), crs=pyproj.CRS.from_epsg(4326), images=names,
-        point=ties.track.astype(np.int64), image=ties.image.astype(np.int64), measured=ties.measured,
-        sigma_image=sigma_of_covariance(ties.covariance), source="ties by matching",
+        ids=tuple(f"tie{number + 1:0{digits}}" for number in range(count)),
+        ground=np.full((count, 3), np.nan),
+        roles=np.full(count, "tie"),
+        sigma_ground=np.zeros((count, 3)),
+        crs=pyproj.CRS.from_epsg(4326),
+        images=names,
+        point=ties.track.astype(np.int64),
+        image=ties.image.astype(np.int64),
+        measured=ties.measured,
+        sigma_image=sigma_of_covariance(ties.covariance),
+        source="ties by matching",
         shape_image=shape_of(ties.covariance),
-    )  # fmt: skip
+    )
 
 
 def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
@@ -259,9 +268,12 @@ def _csv(points: BlockPoints) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(("id", "image", "col", "row", "role", "var_col", "var_row", "cov_col_row"))
     for point, image, place, covariance in zip(
-        points.point.tolist(), points.image.tolist(), points.measured.tolist(), points.covariance_image.tolist(),
+        points.point.tolist(),
+        points.image.tolist(),
+        points.measured.tolist(),
+        points.covariance_image.tolist(),
         strict=True,
-    ):  # fmt: skip
+    ):
         (column, both), (_, row) = covariance
         writer.writerow(
             [points.ids[point], points.images[image], *map(repr, place), "tie", *map(repr, (column, row, both))]

@@ -68,9 +68,11 @@ def extent_under(scene: Scene) -> Extent:
     """
     if not scene.models:
         raise InputError(
-            "an image without a model of its own does not say where it lies", file=scene.path, field="surface.dem",
+            "an image without a model of its own does not say where it lies",
+            file=scene.path,
+            field="surface.dem",
             remedy=Text("give ", Setting("surface.dem", "FILE")),
-        )  # fmt: skip
+        )
     model = scene.model
     ring = border(scene.width, scene.height)
     levels = np.clip(model.height_range, *SANE_HEIGHTS)
@@ -79,9 +81,11 @@ def extent_under(scene: Scene) -> Extent:
     found = extent_of(ground[:, :2])
     if found is None:
         raise InputError(
-            "no border pixel meets the ground: the model does not belong to this image", file=scene.path, field="model",
+            "no border pixel meets the ground: the model does not belong to this image",
+            file=scene.path,
+            field="model",
             remedy="give the metadata of this very image",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -92,21 +96,25 @@ def _require_geoid(allow_network: bool) -> None:
         return
     if not allow_network:
         raise DatumError(
-            f"the cells' heights are above EGM2008, whose geoid grid {grid} is not installed", field="surface.dem",
+            f"the cells' heights are above EGM2008, whose geoid grid {grid} is not installed",
+            field="surface.dem",
             remedy=Text(
                 "fetch it once with `ortho doctor --fetch-grids`, allow the network with ",
-                Setting("scene.allow_network"), ", or give the file with ",
-                Setting("surface.vertical", f"FOLDER/{grid}")
+                Setting("scene.allow_network"),
+                ", or give the file with ",
+                Setting("surface.vertical", f"FOLDER/{grid}"),
             ),
-        )  # fmt: skip
+        )
     try:
         fetch_grid(grid)
     except OrthoError as error:
         raise DatumError(
             Text("the cells' heights are above EGM2008, and its geoid grid cannot be fetched: ", error.message),
-            file=error.file, field="surface.dem",
+            file=error.file,
+            field="surface.dem",
             remedy=Text(
-                error.remedy or "try again later", "; or give the file with ",
-                Setting("surface.vertical", f"FOLDER/{grid}")
+                error.remedy or "try again later",
+                "; or give the file with ",
+                Setting("surface.vertical", f"FOLDER/{grid}"),
             ),
-        ) from error  # fmt: skip
+        ) from error

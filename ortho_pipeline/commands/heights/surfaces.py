@@ -18,8 +18,8 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, open_dem
+from ortho_pipeline.surface.dem_mosaic import matching_files
 from ortho_pipeline.surface.flat import FlatSurface
-from ortho_pipeline.surface.mosaic import matching_files
 
 #: No height is less certain (m) than that: the Earth has none of that size.
 _LARGEST_SIGMA = 10_000.0
@@ -85,9 +85,10 @@ def open_sigma(
     if 0 < number <= _LARGEST_SIGMA:
         return number
     raise InputError(
-        f"{options.sigma} is no standard deviation", field="surface.sigma",
+        f"{options.sigma} is no standard deviation",
+        field="surface.sigma",
         remedy="give metres, or a raster of them such as Copernicus' height error mask",
-    )  # fmt: skip
+    )
 
 
 def dem_as_stated(
@@ -106,16 +107,17 @@ def dem_as_stated(
     """
     if options.source is not None:
         raise InputError(
-            "this says where heights are found, and the DEM is given", field="surface.source",
+            "this says where heights are found, and the DEM is given",
+            field="surface.source",
             remedy=Text("leave it out, or give ", Setting("surface.dem", "auto")),
-        )  # fmt: skip
+        )
     with of_option("surface.vertical"):
         vertical = None if options.vertical is None else Vertical.parse(options.vertical)
     with completed(field="surface.dem"):
         if path.is_collection:
             return open_collected(
                 path, extents, vertical, options.override_vertical, options.fill, memory, scene.access
-            )  # fmt: skip
+            )
         return open_dem(
             path, vertical, override=options.override_vertical, fill=options.fill, memory=memory, **scene.access
         )
@@ -133,12 +135,16 @@ def require_heights(options: SurfaceOptions) -> None:
     """Raise an `InputError` if there are no heights."""
     if not has_surface(options):
         raise InputError(
-            "there are no heights of the ground", field="surface.dem",
+            "there are no heights of the ground",
+            field="surface.dem",
             remedy=Text(
-                "give ", Setting("surface.dem", "FILE"), ", or ", Setting("surface.height", "METRES"),
-                " above the ellipsoid for flat ground"
+                "give ",
+                Setting("surface.dem", "FILE"),
+                ", or ",
+                Setting("surface.height", "METRES"),
+                " above the ellipsoid for flat ground",
             ),
-        )  # fmt: skip
+        )
 
 
 def has_surface(options: SurfaceOptions) -> bool:
@@ -157,8 +163,11 @@ def has_surface(options: SurfaceOptions) -> bool:
         "surface.source": options.source is not None,
     }
     for field in (field for field, given in idle.items() if given and options.dem is None):
-        raise InputError("this is said of a DEM, and there is none", field=field,
-                         remedy=Text("leave it out, or give ", Setting("surface.dem")))  # fmt: skip
+        raise InputError(
+            "this is said of a DEM, and there is none",
+            field=field,
+            remedy=Text("leave it out, or give ", Setting("surface.dem")),
+        )
     return options.dem is not None or options.height is not None
 
 

@@ -16,7 +16,7 @@ from ortho_pipeline.report.layers.angles import AnglesLayer, angles_style
 from ortho_pipeline.runtime.process_limits import Resources
 
 if TYPE_CHECKING:
-    from ortho_pipeline.warp.layers.angles import Sun
+    from ortho_pipeline.warp.quality.angles import Sun
 
 
 def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
@@ -29,10 +29,13 @@ def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
     """
     if not output.angles:
         if output.sun is not None:
-            raise InputError("only the angles depend on the sun", field="output.sun",
-                             remedy=Text("give ", Setting("output.angles"), " too, or leave it out"))  # fmt: skip
+            raise InputError(
+                "only the angles depend on the sun",
+                field="output.sun",
+                remedy=Text("give ", Setting("output.angles"), " too, or leave it out"),
+            )
         return None
-    from ortho_pipeline.warp.layers.angles import Sun
+    from ortho_pipeline.warp.quality.angles import Sun
 
     if output.sun is not None:
         return Sun(float(output.sun[0]), float(output.sun[1]))
@@ -52,23 +55,30 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
     output = placed.request.output
     if not output.angles:
         return None
-    from ortho_pipeline.warp.layers import angles
-    from ortho_pipeline.warp.layers.sight import Sight
+    from ortho_pipeline.warp.quality import angles
+    from ortho_pipeline.warp.quality.sight import Sight
 
     sight, heights = Sight(placed.model, placed.grid), placed.footprint.heights
     resources = Resources(output.memory, output.threads)
     size = placed.scene.width, placed.scene.height
     found = angles.write_angles(
-        sight, placed.surface, size, files["angles"], heights=heights, step=output.layer_step, sun=sun,
+        sight,
+        placed.surface,
+        size,
+        files["angles"],
+        heights=heights,
+        step=output.layer_step,
+        sun=sun,
         resources=resources,
-    )  # fmt: skip
+    )
     layer = AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
     write_text(files["angles_style"], angles_style(layer))
     if sun is None:
         del files["shadow"]
         return layer
-    share = angles.write_shadows(sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources,
-                                 driver=output.format)  # fmt: skip
+    share = angles.write_shadows(
+        sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources, driver=output.format
+    )
     return AnglesLayer(
         view_zenith_deg=found.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
     )

@@ -29,8 +29,8 @@ from ortho_pipeline.surface.dem import DemSurface
 if TYPE_CHECKING:
     from ortho_pipeline.raster.regridded import Regridded
     from ortho_pipeline.warp.job import WarpRecord
-    from ortho_pipeline.warp.layers.accuracy import AccuracyResult, Budget
-    from ortho_pipeline.warp.layers.hiding import Hiding
+    from ortho_pipeline.warp.quality.accuracy import AccuracyResult, Budget
+    from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: Standard deviation (m) of geoids by the name of the height datum: commission errors over land; of any other, national
 #: ones and grids of one's own. Source: Lemoine et al. 1998 (EGM96), Pavlis et al. 2012 (EGM2008).
@@ -63,7 +63,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     output = placed.request.output
     if not output.accuracy_raster:
         return None, []
-    from ortho_pipeline.warp.layers.accuracy import Budget
+    from ortho_pipeline.warp.quality.accuracy import Budget
 
     surface, fit = placed.surface, placed.adjusted.fit
     covariance = _covariance(placed)
@@ -71,17 +71,27 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     datum = 0.0 if surface.sigma is None else _datum(surface)
     apart, unstated = _reference(fit.warnings, placed.scene.adjusted)
     budget = Budget(covariance=covariance, stated=stated, heights=surface.sigma, datum=datum, reference=apart)
-    unknown = [name for name, missing in (("model", not budget.knows_model), ("heights", surface.sigma is None),
-                                          ("reference", unstated)) if missing]  # fmt: skip
+    unknown = [
+        name
+        for name, missing in (
+            ("model", not budget.knows_model),
+            ("heights", surface.sigma is None),
+            ("reference", unstated),
+        )
+        if missing
+    ]
     if not budget.knows_model and surface.sigma is None:
         raise InputError(
             "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
             field="output.accuracy_raster",
             remedy=Text(
-                "give ", Setting("surface.sigma"), ", or control points with ", Setting("points.gcps"),
-                ", or leave it out"
+                "give ",
+                Setting("surface.sigma"),
+                ", or control points with ",
+                Setting("points.gcps"),
+                ", or leave it out",
             ),
-        )  # fmt: skip
+        )
     assumed = _assumptions(budget, surface)
     if output.fill_from is not None:
         assumed.append(
@@ -90,8 +100,11 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None, _common(placed))
     if not unknown:
         return known, []
-    names = {"model": "the model", "heights": Text("the heights (", Setting("surface.sigma"), ")"),
-             "reference": Text("the reference (", Setting("match.reference_sigma"), ")")}  # fmt: skip
+    names = {
+        "model": "the model",
+        "heights": Text("the heights (", Setting("surface.sigma"), ")"),
+        "reference": Text("the reference (", Setting("match.reference_sigma"), ")"),
+    }
     said = Text.joined(" and of ", (names[name] for name in unknown))
     text = Text(
         "the raster of accuracy knows nothing of the errors of ", said, ": its figures are the least that there is"
@@ -112,7 +125,7 @@ def stated_accuracy(model: SensorModel) -> float | None:
 
 def _covariance(placed: Placement) -> Array | None:
     """Return the covariance of the model's parameters, now or before; None where nothing was adjusted."""
-    from ortho_pipeline.warp.layers.accuracy import predictive
+    from ortho_pipeline.warp.quality.accuracy import predictive
 
     fit, before = placed.adjusted.fit, placed.scene.adjusted
     if len(fit.param_names) and fit.used.any():
@@ -175,9 +188,11 @@ def _common(placed: Placement) -> float:
 
 
 def _assumptions(budget: Budget, surface: Surface) -> list[str]:
-    said = ["errors of the model, of the heights and of the reference are independent of each other",
-            "the model follows the scene but for its parameters",
-            "an error is where the ortho shows a point, at its height, less where that is"]  # fmt: skip
+    said = [
+        "errors of the model, of the heights and of the reference are independent of each other",
+        "the model follows the scene but for its parameters",
+        "an error is where the ortho shows a point, at its height, less where that is",
+    ]
     if budget.datum:
         said.insert(1, f"the height datum is good to {metres(budget.datum)}")
     if budget.stated is not None:
@@ -191,7 +206,7 @@ def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | No
     """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
     if placed.request.output.visibility is None:
         return files["ortho"]
-    from ortho_pipeline.warp.layers.hiding import Hiding
+    from ortho_pipeline.warp.quality.hiding import Hiding
 
     return Hiding(files["ortho"], placed.footprint.heights, files.get("visibility"), other)
 
@@ -202,21 +217,28 @@ def write_layers(
     """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
     if known is None:
         return None
-    from ortho_pipeline.warp.layers.accuracy import write_accuracy
-    from ortho_pipeline.warp.layers.sight import Sight
+    from ortho_pipeline.warp.quality.accuracy import write_accuracy
+    from ortho_pipeline.warp.quality.sight import Sight
 
     budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
     scene, output = placed.scene, placed.request.output
     found = write_accuracy(
-        budget, Sight(placed.model, placed.grid), placed.surface, (scene.width, scene.height), files["accuracy"],
-        heights=placed.footprint.heights, step=output.layer_step, resources=Resources(output.memory, output.threads),
+        budget,
+        Sight(placed.model, placed.grid),
+        placed.surface,
+        (scene.width, scene.height),
+        files["accuracy"],
+        heights=placed.footprint.heights,
+        step=output.layer_step,
+        resources=Resources(output.memory, output.threads),
         metadata={"ASSUMPTIONS": "; ".join(known.assumptions), "UNKNOWN": ", ".join(known.unknown) or "nothing"},
-    )  # fmt: skip
+    )
     if not found.known:
         raise InputError(
-            "the standard deviations of the heights reach no pixel of the ortho", field="surface.sigma",
+            "the standard deviations of the heights reach no pixel of the ortho",
+            field="surface.sigma",
             remedy="give a raster of this place, or a number",
-        )  # fmt: skip
+        )
     layer = _record(found, known, output.layer_step)
     write_text(files["accuracy_style"], accuracy_style(layer))
     return layer
@@ -230,15 +252,21 @@ def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
     by = "points" if known.adjusted else "model"
     common = min(known.common / max(sum(sigma**2 for sigma in found.sigma), 1e-300), shares["model"])
     return AccuracyLayer(
-        ce90_m=found.ce90, range_m=found.quantiles, sigma_m=found.sigma,
+        ce90_m=found.ce90,
+        range_m=found.quantiles,
+        sigma_m=found.sigma,
         shares={
-            by: shares["model"] - common + even * part, "heights": shares["heights"],
+            by: shares["model"] - common + even * part,
+            "heights": shares["heights"],
             "reference": even * (1.0 - part) + common,
             "interpolation": shares["interpolation"],
         },
-        unknown=known.unknown, known=found.known, assumptions=known.assumptions, cell=found.cell * step,
+        unknown=known.unknown,
+        known=found.known,
+        assumptions=known.assumptions,
+        cell=found.cell * step,
         cells=tuple(tuple(row) for row in json_value(_rounded(found.cells))),
-    )  # fmt: skip
+    )
 
 
 def _rounded(values: Array) -> list[list[float]]:

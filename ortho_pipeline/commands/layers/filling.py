@@ -25,9 +25,10 @@ def other_of(placed: Placement, source: RasterSource) -> Regridded | None:
         return None
     if output.visibility != "nodata":
         raise InputError(
-            "another ortho fills what terrain hides, and hidden pixels are not left empty", field="output.fill_from",
+            "another ortho fills what terrain hides, and hidden pixels are not left empty",
+            field="output.fill_from",
             remedy=Text("give ", Setting("output.visibility", "nodata"), " too, or leave it out"),
-        )  # fmt: skip
+        )
     with completed(field="output.fill_from"):
         access = placed.request.scene.access
         other = Regridded(output.fill_from, placed.grid, resampling=output.resampling, memory=output.memory, **access)

@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError, ReportError
 from ortho_pipeline.files import allowed, states, together, write_json
 from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.options import MosaicOptions
-from ortho_pipeline.raster.block_cache import cache_restored
+from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.report.mosaic.document import mosaic_document, summary_text
 from ortho_pipeline.report.mosaic.page import write_page
@@ -79,14 +79,22 @@ def mosaic(
 def _refuse_far(orthos: Sequence[Path]) -> None:
     for ortho in orthos:
         if Location(ortho).is_far:
-            raise InputError("a VRT refers to orthos below its own folder", file=ortho, field="output",
-                             remedy="let the name of the mosaic end in .tif")  # fmt: skip
+            raise InputError(
+                "a VRT refers to orthos below its own folder",
+                file=ortho,
+                field="output",
+                remedy="let the name of the mosaic end in .tif",
+            )
 
 
 def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
     if len(set(files.values())) < len(files):
-        raise InputError("record and page lie beside the mosaic under its name", file=files["mosaic"], field="output",
-                         remedy="let the name end in .tif or .vrt")  # fmt: skip
+        raise InputError(
+            "record and page lie beside the mosaic under its name",
+            file=files["mosaic"],
+            field="output",
+            remedy="let the name end in .tif or .vrt",
+        )
     known = [ortho.resolve() for ortho in orthos]
     for path in map(allowed, files.values()):
         if path.resolve() in known:
@@ -123,8 +131,12 @@ def assemble(
     resources, placed = resources or Resources(), lay_out(orthos, options.order)
     for field in ("seamlines", "balance"):
         if options.format == "VRT" and getattr(options, field):
-            raise InputError("a VRT refers to pixels as they are", file=files["mosaic"], field=f"mosaic.{field}",
-                             remedy="make a COG, or leave it out")  # fmt: skip
+            raise InputError(
+                "a VRT refers to pixels as they are",
+                file=files["mosaic"],
+                field=f"mosaic.{field}",
+                remedy="make a COG, or leave it out",
+            )
     pairs = overlaps(placed) if options.seams or options.balance else []
     memory, threads = resources.memory, resources.threads or 1
     balance = balanced(placed, pairs, memory=memory) if options.balance else None
@@ -135,9 +147,13 @@ def assemble(
         write_vrt(placed, files["mosaic"])
     else:
         clamped = write_cog(
-            placed, files["mosaic"], owners=owners if options.seamlines else None, balance=balance, memory=memory,
+            placed,
+            files["mosaic"],
+            owners=owners if options.seamlines else None,
+            balance=balance,
+            memory=memory,
             threads=threads,
-        )  # fmt: skip
+        )
     seams: list[dict[str, Any]] = []
     if options.seams:
         seams = [measure_seam(pair) for pair in pairs] if measure is None else measure(pairs)

@@ -32,8 +32,17 @@ from ortho_pipeline.surface.base import Surface
 RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
 _ATTACHING = ("image", "DEM", "reference", "other ortho", "grid")
 #: The order of a record, by role; files that open a scene have roles of their sensor's and follow its image.
-_ORDER = {"image": 0, "metadata": 2, "points": 3, "DEM": 4, "geoid": 5, "DEM accuracy": 6, "reference": 7,
-          "other ortho": 8, "grid": 9}  # fmt: skip
+_ORDER = {
+    "image": 0,
+    "metadata": 2,
+    "points": 3,
+    "DEM": 4,
+    "geoid": 5,
+    "DEM accuracy": 6,
+    "reference": 7,
+    "other ortho": 8,
+    "grid": 9,
+}
 #: Options that stand in a record only where they were given: without them, files of the same job keep their bytes.
 _IF_GIVEN = ("like", "reference_bands", "search_rotation")
 #: Size, time of change and inode of files.

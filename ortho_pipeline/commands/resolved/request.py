@@ -45,10 +45,15 @@ class Request:
     def named(self) -> list[tuple[str, str | os.PathLike[str]]]:
         """The files that the user named, each with its role; a DEM may be a pattern of several."""
         named: list[tuple[str, Any]] = [
-            ("image", self.image), *self.scene.files.items(), ("points", self.point_file),
-            ("DEM", self.surface.dem), ("geoid", self.surface.vertical), ("DEM accuracy", sigma_file(self.surface)),
-            *(("reference", path) for path in self.match.reference), *self.output.files.items(),
-        ]  # fmt: skip
+            ("image", self.image),
+            *self.scene.files.items(),
+            ("points", self.point_file),
+            ("DEM", self.surface.dem),
+            ("geoid", self.surface.vertical),
+            ("DEM accuracy", sigma_file(self.surface)),
+            *(("reference", path) for path in self.match.reference),
+            *self.output.files.items(),
+        ]
         return [(role, path) for role, path in named if path is not None]
 
     @property

@@ -72,6 +72,6 @@ def _grid_like(request: Request) -> Grid | None:
             Text(Setting("output.like"), " gives the grid, and ", Setting(f"output.{given[0]}"), " would change it"),
             field=f"output.{given[0]}",
             remedy="leave out one of the two",
-        )  # fmt: skip
+        )
     with completed(os.fspath(output.like), field="output.like"):
         return grid_of(output.like, **request.scene.access)

@@ -115,9 +115,10 @@ def _one_of_several(image: Any, scene: SceneOptions) -> Any:
     rpc = item.rpc_of(chosen)
     if rpc is not None:
         raise InputError(
-            f"the RPC of this image lies elsewhere ({rpc.name}), and several images have no option for it", file=image,
+            f"the RPC of this image lies elsewhere ({rpc.name}), and several images have no option for it",
+            file=image,
             remedy="put it beside the image, under its name",
-        )  # fmt: skip
+        )
     return chosen.href
 
 

@@ -58,7 +58,7 @@ class SurveyedFile:
 
 
 @dataclass(frozen=True)
-class Survey:
+class FolderSurvey:
     """What lies in a folder."""
 
     folder: Path
@@ -90,7 +90,7 @@ class Survey:
         return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": json_value(self.found)}
 
 
-def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> Survey:
+def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> FolderSurvey:
     """Look at the files of a folder and of those in it; outputs of this program are left out.
 
     Raises
@@ -104,11 +104,12 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
     names = list(islice(_files(place, _DEPTH), _MOST + 1))
     if len(names) > _MOST:
         raise InputError(
-            f"more than {_MOST} files lie here", file=folder, remedy="give the folder of one delivery, or write the "
-            "file of the run by hand (docs/run.md)",
-        )  # fmt: skip
+            f"more than {_MOST} files lie here",
+            file=folder,
+            remedy="give the folder of one delivery, or write the file of the run by hand (docs/run.md)",
+        )
     found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
-    return Survey(place, tuple(_without_parts(found)))
+    return FolderSurvey(place, tuple(_without_parts(found)))
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:
@@ -189,9 +190,10 @@ def _without_parts(found: list[SurveyedFile]) -> list[SurveyedFile]:
     """Leave out what opens as the same image as another file: the metadata beside it."""
     scenes = {Path(one.path).with_suffix("") for one in found if one.kind == "scene" and not one.path.endswith(".xml")}
     return [
-        one for one in found
+        one
+        for one in found
         if not (one.path.lower().endswith(".xml") and (one.kind != "scene" or Path(one.path).with_suffix("") in scenes))
-    ]  # fmt: skip
+    ]
 
 
 def _short(source: str) -> str:

@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.commands.survey.folder import Kind, Survey, survey
+from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind, survey
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import allowed, write_text
 from ortho_pipeline.options import SceneOptions
@@ -49,12 +49,12 @@ def init(
     if not seen.of("scene"):
         raise InputError(
             "no image with a model lies here", file=folder, remedy="put the metadata (RPC, DIMAP, .IMD ...) beside it"
-        )  # fmt: skip
+        )
     prefix = os.path.relpath(Path(folder).resolve(), target.resolve().parent)
     if prefix.startswith(os.pardir):
         raise InputError(
             "the file of a run lies in the folder of its scenes or above it", file=target, remedy="give such a name"
-        )  # fmt: skip
+        )
     write_text(target, text(seen, prefix))
     skipped = [one for one in seen.found if one.kind == "image"]
     lines = [counted(len(seen.of("scene")), "scene")]
@@ -71,7 +71,7 @@ def init(
     return Result({"pipeline": target}, document, "\n".join(lines))
 
 
-def text(seen: Survey, prefix: str = ".") -> str:
+def text(seen: FolderSurvey, prefix: str = ".") -> str:
     """Return the file: what was found as settings, what was not as comments."""
 
     def at(name: str) -> str:

@@ -40,17 +40,22 @@ class ComparedModel(Record):
         """Return that of a fit, or of the reason why there is none; `size` as `available_models` has it."""
         found = fitted if isinstance(fitted, Fit) else None
         parameters, minimum, dimensions = size
-        return cls.model_validate({
-            "model": model, "parameters": parameters, "minimum_points": minimum, "dimensions": dimensions,
-            "error": None if found else fitted,
-            "rmse": found.rmses if found else Rmses(control=None, check=None, loo=None),
-            "rmse_m": rmse_metres(found) if found else RmsesOnGround(control=None, check=None, loo=None),
-            "condition": found and json_value(float(found.condition)),
-            "redundancy": found and found.redundancy,
-            "sigma0": found and found.sigma0,
-            "fitted_as": found and found.model_name,
-            "ridge": found and found.ridge,
-            "effective_parameters": found and json_value(float(found.effective_parameters)),
-            **to_document(found.warnings if found else ()),
-            "fit": found,
-        })  # fmt: skip
+        return cls.model_validate(
+            {
+                "model": model,
+                "parameters": parameters,
+                "minimum_points": minimum,
+                "dimensions": dimensions,
+                "error": None if found else fitted,
+                "rmse": found.rmses if found else Rmses(control=None, check=None, loo=None),
+                "rmse_m": rmse_metres(found) if found else RmsesOnGround(control=None, check=None, loo=None),
+                "condition": found and json_value(float(found.condition)),
+                "redundancy": found and found.redundancy,
+                "sigma0": found and found.sigma0,
+                "fitted_as": found and found.model_name,
+                "ridge": found and found.ridge,
+                "effective_parameters": found and json_value(float(found.effective_parameters)),
+                **to_document(found.warnings if found else ()),
+                "fit": found,
+            }
+        )

@@ -191,13 +191,17 @@ def compare(
     corrections = () if own is None else [own_name(own, name) for name in (*CORRECTIONS, OWN)]
     recommended, reason, criterion = recommend(rows, preferred=corrections, unsuited=tuple(unsuited or ()), size=size)
     return ComparisonRecord(
-        schema_version=1, image="", sensor="", model_crs=crs,
+        schema_version=1,
+        image="",
+        sensor="",
+        model_crs=crs,
         points=PointCounts(control=kept.control.sum(), check=kept.check.sum()),
         rows=tuple(rows),
         left_out=tuple(LeftOut(id=name, reason=reason) for name, reason in blunders.items()),
         recommendation=Recommendation.model_validate({"model": recommended, "criterion": criterion, "reason": reason}),
-        **to_document(uncovered(kept.image[kept.control], size)), files={},
-    )  # fmt: skip
+        **to_document(uncovered(kept.image[kept.control], size)),
+        files={},
+    )
 
 
 @dataclass(frozen=True)

@@ -83,9 +83,13 @@ def expectation(found: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | No
     stated = float(np.trace(ImageErrors.of(model, measured).covariance, axis1=1, axis2=2).mean())
     places = _places(found, size)
     return Expectation(
-        _criterion(found), _noise(found), stated, _variance(found, points.ground[tests]), _variance(found, places),
+        _criterion(found),
+        _noise(found),
+        stated,
+        _variance(found, points.ground[tests]),
+        _variance(found, places),
         _unseen(found, places),
-    )  # fmt: skip
+    )
 
 
 def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[str], float]:
@@ -99,9 +103,10 @@ def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[s
     if not math.isfinite(lowest):
         return list(expected), 1.0
     names = [
-        name for name, one in expected.items()
+        name
+        for name, one in expected.items()
         if one.criterion <= lowest + _CONTRADICTED or one.noise <= worth**2 * expected[best].noise
-    ]  # fmt: skip
+    ]
     return names, min(1.0, expected[best].noise)
 
 

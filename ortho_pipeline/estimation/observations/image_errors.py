@@ -49,9 +49,11 @@ class ImageErrors:
         if exact.any():
             name = points.ids[int(np.flatnonzero(exact)[0])]
             raise InputError(
-                f"the point {name} has no error in some direction of the image", file=points.source or None,
-                field="sigma_image", remedy="give each measurement a positive standard deviation",
-            )  # fmt: skip
+                f"the point {name} has no error in some direction of the image",
+                file=points.source or None,
+                field="sigma_image",
+                remedy="give each measurement a positive standard deviation",
+            )
         return cls(factor)
 
     @property

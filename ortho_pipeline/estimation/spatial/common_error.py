@@ -37,7 +37,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CommonError(CommonUnknown):
+class ImageCommonError(CommonUnknown):
     """What some points of an image have in common, and what the others tell of it.
 
     Parameters
@@ -55,7 +55,7 @@ class CommonError(CommonUnknown):
     shares: np.ndarray
 
     @classmethod
-    def of(cls, model: SensorModel, points: Points, used: np.ndarray) -> CommonError | None:
+    def of(cls, model: SensorModel, points: Points, used: np.ndarray) -> ImageCommonError | None:
         """Return that of points, in the CRS of the model, of which those in a mask ``(N,)`` control; None without."""
         shares = used & (points.sigma_common > 0)
         count = len(model.params)
@@ -72,9 +72,14 @@ class CommonError(CommonUnknown):
         largest = float(problem.points.sigma_common.max())
         everyone = np.ones(len(problem.rows), dtype=bool)
         return cls(
-            sigma=largest, points=len(everyone), value=np.zeros(2), told=np.zeros((2, 2)), per_sigma=per_sigma,
-            gain=per_sigma, shares=everyone,
-        )  # fmt: skip
+            sigma=largest,
+            points=len(everyone),
+            value=np.zeros(2),
+            told=np.zeros((2, 2)),
+            per_sigma=per_sigma,
+            gain=per_sigma,
+            shares=everyone,
+        )
 
     def offset(self, model: SensorModel, points: Points) -> Array:
         """Return how far (px) it moves each of points ``(N, 2)``; 0 for those that do not share it."""
@@ -83,12 +88,12 @@ class CommonError(CommonUnknown):
         found[shares] = model.param_partials(points.ground[shares]) @ (self.per_sigma @ self.value)
         return found
 
-    def seen_by(self, model: SensorModel, others: Points) -> CommonError:
+    def seen_by(self, model: SensorModel, others: Points) -> ImageCommonError:
         """Return it as points without it see it, from a model that was adjusted to those with it."""
         miss = others.image - model.ground_to_image(others.ground)
         return self.started(solve_2x2(model.param_partials(others.ground) @ self.per_sigma, -miss))
 
-    def settled(self, problem: Problem, keep: np.ndarray, solution: Solution) -> tuple[Solution, CommonError]:
+    def settled(self, problem: Problem, keep: np.ndarray, solution: Solution) -> tuple[Solution, ImageCommonError]:
         """Return the solution with it as an unknown.
 
         Parameters
@@ -101,13 +106,13 @@ class CommonError(CommonUnknown):
             With its present value.
         """
 
-        def again(found: CommonError, _: Solution) -> Solution:
+        def again(found: ImageCommonError, _: Solution) -> Solution:
             return problem.shifted(-found.offset(problem.model, problem.points)).solve(keep)
 
         shared = replace(self, shares=problem.points.sigma_common[keep] > 0)
-        return shared.settled_with(solution, CommonError._seen, again, _STANDS)
+        return shared.settled_with(solution, ImageCommonError._seen, again, _STANDS)
 
-    def _seen(self, solution: Solution) -> tuple[CommonError, Array]:
+    def _seen(self, solution: Solution) -> tuple[ImageCommonError, Array]:
         """Return it with what a solution tells of it, and the slope of half the sum of squares ``(2,)``."""
         design = solution.errors.whitened(solution.jacobian)
         moved = self.moved(solution)

@@ -299,11 +299,14 @@ def _classes(
         if within.any():
             found.append(
                 DistanceClass(
-                    from_m=low, to_m=high, distance_m=float(distance[within].mean()), pairs=int(within.sum()),
+                    from_m=low,
+                    to_m=high,
+                    distance_m=float(distance[within].mean()),
+                    pairs=int(within.sum()),
                     correlation=_pair(_ratio(products[within].mean(axis=0), variance)),
                     relative=_pair(np.sqrt(halves[within].mean(axis=0))),
                 )
-            )  # fmt: skip
+            )
     return tuple(found)
 
 

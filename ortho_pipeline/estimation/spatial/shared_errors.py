@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.estimation.problem import Solution
-from ortho_pipeline.estimation.spatial.common_error import CommonError
+from ortho_pipeline.estimation.spatial.common_error import ImageCommonError
 from ortho_pipeline.estimation.statistics import basis_of
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
@@ -82,7 +82,7 @@ class SharedErrors(Record):
 
 
 def shared_errors(
-    solution: Solution, image: Array, common: CommonError | None = None, sigma_alike: Array | None = None
+    solution: Solution, image: Array, common: ImageCommonError | None = None, sigma_alike: Array | None = None
 ) -> tuple[SharedErrors, Array] | None:
     """Return what neighbours share and the covariance ``(P, P)`` of the parameters; None where no point has a group.
 
@@ -92,7 +92,7 @@ def shared_errors(
         With redundancy.
     image : (n, 2)
         Its points, px.
-    common : CommonError, optional
+    common : ImageCommonError, optional
         What the points have in common; its own part of the covariance is not in what is returned.
     sigma_alike : (n,), optional
         What the matches among them err alike, px per axis, where it is known to be more than `MATCHED_ALIKE`.

@@ -38,9 +38,13 @@ class Record(pydantic.BaseModel):
     """A record, which does not change and refuses members that it does not know."""
 
     model_config = pydantic.ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, protected_namespaces=(), defer_build=True,
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        protected_namespaces=(),
+        defer_build=True,
         json_schema_serialization_defaults_required=True,
-    )  # fmt: skip
+    )
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of the record, as JSON values."""

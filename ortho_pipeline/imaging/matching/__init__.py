@@ -4,7 +4,7 @@ Imports `surface` and what is below; a sensor model is only asked where it puts 
 """
 
 from ortho_pipeline.imaging.matching.matcher import REASONS, Matches, MatchSettings, match
-from ortho_pipeline.imaging.matching.targets import OtherScene, Reference, Target, View, open_references
+from ortho_pipeline.imaging.matching.targets import OtherScene, Reference, SceneView, Target, open_references
 
 __all__ = [
     "REASONS",
@@ -12,8 +12,8 @@ __all__ = [
     "Matches",
     "OtherScene",
     "Reference",
+    "SceneView",
     "Target",
-    "View",
     "match",
     "open_references",
 ]

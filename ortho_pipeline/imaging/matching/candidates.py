@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ortho_pipeline.imaging.matching.targets import View
+from ortho_pipeline.imaging.matching.targets import SceneView
 from ortho_pipeline.models.base import Array
 
 #: Largest window (chip px) that is looked at in a cell: so the cost does not depend on the size of the scene.
@@ -29,7 +29,7 @@ def cells_of(width: float, height: float, count: int) -> tuple[int, int]:
 
 
 def candidates(
-    view: View,
+    view: SceneView,
     region: tuple[int, int, int, int],
     cells: tuple[int, int],
     size: int,
@@ -64,7 +64,7 @@ def candidates(
     return table[:, :2], table[:, 2]
 
 
-def _best(view: View, cell: tuple[float, float, float, float], size: int, factor: int) -> tuple[int, int] | None:
+def _best(view: SceneView, cell: tuple[float, float, float, float], size: int, factor: int) -> tuple[int, int] | None:
     """Return the first pixel of the chip with the most structure whose centre lies in a cell."""
     width, height = view.size
     middle = (cell[0] + cell[2]) / 2, (cell[1] + cell[3]) / 2

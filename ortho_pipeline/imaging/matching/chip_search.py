@@ -13,7 +13,7 @@ from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.imaging.matching.correlation import Peaks, orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.targets import Reference, Target, View
+from ortho_pipeline.imaging.matching.targets import Reference, SceneView, Target
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.runtime.process_limits import side_by_side
@@ -84,14 +84,19 @@ def in_batches(work: Callable[[NDArray[np.int_]], None], index: NDArray[np.int_]
 
 
 def in_each_band(
-    view: View, targets: Sequence[Target], origins: NDArray[np.int_], scene: Chips, start: Array, factor: int,
+    view: SceneView,
+    targets: Sequence[Target],
+    origins: NDArray[np.int_],
+    scene: Chips,
+    start: Array,
+    factor: int,
     threads: int,
-) -> tuple[BandShift, ...]:  # fmt: skip
+) -> tuple[BandShift, ...]:
     """Return where single bands of references put chips; none where fewer than two bands can be compared.
 
     Parameters
     ----------
-    view : View
+    view : SceneView
         With the model as the matches corrected it.
     origins : (n, 2)
         First pixels of chips that were matched.
@@ -152,9 +157,11 @@ def _way_back(shift: Array, wide: Chips, around: Chips, radius: int) -> Array:
     """Return how far (chip px) from where it began the way back ends ``(n,)``."""
     whole = np.clip(np.round(shift), -radius, radius).astype(int)
     side = wide.shape[1] - 4 * radius
-    there = np.stack([
-        chip[row : row + side, column : column + side]
-        for chip, (column, row) in zip(wide, 2 * radius + whole, strict=True)
-    ])  # fmt: skip
+    there = np.stack(
+        [
+            chip[row : row + side, column : column + side]
+            for chip, (column, row) in zip(wide, 2 * radius + whole, strict=True)
+        ]
+    )
     back = peaks(surfaces(orientation(there), orientation(around)))
     return np.asarray(np.hypot(*(back.shift + (shift - whole)).T))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.imaging.matching.kernels import chip_kernel
-from ortho_pipeline.imaging.matching.targets import Target, View
+from ortho_pipeline.imaging.matching.targets import SceneView, Target
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.intensity import EXACT
 from ortho_pipeline.surface import ray_kernel
@@ -39,7 +39,7 @@ _NEARLY_ALL = 0.95
 _PROBED = 24
 
 
-def scene_chips(view: View, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
+def scene_chips(view: SceneView, origins: NDArray[np.int_], size: int, factor: int) -> Pixels:
     """Return intensities ``(n, size, size)`` of chips of `size` means of `factor` x `factor` pixels.
 
     Parameters
@@ -59,7 +59,7 @@ class Renderer:
     """
 
     def __init__(
-        self, view: View, targets: Sequence[Target], origins: NDArray[np.int_], size: int, factor: int
+        self, view: SceneView, targets: Sequence[Target], origins: NDArray[np.int_], size: int, factor: int
     ) -> None:
         self._targets, self._size = targets, size
         self._surface = view.surface
@@ -116,7 +116,7 @@ def _read(target: Target, places: Array, out: Pixels) -> None:
 class _Nodes:
     """The lattices of chips: `coefficients` ``(n, m, m, 5, 4)``, the windows of the DEM, and their heights."""
 
-    def __init__(self, view: View, target: Target, origins: Array, extent: int) -> None:
+    def __init__(self, view: SceneView, target: Target, origins: Array, extent: int) -> None:
         self._view, self._target, self._origins, self._extent = view, target, origins, extent
         self._sampler = view.surface.sampler(view.model.crs)
         count = len(origins)

@@ -107,8 +107,15 @@ def _shifts(scene: NDArray[np.float32], target: NDArray[np.float32], start: Arra
     count = len(scene)
     shift, covariance, correlation = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
     shift_kernel.shifts(
-        np.ascontiguousarray(scene), np.ascontiguousarray(target), np.ascontiguousarray(start, dtype=float), offset,
-        RIM, np.array([_STEPS, _SMALL, _FARTHEST]), shift, covariance, correlation,
-    )  # fmt: skip
+        np.ascontiguousarray(scene),
+        np.ascontiguousarray(target),
+        np.ascontiguousarray(start, dtype=float),
+        offset,
+        RIM,
+        np.array([_STEPS, _SMALL, _FARTHEST]),
+        shift,
+        covariance,
+        correlation,
+    )
     shift[np.linalg.eigvalsh(np.nan_to_num(covariance))[:, 1] > _VAGUE**2] = np.nan
     return Measured(shift, covariance, correlation, np.full(count, not offset))

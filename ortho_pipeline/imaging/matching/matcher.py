@@ -13,6 +13,7 @@ from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.band_shifts import BandShift, spread
+from ortho_pipeline.imaging.matching.agreement import agreed
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
@@ -26,12 +27,12 @@ from ortho_pipeline.imaging.matching.chip_search import (
 )
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.search import Level, agreed, place, refuse_accident
+from ortho_pipeline.imaging.matching.search import Level, place, refuse_accident
 from ortho_pipeline.imaging.matching.sight import HEIGHTS, Chips, across, displacement, placed_along_sight
 from ortho_pipeline.imaging.matching.targets import (
     SAMPLES,
+    SceneView,
     Target,
-    View,
     chip_factor,
     metres_per_pixel,
     near,
@@ -45,7 +46,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import sigma_of_covariance
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.surface.rays import meet_surface
 
 #: Radius (chip px) of the search about the corrected model.
@@ -152,7 +153,7 @@ class Matches:
     bands: tuple[BandShift, ...] = ()
 
 
-def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Matches:
+def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -> Matches:
     """Match a scene with targets.
 
     Raises
@@ -178,7 +179,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     # The targets may show a part of that rectangle only.
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
-    corrected = View(view.intensity, correction, view.surface)
+    corrected = SceneView(view.intensity, correction, view.surface)
     origins, cells = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
     tried = _Tried(view, targets, origins, cells, base, threads, displaced)
     tried.search(correction)
@@ -192,7 +193,7 @@ def match(view: View, targets: Sequence[Target], settings: MatchSettings) -> Mat
     return replace(found, coverage=len(shown) / SAMPLES**2, bands=bands, points=points)
 
 
-def _shown(view: View, targets: Sequence[Target]) -> Array:
+def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
     """Return those of points ``(n, 2)`` spread over the scene that a target shows, as the model has it.
 
     Raises
@@ -208,13 +209,11 @@ def _shown(view: View, targets: Sequence[Target]) -> Array:
         if inside.any():
             said = f"covers {inside.mean():.1%} of the scene, which is too little to match"
             remedy = "give images that cover more of the scene, or measure points by hand"
-        raise InputError(
-            f"{targets[0].called} {said}", file=targets[0].path, field=targets[0].field, remedy=remedy
-        )  # fmt: skip
+        raise InputError(f"{targets[0].called} {said}", file=targets[0].path, field=targets[0].field, remedy=remedy)
     return image[inside]
 
 
-def _region(view: View, shown: Array) -> tuple[int, int, int, int]:
+def _region(view: SceneView, shown: Array) -> tuple[int, int, int, int]:
     """Return the rectangle (left, top, right, bottom) of the scene about points ``(n, 2)`` that a target shows."""
     half = np.array(view.size) / (2 * SAMPLES)
     low = np.maximum(np.floor(shown.min(axis=0) - half), 0).astype(int)
@@ -222,7 +221,7 @@ def _region(view: View, shown: Array) -> tuple[int, int, int, int]:
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
+def _inside(view: SceneView, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
     """Tell which image points ``(n,)`` fall into a target."""
     ground = meet_surface(view.model, image, view.surface)
     # Where the model is off, the surface may end too soon: its reference height stands in.
@@ -232,7 +231,7 @@ def _inside(view: View, targets: Sequence[Target], image: Array) -> NDArray[np.b
 
 
 def _cells_shown(
-    view: View, targets: Sequence[Target], region: tuple[int, int, int, int], grid: tuple[int, int]
+    view: SceneView, targets: Sequence[Target], region: tuple[int, int, int, int], grid: tuple[int, int]
 ) -> NDArray[np.bool_]:
     """Return the cells ``(rows, columns)`` of a region whose centre a target shows."""
     steps = [
@@ -246,9 +245,15 @@ class _Tried:
     """The chips that are tried, and how far each has come."""
 
     def __init__(
-        self, view: View, targets: Sequence[Target], origins: NDArray[np.int_], cells: NDArray[np.int_], factor: int,
-        threads: int, displaced: float,
-    ) -> None:  # fmt: skip
+        self,
+        view: SceneView,
+        targets: Sequence[Target],
+        origins: NDArray[np.int_],
+        cells: NDArray[np.int_],
+        factor: int,
+        threads: int,
+        displaced: float,
+    ) -> None:
         self.view, self.targets, self.origins, self.cells, self.factor = view, targets, origins, cells, factor
         # Where heights displace chips by more than they bear (px), each is sought by itself.
         self.threads, self.displaced = threads, displaced
@@ -268,20 +273,24 @@ class _Tried:
         """Return what single bands say of the matches that are kept, measured with the last correction."""
         good = np.flatnonzero(self.reason == "")
         return in_each_band(
-            View(self.view.intensity, correction, self.view.surface), self.targets,
-            self.origins[good] + self.whole[good], self.scene[good],
-            (self.offset[good] - self.whole[good]) / self.factor, self.factor, self.threads,
-        )  # fmt: skip
+            SceneView(self.view.intensity, correction, self.view.surface),
+            self.targets,
+            self.origins[good] + self.whole[good],
+            self.scene[good],
+            (self.offset[good] - self.whole[good]) / self.factor,
+            self.factor,
+            self.threads,
+        )
 
     def _renderer(self, correction: SensorModel, index: NDArray[np.int_], radius: int) -> Renderer:
-        seen = View(self.view.intensity, correction, self.view.surface)
+        seen = SceneView(self.view.intensity, correction, self.view.surface)
         origins = self.origins[index] + self.whole[index] - radius * self.factor
         return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
 
     def search(self, correction: SensorModel) -> None:
         """Find each chip to a chip px about where the correction puts it, or along the line of sight."""
         if self.displaced:
-            seen, reach = View(self.view.intensity, correction, self.view.surface), 2 * HEIGHTS * self.displaced
+            seen, reach = SceneView(self.view.intensity, correction, self.view.surface), 2 * HEIGHTS * self.displaced
             chips = Chips(
                 seen, self.targets, self.centres.astype(int), self.factor, reach + 2 * self.factor, self.threads
             )
@@ -316,7 +325,7 @@ class _Tried:
             raise self._too_few()
         better, agreeing = agreed(
             correction, self.centres[good], self.offset[good], self.score[good], _NEAR * self.factor
-        )  # fmt: skip
+        )
         if searched is not None:
             places = turns * (2 * searched / self.factor + 1) ** 2
             refuse_accident(int(agreeing.sum()), len(good), _NEAR, places, self.targets, searched)
@@ -398,21 +407,26 @@ class _Tried:
         if len(residuals) < _MOSTLY * seen and scatter > _VAGUE * self.factor:
             raise InputError(
                 f"the scene and the reference do not agree: {len(residuals)} of {counted(seen, 'chip')} fit together, "
-                f"and those only within {scatter:.1f} px", file=self.targets[0].path, field=self.targets[0].field,
+                f"and those only within {scatter:.1f} px",
+                file=self.targets[0].path,
+                field=self.targets[0].field,
                 remedy=Text(
-                    "check that the reference shows this place, search farther (", Setting("match.search"),
-                    ") if the model may be off by more, or give better heights"
+                    "check that the reference shows this place, search farther (",
+                    Setting("match.search"),
+                    ") if the model may be off by more, or give better heights",
                 ),
-            )  # fmt: skip
+            )
 
     def _too_few(self) -> InputError:
         counts = {name: int((self.reason == name).sum()) for name in REASONS}
         why = ", ".join(f"{count} {REASONS[name]}" for name, count in counts.items() if count)
         return TooFewPoints(
             f"{counted(int((self.reason == '').sum()), 'match')} of {len(self.reason)} tried"
-            f"{': ' + why if why else ''}", file=self.targets[0].path, field=self.targets[0].field,
+            f"{': ' + why if why else ''}",
+            file=self.targets[0].path,
+            field=self.targets[0].field,
             remedy="give images that are more alike (season, resolution), or points that are measured by hand",
-        )  # fmt: skip
+        )
 
     def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:
         """Return all that was tried, and the points."""
@@ -427,15 +441,32 @@ class _Tried:
         crs = parse_crs(self.view.model.crs)
         names = ", ".join(os.path.basename(target.path) for target in self.targets)
         points = Points(
-            ids=tuple(f"m{cell}" for cell in self.cells[good]), image=self.centres[good], ground=self.ground[good],
-            roles=roles, sigma_image=sigma_of_covariance(covariance), sigma_ground=np.zeros((len(good), 3)), crs=crs,
-            source=f"matched with {names}", covariance_image=covariance, groups=groups,
+            ids=tuple(f"m{cell}" for cell in self.cells[good]),
+            image=self.centres[good],
+            ground=self.ground[good],
+            roles=roles,
+            sigma_image=sigma_of_covariance(covariance),
+            sigma_ground=np.zeros((len(good), 3)),
+            crs=crs,
+            source=f"matched with {names}",
+            covariance_image=covariance,
+            groups=groups,
             sigma_common=np.full(len(good), settings.reference_sigma),
-        )  # fmt: skip
+        )
         return Matches(
-            self.centres, delivered, self.score, self.reason, self.cells, self.scene, self.target, self.found,
-            self.factor, levels, parts, points,
-        )  # fmt: skip
+            self.centres,
+            delivered,
+            self.score,
+            self.reason,
+            self.cells,
+            self.scene,
+            self.target,
+            self.found,
+            self.factor,
+            levels,
+            parts,
+            points,
+        )
 
 
 def _robust(design: Array, values: Array) -> Array:

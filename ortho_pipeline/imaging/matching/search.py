@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.imaging.matching.agreement import affine_step, agreed, followed_by, shifted
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
-from ortho_pipeline.imaging.matching.targets import Target, View, metres_per_pixel
+from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_per_pixel
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -88,7 +89,7 @@ class Level:
 
 
 def place(
-    view: View, targets: Sequence[Target], reach: float, base: int, region: Region, rotation_deg: float = 0.0
+    view: SceneView, targets: Sequence[Target], reach: float, base: int, region: Region, rotation_deg: float = 0.0
 ) -> tuple[ImageCorrection, list[Level]]:
     """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
 
@@ -113,7 +114,7 @@ def place(
     factor, radius = _coarsest(region, reach, base)
     side = _chip_side(region, factor, 3)
     shifts = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
-    alone = [_shifted(start, -shift * factor) for shift in shifts]
+    alone = [shifted(start, -shift * factor) for shift in shifts]
     try:
         return _refined(view, targets, reach, base, region, (factor, radius), alone)
     except InputError as error:
@@ -128,9 +129,13 @@ def place(
 
 
 def _turned(
-    view: View, targets: Sequence[Target], region: Region, start: ImageCorrection, level: tuple[int, int],
+    view: SceneView,
+    targets: Sequence[Target],
+    region: Region,
+    start: ImageCorrection,
+    level: tuple[int, int],
     rotation_deg: float,
-) -> list[ImageCorrection]:  # fmt: skip
+) -> list[ImageCorrection]:
     """Return the corrections of the highest places over shifts, rotations and scales, the highest first."""
     factor, radius = level
     side = _chip_side(region, factor, 3)
@@ -138,19 +143,21 @@ def _turned(
     wide = radius + margin((_spread(region, side, factor) + side * factor / 2 - origin) / factor)
     found: list[Turn] = []
     for matrix in renderings(rotation_deg):
-        model = followed_by(start, _step(matrix, np.zeros(2)))
+        model = followed_by(start, affine_step(matrix, np.zeros(2)))
         shown = _correlated(replace(view, model=model), targets, region, side, factor, wide)
         if len(shown.centres) >= _FEWEST:
             found += votes(shown.smooth(), (shown.centres - origin) / factor, radius, matrix, factor)
     found.sort(key=lambda one: -one.value)
     likely = (
-        followed_by(start, _step(turn.matrix, turn.shift)) for turn in found if turn.value > _WORTH * found[0].value
+        followed_by(start, affine_step(turn.matrix, turn.shift))
+        for turn in found
+        if turn.value > _WORTH * found[0].value
     )
     return _distinct(likely, region, factor)
 
 
 def _settled(
-    view: View, targets: Sequence[Target], region: Region, correction: ImageCorrection, factor: int
+    view: SceneView, targets: Sequence[Target], region: Region, correction: ImageCorrection, factor: int
 ) -> ImageCorrection:
     """Return what a correction leads to where its chips agree on a better one, step by step.
 
@@ -191,9 +198,14 @@ def _apart(one: ImageCorrection, other: ImageCorrection, region: Region) -> floa
 
 
 def _refined(
-    view: View, targets: Sequence[Target], reach: float, base: int, region: Region, level: tuple[int, int],
+    view: SceneView,
+    targets: Sequence[Target],
+    reach: float,
+    base: int,
+    region: Region,
+    level: tuple[int, int],
     corrections: Sequence[ImageCorrection],
-) -> tuple[ImageCorrection, list[Level]]:  # fmt: skip
+) -> tuple[ImageCorrection, list[Level]]:
     """Return the correction that stands out among hypotheses, refined level by level.
 
     Raises
@@ -209,9 +221,7 @@ def _refined(
     levels: list[Level] = []
     while True:
         found = peaks(shown.surface, 2)
-        correction, agreeing = agreed(
-            correction, shown.centres, found.shift * factor, found.score, _AGREE * factor
-        )  # fmt: skip
+        correction, agreeing = agreed(correction, shown.centres, found.shift * factor, found.score, _AGREE * factor)
         # That it is the right place among all is for the many chips of the last search to say.
         refuse_accident(int(agreeing.sum()), len(agreeing), _AGREE, 1.0, targets, reach)
         mean = correction.coefficients[[0, 3]]
@@ -261,8 +271,9 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
     if radius > _LARGEST_RADIUS:
         raise InputError(
             f"a search over {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
-            field="match.search", remedy="search less far, or measure points by hand",
-        )  # fmt: skip
+            field="match.search",
+            remedy="search less far, or measure points by hand",
+        )
     return factor, radius
 
 
@@ -277,7 +288,9 @@ def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def _correlated(view: View, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int) -> _Shown:
+def _correlated(
+    view: SceneView, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int
+) -> _Shown:
     """Correlate chips spread over a region with the targets, each with the first that shows enough there."""
     origins = _spread(region, side, factor)
     wide = side + 2 * radius
@@ -309,9 +322,12 @@ def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
 
 
 def _standing_out(
-    compared: Sequence[_Shown], corrections: Sequence[ImageCorrection], targets: Sequence[Target], reach: float,
+    compared: Sequence[_Shown],
+    corrections: Sequence[ImageCorrection],
+    targets: Sequence[Target],
+    reach: float,
     pixel: float,
-) -> int:  # fmt: skip
+) -> int:
     """Return the number of the hypothesis that is clearly better than the others.
 
     Raises
@@ -342,21 +358,27 @@ def _standing_out(
         divided = _divided(values[best], values[other], far)
         if divided:
             raise InputError(
-                f"{targets[0].called} is inconsistent: {divided}", file=targets[0].path, field=targets[0].field,
+                f"{targets[0].called} is inconsistent: {divided}",
+                file=targets[0].path,
+                field=targets[0].field,
                 remedy="give another reference, or cut out the part that is right and give that alone",
-            )  # fmt: skip
+            )
         raise InputError(
             f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
             f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
-            file=targets[0].path, field=targets[0].field,
+            file=targets[0].path,
+            field=targets[0].field,
             remedy=Text(
-                f"check that {targets[0].called} shows this place, search farther (", Setting("match.search"),
-                ") if the model may be off by more, and for rotations (", Setting("match.search_rotation", "5"),
-                ") if it may be turned; state how wrong heights may be (", Setting("surface.sigma", "20"),
+                f"check that {targets[0].called} shows this place, search farther (",
+                Setting("match.search"),
+                ") if the model may be off by more, and for rotations (",
+                Setting("match.search_rotation", "5"),
+                ") if it may be turned; state how wrong heights may be (",
+                Setting("surface.sigma", "20"),
                 ") if the DEM is coarse and the view oblique; measure points by hand where the ground is ",
-                "uniform or repeats itself"
+                "uniform or repeats itself",
             ),
-        )  # fmt: skip
+        )
     return best
 
 
@@ -385,63 +407,6 @@ def _divided(one: Mapping[tuple[float, ...], float], other: Mapping[tuple[float,
     )
 
 
-def agreed(
-    correction: ImageCorrection, centres: Array, offsets: Array, score: Array, tolerance: float
-) -> tuple[ImageCorrection, NDArray[np.bool_]]:
-    """Return a better correction, fitted to most of the offsets ``(n, 2)`` (px), and which of them agree with it.
-
-    A chip at p shows what the model puts at p + offset, so that the model has to put it `offset` earlier.
-    """
-    middle = np.median(offsets, axis=0)
-    agreeing = np.hypot(*(offsets - middle).T) <= 3 * tolerance
-    origin = np.array(correction.origin)
-    design = np.column_stack([np.ones(len(centres)), centres - origin])
-    # Three numbers per axis want many chips all over the scene; with few of them only the mean is believed.
-    slopes = agreeing.sum() >= 12 and np.ptp(centres[agreeing], axis=0).min() > 0
-    design = design if slopes else design[:, :1]
-    fitted = np.broadcast_to(middle, offsets.shape)
-    coefficients = np.zeros((design.shape[1], 2))
-    coefficients[0] = middle
-    for _ in range(10):
-        if agreeing.sum() < design.shape[1] + 1:
-            break
-        weight = np.sqrt(np.maximum(score[agreeing], 0.0))[:, None]
-        coefficients = np.linalg.lstsq(weight * design[agreeing], weight * offsets[agreeing], rcond=None)[0]
-        fitted = design @ coefficients
-        again = np.hypot(*(offsets - fitted).T) <= tolerance
-        if (again == agreeing).all():
-            break
-        agreeing = again
-    agreeing = np.hypot(*(offsets - fitted).T) <= tolerance
-    # corrected(p) = p - offset(p), put after the correction that there is.
-    step = np.zeros(6)
-    step[[0, 3]] = -coefficients[0]
-    if slopes:
-        step[1:3], step[4:6] = -coefficients[1:, 0], -coefficients[1:, 1]
-    return followed_by(correction, step), agreeing
-
-
-def _step(matrix: Array, shift: Array) -> Array:
-    """Return the coefficients of an affine correction about an origin."""
-    slopes = matrix - np.eye(2)
-    return np.array([shift[0], *slopes[0], shift[1], *slopes[1]])
-
-
-def _shifted(correction: ImageCorrection, shift: Array) -> ImageCorrection:
-    """Return a correction that is followed by a shift (px)."""
-    return followed_by(correction, _step(np.eye(2), shift))
-
-
-def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
-    """Return the affine correction that a second one, of coefficients `step` about the same origin, makes of it."""
-    second = np.eye(2) + step[[1, 2, 4, 5]].reshape(2, 2)
-    matrix = second @ correction.matrix
-    shift = second @ correction.coefficients[[0, 3]] + step[[0, 3]]
-    slopes = (matrix - np.eye(2)).ravel()
-    coefficients = np.array([shift[0], slopes[0], slopes[1], shift[1], slopes[2], slopes[3]])
-    return ImageCorrection(correction.model, "affine", correction.origin, coefficients)
-
-
 def refuse_accident(
     agreeing: int, chips: int, tolerance: float, places: float, targets: Sequence[Target], reach: float
 ) -> None:
@@ -464,13 +429,16 @@ def refuse_accident(
         raise InputError(
             f"the scene and {targets[0].called} do not agree: {agreeing} of {counted(chips, 'chip')} fit together "
             f"within {reach:.0f} px of where the model puts them, which chance does as well",
-            file=targets[0].path, field=targets[0].field,
+            file=targets[0].path,
+            field=targets[0].field,
             remedy=Text(
-                f"check that {targets[0].called} shows this place, search farther (", Setting("match.search"),
-                ") if the model may be off by more, for rotations (", Setting("match.search_rotation", "5"),
-                ") if it may be turned, or measure points by hand"
+                f"check that {targets[0].called} shows this place, search farther (",
+                Setting("match.search"),
+                ") if the model may be off by more, for rotations (",
+                Setting("match.search_rotation", "5"),
+                ") if it may be turned, or measure points by hand",
             ),
-        )  # fmt: skip
+        )
 
 
 def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
@@ -478,9 +446,12 @@ def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
     if not count:
         why = "where it covers the scene, it has no values or there are no heights"
     return InputError(
-        f"{targets[0].called} shows too little of the scene: {why}", file=targets[0].path, field=targets[0].field,
+        f"{targets[0].called} shows too little of the scene: {why}",
+        file=targets[0].path,
+        field=targets[0].field,
         remedy=Text(
-            "give images that overlap more, bands that have values (", Setting("match.reference_bands"),
-            "), and heights that cover the overlap"
+            "give images that overlap more, bands that have values (",
+            Setting("match.reference_bands"),
+            "), and heights that cover the overlap",
         ),
-    )  # fmt: skip
+    )

@@ -23,7 +23,7 @@ from ortho_pipeline.imaging.matching.chip_search import FEWEST, MEASURED, SIDE, 
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
 from ortho_pipeline.imaging.matching.search import Level
-from ortho_pipeline.imaging.matching.targets import Target, View
+from ortho_pipeline.imaging.matching.targets import SceneView, Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Text
@@ -48,7 +48,7 @@ class Chips:
 
     Parameters
     ----------
-    view : View
+    view : SceneView
         With the model as it is corrected.
     centres : (n, 2) of int
     factor : int
@@ -58,7 +58,13 @@ class Chips:
     """
 
     def __init__(
-        self, view: View, targets: Sequence[Target], centres: NDArray[np.int_], factor: int, reach: float, threads: int
+        self,
+        view: SceneView,
+        targets: Sequence[Target],
+        centres: NDArray[np.int_],
+        factor: int,
+        reach: float,
+        threads: int,
     ) -> None:
         self.view, self.targets, self.centres, self.factor = view, targets, centres, factor
         self.reach, self.threads = reach, threads
@@ -121,9 +127,14 @@ class Chips:
 
 
 def along_sight(
-    view: View, targets: Sequence[Target], factor: int, search: float, window: tuple[int, int, int, int],
-    displaced: float, threads: int,
-) -> tuple[ImageCorrection, int, int] | None:  # fmt: skip
+    view: SceneView,
+    targets: Sequence[Target],
+    factor: int,
+    search: float,
+    window: tuple[int, int, int, int],
+    displaced: float,
+    threads: int,
+) -> tuple[ImageCorrection, int, int] | None:
     """Return the shift of the model on which most chips agree across the line of sight, each found by itself.
 
     That is how a scene is placed where heights are wrong by more than chips are large, from chip to chip.
@@ -141,12 +152,10 @@ def along_sight(
     chips, agreeing : int
         Or None, where so many could as well agree by accident.
     """
-    start = ImageCorrection.identity(
-        view.model, "affine", ((window[0] + window[2]) / 2, (window[1] + window[3]) / 2)
-    )  # fmt: skip
+    start = ImageCorrection.identity(view.model, "affine", ((window[0] + window[2]) / 2, (window[1] + window[3]) / 2))
     columns, rows = cells_of(window[2] - window[0], window[3] - window[1], _ASKED)
     origins, _ = candidates(view, window, (columns, rows), SIDE, factor, np.ones((rows, columns), dtype=bool))
-    corrected = View(view.intensity, start, view.surface)
+    corrected = SceneView(view.intensity, start, view.surface)
     chips = Chips(corrected, targets, origins + SIDE // 2 * factor, factor, search + HEIGHTS * displaced, threads)
     chips.search()
     good = np.isfinite(chips.offset).all(axis=1)
@@ -164,7 +173,7 @@ def along_sight(
     return replace(start, coefficients=step), len(offset), int(most.sum())
 
 
-def displacement(view: View, shown: Array, dem_sigma: float, factor: int) -> float:
+def displacement(view: SceneView, shown: Array, dem_sigma: float, factor: int) -> float:
     """Return the standard deviation (px) of what wrong heights displace matches by; 0 where chips bear it."""
     ground = meet_surface(view.model, shown, view.surface)
     along = view.model.ground_partials(ground[np.isfinite(ground).all(axis=1)])[:, :, 2]
@@ -173,9 +182,14 @@ def displacement(view: View, shown: Array, dem_sigma: float, factor: int) -> flo
 
 
 def placed_along_sight(
-    view: View, targets: Sequence[Target], level: tuple[int, float], region: tuple[int, int, int, int],
-    displaced: float, threads: int, refused: InputError,
-) -> tuple[ImageCorrection, list[Level]]:  # fmt: skip
+    view: SceneView,
+    targets: Sequence[Target],
+    level: tuple[int, float],
+    region: tuple[int, int, int, int],
+    displaced: float,
+    threads: int,
+    refused: InputError,
+) -> tuple[ImageCorrection, list[Level]]:
     """Return the correction on which chips agree across the line of sight, where heights may be the cause of a refusal.
 
     Raises
@@ -190,9 +204,11 @@ def placed_along_sight(
     if found is None:
         raise InputError(
             f"{refused.message}; nor do chips agree across the line of sight, along which wrong heights displace them "
-            f"by {displaced:.0f} px", file=refused.file, field=refused.field,
+            f"by {displaced:.0f} px",
+            file=refused.file,
+            field=refused.field,
             remedy=Text("give better heights, or: ", refused.remedy or ""),
-        ) from None  # fmt: skip
+        ) from None
     correction, chips, agreeing = found
     shift = correction.coefficients[[0, 3]]
     radius = math.ceil((reach + HEIGHTS * displaced) / factor)
@@ -232,7 +248,7 @@ def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def displacements(view: View, target: Target, partials: Array, ground: Array) -> tuple[Array, Array]:
+def displacements(view: SceneView, target: Target, partials: Array, ground: Array) -> tuple[Array, Array]:
     """Return how a metre of height displaces matches ``(n, 2)``, and d(target)/d(image) ``(n, 2, 2)``.
 
     Parameters
@@ -242,9 +258,12 @@ def displacements(view: View, target: Target, partials: Array, ground: Array) ->
     """
     per_metre = map_from_enu(parse_crs(view.model.crs), ground)
     second = np.stack(
-        [(target.project(ground + one, view.model.crs) - target.project(ground - one, view.model.crs)) / 2
-         for one in np.moveaxis(per_metre, 2, 0)], axis=-1,
-    )  # fmt: skip
+        [
+            (target.project(ground + one, view.model.crs) - target.project(ground - one, view.model.crs)) / 2
+            for one in np.moveaxis(per_metre, 2, 0)
+        ],
+        axis=-1,
+    )
     first = partials @ per_metre
     # Along a ray of another scene plan follows height; in an orthoimage it does not.
     with np.errstate(invalid="ignore"):

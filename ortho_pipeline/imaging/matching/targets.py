@@ -29,7 +29,7 @@ _RATIO = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SceneView:
     """A scene as a matcher sees it.
 
     Parameters
@@ -137,17 +137,21 @@ class Reference:
         missing_band = next((number for number in bands if not 1 <= number <= source.count), None)
         if missing_band is not None:
             raise InputError(
-                f"the reference has {counted(source.count, 'band')}; there is no band {missing_band}", file=source.path,
-                field="match.reference_bands", remedy=f"give numbers from 1 to {source.count}",
-            )  # fmt: skip
+                f"the reference has {counted(source.count, 'band')}; there is no band {missing_band}",
+                file=source.path,
+                field="match.reference_bands",
+                remedy=f"give numbers from 1 to {source.count}",
+            )
         dataset = source.dataset
         text, transform = dataset.GetProjection(), dataset.GetGeoTransform(can_return_null=True)
         if not text or transform is None:
             missing = "coordinate system" if transform is not None else "georeference"
             raise CrsError(
-                f"the reference has no {missing}: where it lies is not known", file=source.path, field="reference",
+                f"the reference has no {missing}: where it lies is not known",
+                file=source.path,
+                field="reference",
                 remedy="give an orthoimage (GeoTIFF with its CRS), or set it with gdal_edit.py -a_srs and -a_ullr",
-            )  # fmt: skip
+            )
         forward = np.array([[transform[1], transform[2]], [transform[4], transform[5]]])
         with np.errstate(all="ignore"):
             sound = abs(np.linalg.det(forward)) > 0
@@ -157,9 +161,11 @@ class Reference:
             sound = bool(np.isfinite(inverse).all() and np.abs(offset).max() < 2**52)
         if not sound:
             raise CrsError(
-                "the reference has a georeference that cannot be inverted", file=source.path, field="reference",
+                "the reference has a georeference that cannot be inverted",
+                file=source.path,
+                field="reference",
                 remedy="give an orthoimage",
-            )  # fmt: skip
+            )
         with completed(source.path):
             crs = horizontal(parse_crs(text))
             # A system of no known datum is refused here, by the name of its file.
@@ -213,14 +219,14 @@ def open_references(
     return tuple(Reference.open(path, bands, **access) for path in paths)
 
 
-def spread_over(view: View) -> Array:
+def spread_over(view: SceneView) -> Array:
     """Return points ``(SAMPLES**2, 2)`` spread over a scene."""
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     columns, rows = np.meshgrid(steps * view.size[0], steps * view.size[1])
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def near(view: View, targets: Sequence[Target], reach: float) -> Sequence[Target]:
+def near(view: SceneView, targets: Sequence[Target], reach: float) -> Sequence[Target]:
     """Return the targets that may show something of a scene whose model is off by `reach` px; all, if none may.
 
     Of a country's many orthoimages a scene needs few, and each of the others would be asked for every chip.
@@ -252,7 +258,7 @@ def shown_by(targets: Sequence[Target], ground: Array, crs: str) -> NDArray[np.b
     return found
 
 
-def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
+def chip_factor(view: SceneView, targets: Sequence[Target], shown: Array) -> int:
     """Return how many pixels of a scene make one of a chip, where targets show points ``(n, 2)`` of it; at least 1.
 
     Raises
@@ -265,15 +271,16 @@ def chip_factor(view: View, targets: Sequence[Target], shown: Array) -> int:
         first = targets[0]
         raise InputError(
             f"a pixel of {os.path.basename(view.intensity.source.path)} is {ratio:.3g} pixels of {first.called}",
-            file=first.path, field=first.field,
+            file=first.path,
+            field=first.field,
             remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
-        )  # fmt: skip
+        )
     # Averaged to the pixels of a target half as fine, a real scene was found half a pixel off; in its own, a twentieth.
     # Of a scene that was enlarged, two by two are its own: single ones show its noise as if it were structure.
     return max(2 if view.intensity.enlarged else 1, round(1 / ratio / _FINER))
 
 
-def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
+def _resolution_ratio(view: SceneView, target: Target, image: Array) -> Array:
     """Return pixels of the target per pixel of the scene ``(n,)`` at image points; NaN where it shows nothing."""
     heights = np.full(len(image), view.model.reference_height)
     around = [
@@ -284,7 +291,7 @@ def _resolution_ratio(view: View, target: Target, image: Array) -> Array:
     return np.sqrt(np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]))
 
 
-def metres_per_pixel(view: View) -> float:
+def metres_per_pixel(view: SceneView) -> float:
     """Return the size (m) of a pixel on the ground in the middle of a scene."""
     middle = np.array(view.size) / 2
     image = middle + np.array([(0.0, 0.0), (8.0, 0.0), (0.0, 8.0)])

@@ -21,7 +21,7 @@ from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIGMAS
 from ortho_pipeline.imaging.matching.search import place
 from ortho_pipeline.imaging.matching.sight import HEIGHTS, Chips, along_sight, displacements, solved
-from ortho_pipeline.imaging.matching.targets import OtherScene, View, chip_factor, shown_by, spread_over
+from ortho_pipeline.imaging.matching.targets import OtherScene, SceneView, chip_factor, shown_by, spread_over
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -84,7 +84,7 @@ class PairSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class Matched:
+class PairMatches:
     """Places of one scene found in the other one; NaN where nothing was found.
 
     Parameters
@@ -120,7 +120,7 @@ class Pair:
 
     Parameters
     ----------
-    view : View
+    view : SceneView
     target : OtherScene
     correction : ImageCorrection
     factor : int
@@ -130,7 +130,7 @@ class Pair:
     settings : TieSettings
     """
 
-    view: View
+    view: SceneView
     target: OtherScene
     correction: ImageCorrection
     factor: int
@@ -138,7 +138,7 @@ class Pair:
     settings: TieSettings
 
     @classmethod
-    def place(cls, view: View, target: OtherScene, shown: Array, search: float, settings: TieSettings) -> Pair:
+    def place(cls, view: SceneView, target: OtherScene, shown: Array, search: float, settings: TieSettings) -> Pair:
         """Find the correction, by what both show.
 
         Parameters
@@ -184,7 +184,7 @@ class Pair:
         shift = self.correction.coefficients[[0, 3]]
         return float(shift[0]), float(shift[1])
 
-    def match(self, places: Array) -> Matched:
+    def match(self, places: Array) -> PairMatches:
         """Find places ``(n, 2)`` of the first scene in the second one.
 
         Chips are of whole pixels: what the chip about the nearest of their corners says is taken for the place itself.
@@ -195,10 +195,10 @@ class Pair:
         return self._judged(places, chips)
 
     def _chips(self, centres: NDArray[np.int_]) -> Chips:
-        seen = View(self.view.intensity, self.correction, self.view.surface)
+        seen = SceneView(self.view.intensity, self.correction, self.view.surface)
         return Chips(seen, [self.target], centres, self.factor, self.reach, self.settings.threads)
 
-    def _judged(self, places: Array, chips: Chips) -> Matched:
+    def _judged(self, places: Array, chips: Chips) -> PairMatches:
         """Leave out what contradicts the others across the epipolar direction, or heights by more than they may."""
         count = len(places)
         ground = np.full((count, 3), np.nan)
@@ -232,19 +232,25 @@ class Pair:
         second[good] = self.target.project(ground[good], self.view.model.crs)
         covariance = replace(parts, height=0.0).covariance(chips.covariance, along)
         height, sigma = _heights(residuals, covariance, along)
-        return Matched(
-            places, second, covariance / 2, turned @ covariance @ turned.swapaxes(1, 2) / 2, height, sigma,
-            chips.score, parts,
-        )  # fmt: skip
+        return PairMatches(
+            places,
+            second,
+            covariance / 2,
+            turned @ covariance @ turned.swapaxes(1, 2) / 2,
+            height,
+            sigma,
+            chips.score,
+            parts,
+        )
 
 
-def shared(view: View, target: OtherScene) -> Array:
+def shared(view: SceneView, target: OtherScene) -> Array:
     """Return those of points ``(n, 2)`` spread over a scene that another one shows, as the models have it."""
     image = spread_over(view)
     return image[shows(view, target, image)]
 
 
-def shows(view: View, target: OtherScene, image: Array) -> NDArray[np.bool_]:
+def shows(view: SceneView, target: OtherScene, image: Array) -> NDArray[np.bool_]:
     """Tell which image points ``(n,)`` of a scene another one shows, as the models have it."""
     return shown_by([target], meet_surface(view.model, image, view.surface), view.model.crs)
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
-from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, View, metres_per_pixel
-from ortho_pipeline.imaging.ties.pairs import Matched, Pair, PairSummary, TieSettings, shared, shows
+from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, SceneView, metres_per_pixel
+from ortho_pipeline.imaging.ties.pairs import Pair, PairMatches, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 
 #: Cells of a scene are at most so many times those wanted of its smallest overlap.
 _MOST = 10
@@ -58,7 +58,7 @@ class Ties:
         return np.intersect1d(self.track[self.image == first], self.track[self.image == second])
 
 
-def tie(views: Sequence[View], settings: TieSettings) -> Ties:
+def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
     """Tie scenes together.
 
     Raises
@@ -73,9 +73,11 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
     overlaps = _overlaps(views, targets)
     if not overlaps:
         raise InputError(
-            "no two of the scenes show the same ground", file=views[0].intensity.source.path, field="images",
+            "no two of the scenes show the same ground",
+            file=views[0].intensity.source.path,
+            field="images",
             remedy="give scenes that overlap; if they do, a model leads elsewhere (`ortho info`)",
-        )  # fmt: skip
+        )
     block = _Block(views, targets, settings)
     for home, view in enumerate(views):
         partners = {other: shown for (first, other), shown in overlaps.items() if first == home}
@@ -87,17 +89,21 @@ def tie(views: Sequence[View], settings: TieSettings) -> Ties:
             for one in block.pairs
         )
         raise InputError(
-            f"there are no ties: {said}", file=views[0].intensity.source.path, field="images",
+            f"there are no ties: {said}",
+            file=views[0].intensity.source.path,
+            field="images",
             remedy=Text(
-                "search farther (", Setting("match.search"),
-                ") if the models may be off by more, state how wrong the heights may be (", Setting("surface.sigma"),
-                "), or measure tie points by hand"
+                "search farther (",
+                Setting("match.search"),
+                ") if the models may be off by more, state how wrong the heights may be (",
+                Setting("surface.sigma"),
+                "), or measure tie points by hand",
             ),
-        )  # fmt: skip
+        )
     return block.ties()
 
 
-def _overlaps(views: Sequence[View], targets: Sequence[OtherScene]) -> dict[tuple[int, int], Array]:
+def _overlaps(views: Sequence[SceneView], targets: Sequence[OtherScene]) -> dict[tuple[int, int], Array]:
     """Return the pairs of scenes that show the same ground, and points ``(n, 2)`` of the first that the second does."""
     found = {}
     for first, second in itertools.combinations(range(len(views)), 2):
@@ -118,12 +124,12 @@ class _Track:
 class _Block:
     """Tracks as they grow, home by home."""
 
-    def __init__(self, views: Sequence[View], targets: Sequence[OtherScene], settings: TieSettings) -> None:
+    def __init__(self, views: Sequence[SceneView], targets: Sequence[OtherScene], settings: TieSettings) -> None:
         self.views, self.targets, self.settings = views, targets, settings
         self.tracks: list[_Track] = []
         self.pairs: list[PairSummary] = []
 
-    def tie_home(self, home: int, view: View, partners: Mapping[int, Array]) -> None:
+    def tie_home(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> None:
         """Measure chips of a scene in the scenes after it."""
         placed = self._placed(home, view, partners)
         if not placed:
@@ -147,7 +153,7 @@ class _Block:
         self._take(home, asking, found, placed)
         self.tracks += [track for track in begun if len(track.places) > 1]
 
-    def _placed(self, home: int, view: View, partners: Mapping[int, Array]) -> dict[int, Pair]:
+    def _placed(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> dict[int, Pair]:
         """Return the pairs of a home whose relative position was found; the others are said."""
         placed = {}
         search = self.settings.search / metres_per_pixel(view)
@@ -159,7 +165,12 @@ class _Block:
         return placed
 
     def _begun(
-        self, home: int, view: View, placed: Mapping[int, Pair], partners: Mapping[int, Array], grown: Sequence[_Track]
+        self,
+        home: int,
+        view: SceneView,
+        placed: Mapping[int, Pair],
+        partners: Mapping[int, Array],
+        grown: Sequence[_Track],
     ) -> tuple[list[_Track], list[set[int]]]:
         """Return new tracks, one in each cell that lacks a tie with a scene after it, and these scenes of each."""
         share = min(len(partners[other]) for other in placed) / SAMPLES**2
@@ -181,9 +192,12 @@ class _Block:
         return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()]
 
     def _take(
-        self, home: int, asking: Sequence[_Track], found: Mapping[int, tuple[NDArray[np.int_], Matched]],
+        self,
+        home: int,
+        asking: Sequence[_Track],
+        found: Mapping[int, tuple[NDArray[np.int_], PairMatches]],
         placed: Mapping[int, Pair],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Add what was found to the tracks."""
         own: dict[int, list[Array]] = {}
         for other, (index, matched) in found.items():
@@ -210,12 +224,15 @@ class _Block:
             for image, (place, covariance) in sorted(track.places.items())
         ]
         return Ties(
-            np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
-            np.array([row[2] for row in rows]), np.array([row[3] for row in rows]), tuple(self.pairs),
-        )  # fmt: skip
+            np.array([row[0] for row in rows]),
+            np.array([row[1] for row in rows]),
+            np.array([row[2] for row in rows]),
+            np.array([row[3] for row in rows]),
+            tuple(self.pairs),
+        )
 
 
-def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], Matched]]) -> None:
+def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], PairMatches]]) -> None:
     """Take the worse of two matches of one chip away that put the ground at different heights."""
     for (first_index, first), (second_index, second) in itertools.combinations(found.values(), 2):
         _, rows, others = np.intersect1d(first_index, second_index, return_indices=True)

@@ -45,7 +45,7 @@ from ortho_pipeline.models.frame.working_frame import (
     GEOGRAPHIC,
     MAP,
     TOPOCENTRIC,
-    MapPlane,
+    ProjectionFrame,
     Topocentric,
     WorkingFrame,
     require_frame,
@@ -203,7 +203,7 @@ class FrameCamera(SensorModel):
     @cached_property
     def working_frame(self) -> WorkingFrame:
         """The frame of the exterior orientation."""
-        return MapPlane() if self.frame == MAP else Topocentric(self.origin)
+        return ProjectionFrame() if self.frame == MAP else Topocentric(self.origin)
 
     @property
     def rotation(self) -> Array:

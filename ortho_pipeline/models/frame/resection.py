@@ -172,12 +172,16 @@ def _grunert(ground: Array, rays: Array) -> Iterator[Array]:
         4 * (q * (1 - q) * cos_b - (1 - plus) * cos_a * cos_c + 2 * c_b * cos_a**2 * cos_b),
         2
         * (
-            q**2 - 1 + 2 * q**2 * cos_b**2 + 2 * (1 - c_b) * cos_a**2
-            - 4 * plus * cos_a * cos_b * cos_c + 2 * (1 - a_b) * cos_c**2
+            q**2
+            - 1
+            + 2 * q**2 * cos_b**2
+            + 2 * (1 - c_b) * cos_a**2
+            - 4 * plus * cos_a * cos_b * cos_c
+            + 2 * (1 - a_b) * cos_c**2
         ),
         4 * (-q * (1 + q) * cos_b + 2 * a_b * cos_c**2 * cos_b - (1 - plus) * cos_a * cos_c),
         (1 + q) ** 2 - 4 * a_b * cos_c**2,
-    ]  # fmt: skip
+    ]
     for root in np.roots(quartic):
         # Noise makes a double root complex: its real part is still a start.
         v = float(root.real)

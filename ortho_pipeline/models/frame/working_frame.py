@@ -108,7 +108,7 @@ class Topocentric:
         return np.asarray(metres_per_degree(np.array([[*position[:2], 0.0]]))[0])
 
 
-class MapPlane:
+class ProjectionFrame:
     """The coordinates of a map projection, as if the Earth were flat."""
 
     curvature = 0.0

@@ -356,9 +356,18 @@ def _compiled_camera(model: Pushbroom) -> pushbroom_kernel.Camera:
     """Return the camera as the compiled projection reads it."""
     camera = model.camera
     numbers = np.array(
-        [camera.principal_column, camera.principal_line, camera.focal_length, camera.width, model.line_period,
-         SEMI_MAJOR, ECCENTRICITY_SQUARED, _LAST_STEP, *model.light.numbers]
-    )  # fmt: skip
+        [
+            camera.principal_column,
+            camera.principal_line,
+            camera.focal_length,
+            camera.width,
+            model.line_period,
+            SEMI_MAJOR,
+            ECCENTRICITY_SQUARED,
+            _LAST_STEP,
+            *model.light.numbers,
+        ]
+    )
     return pushbroom_kernel.Camera(model.mounting, model.lever, numbers, camera.dx, camera.dy)
 
 

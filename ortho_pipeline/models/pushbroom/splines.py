@@ -72,9 +72,10 @@ class Spline:
         basis = empty.basis(times)
         if not (np.isfinite(basis).all() and np.isfinite(values).all()):
             raise InputError(
-                "times or values of a table are so far apart that no spline follows them", field="breaks",
+                "times or values of a table are so far apart that no spline follows them",
+                field="breaks",
                 remedy="the file is damaged: copy it again",
-            )  # fmt: skip
+            )
         found, _, rank, _ = np.linalg.lstsq(basis, values - middle, rcond=1e-10)
         if rank < count:
             raise InputError(

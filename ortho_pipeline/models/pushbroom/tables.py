@@ -85,9 +85,10 @@ def pushbroom_of_tables(
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     if not (steps <= _FASTEST * np.diff(times) + _ROUNDED).all():
         raise InputError(
-            f"between two positions of this table lie {steps.max():.4g} m: no satellite is so fast", field="orbit",
+            f"between two positions of this table lie {steps.max():.4g} m: no satellite is so fast",
+            field="orbit",
             remedy="the file is damaged: copy it again; or give positions in ECEF metres at times in seconds",
-        )  # fmt: skip
+        )
     turn_times, turns = _table(attitude, (3, 3), needed, degree, "attitude")
     if not are_rotations(turns):
         raise InputError("a matrix of this table is not a rotation", field="attitude")

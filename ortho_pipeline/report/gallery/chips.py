@@ -28,7 +28,7 @@ _STRETCH = (2.0, 98.0)
 
 
 @dataclass(frozen=True)
-class Tile:
+class ChipPair:
     """A pair of chips: `scene` and `reference` are their corners in the picture, `cross` and `found` the place in each.
 
     All in pixels of the picture, from the corner of the chip for `cross` and `found`; `found` is None where nothing was
@@ -62,8 +62,8 @@ class Tile:
 class Gallery:
     """Tiles in the order of the page, the picture (PNG in base64) with its size, and the side of a chip in it, px."""
 
-    worst: tuple[Tile, ...]
-    rejected: tuple[Tile, ...]
+    worst: tuple[ChipPair, ...]
+    rejected: tuple[ChipPair, ...]
     picture: str
     size: tuple[int, int]
     side: int
@@ -95,9 +95,15 @@ def gallery(report: SceneReport, matches: Matches) -> Gallery | None:
     picture = _picture(matches, [k for k, _ in order])
     tiles = [_tile(matches, k, one, place) for place, (k, one) in enumerate(order)]
     return Gallery(
-        tuple(tiles[: len(worst)]), tuple(tiles[len(worst) :]), base64.b64encode(png_bytes(picture)).decode(),
-        (picture.shape[2], picture.shape[1]), matches.scene.shape[1], matches.factor, len(kept), len(rejected),
-    )  # fmt: skip
+        tuple(tiles[: len(worst)]),
+        tuple(tiles[len(worst) :]),
+        base64.b64encode(png_bytes(picture)).decode(),
+        (picture.shape[2], picture.shape[1]),
+        matches.scene.shape[1],
+        matches.factor,
+        len(kept),
+        len(rejected),
+    )
 
 
 def _score(one: MatchPoint) -> float:
@@ -111,14 +117,14 @@ def _corners(place: int, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
     return (left, top), (left + side + 1, top)
 
 
-def _tile(matches: Matches, index: int, one: MatchPoint, place: int) -> Tile:
+def _tile(matches: Matches, index: int, one: MatchPoint, place: int) -> ChipPair:
     side = matches.scene.shape[1]
     scene, reference = _corners(place, side)
     column, row = (float(value) for value in side / 2 + matches.found[index])
     reason = one.candidate.reason
     inside = 0 <= column <= side and 0 <= row <= side
     kinds = {"control": "control", "check": "check", "out": "left out by the adjustment"}
-    return Tile(
+    return ChipPair(
         id=one.candidate.id if one.point is None else one.point.id,
         kind="rejected" if reason is not None else kinds[one.kind],
         # Of what was not measured it is no correlation.

@@ -48,9 +48,11 @@ def plot_matches(report: SceneReport) -> Drawing | None:
     rows = _legend_rows(found, max(wide + 2 * left, _LEAST) - 2 * _PAD)
     base = top + tall + 28
     drawing = Drawing(
-        wide + 2 * left, base + 20 * len(rows) + 4, f"Map of {counted(len(found), 'match', 'matches')}, kept and "
-        "rejected, over the frame of the image", "matches",
-    )  # fmt: skip
+        wide + 2 * left,
+        base + 20 * len(rows) + 4,
+        f"Map of {counted(len(found), 'match', 'matches')}, kept and rejected, over the frame of the image",
+        "matches",
+    )
     _fields(drawing, report.matching.coverage.kept, (left, top, wide, tall))
     drawing.rect("frame", left, top, wide, tall)
     drawing.text(left, top - 5, "0, 0", quiet=True)
@@ -89,9 +91,13 @@ def _fields(drawing: Drawing, kept: Sequence[Sequence[int]], frame: tuple[float,
         for i, count in enumerate(row):
             with drawing.titled(f"{counted(count, 'match', 'matches')} kept"):
                 drawing.rect(
-                    "plus", left + i * wide / len(row), top + j * tall / len(kept), wide / len(row), tall / len(kept),
+                    "plus",
+                    left + i * wide / len(row),
+                    top + j * tall / len(kept),
+                    wide / len(row),
+                    tall / len(kept),
                     _DARKEST * count / most if most else 0.0,
-                )  # fmt: skip
+                )
 
 
 def _crosses(drawing: Drawing, kind: str, places: Sequence[Pair]) -> None:
@@ -151,9 +157,11 @@ def plot_match_histograms(report: SceneReport) -> Drawing | None:
     step = round_down(2 * reach / math.sqrt(len(found)))
     edges = step * np.arange(-math.ceil(reach / step + 1e-9), math.ceil(reach / step + 1e-9) + 1)
     drawing = Drawing(
-        420, 470, f"Residuals of {counted(len(found), 'match', 'matches')}, {names[0]} and {names[1]}",
+        420,
+        470,
+        f"Residuals of {counted(len(found), 'match', 'matches')}, {names[0]} and {names[1]}",
         "match_histograms",
-    )  # fmt: skip
+    )
     tops = [np.histogram(part[:, axis], edges)[0] for part in (control, check) for axis in (0, 1)]
     high = 1.08 * max(1, *(int((one + other).max()) for one, other in zip(tops[:2], tops[2:], strict=True)))
     for axis in (0, 1):

@@ -42,8 +42,10 @@ def plot_network(report: BlockReport) -> Drawing | None:
     _draw_names(drawing, {label: paper.at(corners) for label, corners in list(outlines.items())[:_NAMES]})
     length = round_down(paper.width / paper.scale / 4)
     left, base = _MARGIN, drawing.height - 8.0
-    drawing.path("rule", [(left, base - 4), (left, base), (left + length * paper.scale, base),
-                          (left + length * paper.scale, base - 4)])  # fmt: skip
+    drawing.path(
+        "rule",
+        [(left, base - 4), (left, base), (left + length * paper.scale, base), (left + length * paper.scale, base - 4)],
+    )
     drawing.text(left + length * paper.scale + 8, base, f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m")
     return drawing
 
@@ -103,8 +105,11 @@ def _draw_points(drawing: Drawing, report: BlockReport, paper: _Paper, first: fl
     for ray in report.adjustment.rays:
         if ray.used:
             rays[ray.id] = rays.get(ray.id, 0) + 1
-    placed = [(one, angle) for one, angle in zip(report.adjustment.points, report.network.largest_deg, strict=True)
-              if None not in one.ground]  # fmt: skip
+    placed = [
+        (one, angle)
+        for one, angle in zip(report.adjustment.points, report.network.largest_deg, strict=True)
+        if None not in one.ground
+    ]
     ties = [one for one in placed if one[0].role == "tie"]
     known = [one for one in placed if one[0].role != "tie"]
     wrong = doubted(report.notices)

@@ -89,8 +89,15 @@ def residual_axes(
             continue
         axes.plot(*image[some].T, mark, color=colour, markersize=4, label=_NAMES[name])
         if name != "out":
-            axes.quiver(*image[some].T, *residuals[some].T, color=colour, angles="xy", width=0.004,
-                        scale=_scale(image[known], residuals[known & (kind != "out")]), scale_units="xy")  # fmt: skip
+            axes.quiver(
+                *image[some].T,
+                *residuals[some].T,
+                color=colour,
+                angles="xy",
+                width=0.004,
+                scale=_scale(image[known], residuals[known & (kind != "out")]),
+                scale_units="xy",
+            )
     axes.set_title(title)
     axes.set_xlabel("column, px")
     axes.set_ylabel("row, px")

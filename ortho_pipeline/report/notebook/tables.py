@@ -67,10 +67,12 @@ def _rms_row(name: str, rms: Rmse) -> tuple[str, ...]:
 @html.register
 def _(scene: Scene) -> str:
     rows = [
-        ("size", f"{scene.width} x {scene.height} pixels"), ("sensor", scene.sensor),
-        ("models", ", ".join(scene.models)), ("read from", str(scene.model_source)),
+        ("size", f"{scene.width} x {scene.height} pixels"),
+        ("sensor", scene.sensor),
+        ("models", ", ".join(scene.models)),
+        ("read from", str(scene.model_source)),
         *((name, str(value)) for name, value in scene.facts.items()),
-    ]  # fmt: skip
+    ]
     table = _table(f"Scene {Path(scene.path).name}", ("", ""), rows)
     return render("report/notebook.html.j2", tables=[table], notes=scene.warnings)
 
@@ -104,11 +106,13 @@ def _(points: Points) -> str:
     head = ("", "role", "column", "row", "x", "y", "height")
     texts = [
         (
-            one.id, one.role, *(f"{value:.2f}" for value in one.image),
+            one.id,
+            one.role,
+            *(f"{value:.2f}" for value in one.image),
             *("–" if math.isnan(value) else f"{value:.10g}" for value in one.ground),
         )
         for one in itertools.islice(points, _LISTED)
-    ]  # fmt: skip
+    ]
     rest = len(points) - len(texts)
     said = [f"and {counted(rest, 'more point')}"] if rest else []
     return render("report/notebook.html.j2", tables=[_table(repr(points)[1:-1], head, texts)], notes=said)

@@ -120,9 +120,10 @@ class Signal:
 
 #: Of a result that no point tests.
 UNTESTED = Signal(
-    "look", "Nothing tests how accurate this is.",
+    "look",
+    "Nothing tests how accurate this is.",
     "Give points of known ground that only check, or an orthoimage of the place to match with.",
-)  # fmt: skip
+)
 
 
 def advised(code: str) -> tuple[Level, str]:
@@ -133,9 +134,7 @@ def advised(code: str) -> tuple[Level, str]:
     return "look", _UNKNOWN
 
 
-def signals(
-    warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *, tested: bool = True
-) -> list[Signal]:  # fmt: skip
+def signals(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *, tested: bool = True) -> list[Signal]:
     """Return the notices of a document, the gravest first; of earlier versions, which have no codes, the texts.
 
     Of a result that is not `tested` that is the first thing to look at.

@@ -29,10 +29,11 @@ _SIDE, _MOST = 88, 300
 _NOT_MADE = {"message": "nobody has made this scene yet", "file": None, "field": None, "remedy": "run it"}
 #: The evidence that scenes are ordered by, the best first.
 EVIDENCE = {
-    "check": ("check point", "check points"), "matched": ("held-out match", "held-out matches"),
+    "check": ("check point", "check points"),
+    "matched": ("held-out match", "held-out matches"),
     "loo": ("control point left out in turn", "control points left out in turn"),
     "control": ("control point: the fit", "control points: the fit"),
-}  # fmt: skip
+}
 
 
 #: What a scene may be other than ready, the worst first.
@@ -100,9 +101,17 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
     code = script()
     states = Counter(row.state for row in rows)
     page = render(
-        "report/run.html.j2", title=title, rows=shown, key=key, script=code, policy=policy(code), thumbnails=_MOST,
-        head=_headline(states, len(rows)), levels=WORDS, said=_summary(rows),
-    )  # fmt: skip
+        "report/run.html.j2",
+        title=title,
+        rows=shown,
+        key=key,
+        script=code,
+        policy=policy(code),
+        thumbnails=_MOST,
+        head=_headline(states, len(rows)),
+        levels=WORDS,
+        said=_summary(rows),
+    )
     write_text(path, page)
 
 

@@ -96,8 +96,11 @@ def write_report_html(
 
 def _too_short(report: SceneReport) -> bool:
     """Tell whether some arrows over the ortho are too short to be drawn beside the longest."""
-    sizes = [math.hypot(*one.residual_m) for one in report.adjustment.points
-             if one.kind != "out" and is_known(one.residual_m)]  # fmt: skip
+    sizes = [
+        math.hypot(*one.residual_m)
+        for one in report.adjustment.points
+        if one.kind != "out" and is_known(one.residual_m)
+    ]
     return bool(sizes) and min(sizes) < max(sizes) / LONGEST_ARROW
 
 

@@ -19,7 +19,7 @@ _REMEDY = "give a STAC collection: its JSON file, or its address in an API (…/
 _LIMIT, _PAGES = 100, 50
 #: Documents of a static collection that are read, and how many at a time; catalogs within each other.
 _MOST_DOCUMENTS, _AT_ONCE, _DEEPEST = 30_000, 16, 8
-_FEWER = "give a smaller collection, or a FeatureCollection file of the items that are meant"
+_FEWER = "give a smaller collection, or a FeatureCollection file of the items that you need"
 
 
 class Collection:
@@ -84,7 +84,7 @@ class Collection:
         for item in items:
             if not item.boxes:
                 raise InputError(
-                    f"the item {item.id!r} does not say where it lies", file=item.address, field="bbox", remedy=_REMEDY
+                    f"the item {item.id!r} does not state its position", file=item.address, field="bbox", remedy=_REMEDY
                 )
             if any_meet(item.boxes, boxes):
                 found[item.id, tuple(asset.href for asset in item.assets)] = item
@@ -103,7 +103,9 @@ class Collection:
             if not wanted:
                 return
             if len(seen) > _MOST_DOCUMENTS:
-                raise InputError(f"more than {_MOST_DOCUMENTS} documents", file=self.address, remedy=_FEWER)
+                raise InputError(
+                    f"this collection has more than {_MOST_DOCUMENTS} documents", file=self.address, remedy=_FEWER
+                )
             below = []
             with thread_pool(_AT_ONCE, "stac") as pool:
                 for place, read in zip(wanted, pool.map(self._read, wanted), strict=True):
@@ -114,7 +116,7 @@ class Collection:
                         below += self._named(_links(read), place, seen)
             wanted = below
         if wanted:
-            raise InputError(f"more than {_DEEPEST} catalogs within each other", file=self.address, remedy=_FEWER)
+            raise InputError(f"more than {_DEEPEST} nested catalogs", file=self.address, remedy=_FEWER)
 
     def _named(self, links: list[dict[str, Any]], base: str, seen: set[str]) -> list[str]:
         """Return the places that links to items and catalogs name, of which none was seen before."""
@@ -133,9 +135,11 @@ class Collection:
         _require_collection(document, place)
         if document["type"] == "Collection" and self._document["type"] == "Catalog":
             raise InputError(
-                f"this is a catalog of collections, such as {str(document.get('id'))[:60]!r}", file=self.address,
-                field="links", remedy=f"give one of them, such as {place}",
-            )  # fmt: skip
+                f"this is a catalog of collections, such as {str(document.get('id'))[:60]!r}",
+                file=self.address,
+                field="links",
+                remedy=f"give one of them, such as {place}",
+            )
         extent = extent_boxes(document)
         return not extent or any_meet(extent, boxes)
 
@@ -152,7 +156,9 @@ class Collection:
             following = [link for link in _links(found) if link["rel"] == "next"]
             ours = [link for link in following if str(link.get("method", "GET")).upper() == "GET"]
             if following and not ours:
-                raise InputError("the next page of items is not given by GET", file=page, field="links", remedy=_FEWER)
+                raise InputError(
+                    "the next page of items cannot be read with GET", file=page, field="links", remedy=_FEWER
+                )
             page = target(ours[0]["href"], page) if ours else None
         raise InputError(f"more than {_PAGES} pages of items at one place", file=address, remedy=_FEWER)
 
@@ -167,14 +173,14 @@ def read_collection(address: AnyPath, *, allow_network: bool = False) -> dict[st
 
 def _require_collection(document: Mapping[str, Any], address: AnyPath) -> None:
     if document.get("type") not in COLLECTIONS:
-        raise InputError("this is no STAC collection", file=address, field="type", remedy=_REMEDY)
+        raise InputError("this is not a STAC collection", file=address, field="type", remedy=_REMEDY)
     _require_lists(document, address)
 
 
 def _require_lists(document: Mapping[str, Any], address: AnyPath) -> None:
     for member in ("links", "features"):
         if not isinstance(document.get(member, []), list):
-            raise InputError("this is no list", file=address, field=member, remedy=_REMEDY)
+            raise InputError("this is not a list", file=address, field=member, remedy=_REMEDY)
 
 
 def _links(document: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -187,6 +193,6 @@ def _is_link(link: object) -> bool:
 
 def _object(feature: Any, address: str) -> Mapping[str, Any]:
     if not isinstance(feature, dict):
-        raise InputError("an item is an object", file=address, field="features", remedy=_REMEDY)
+        raise InputError("an item must be a JSON object", file=address, field="features", remedy=_REMEDY)
     # An API leaves out of its answer what stands in it once.
     return {"stac_version": "1.0.0", **feature} if Location(address).is_address else feature

@@ -17,7 +17,7 @@ from ortho_pipeline.stores.objects import Objects
 
 #: Types of documents that hold items, or lead to them.
 COLLECTIONS = ("Collection", "Catalog", "FeatureCollection")
-REMEDY = "give a STAC item as the specification has it (a JSON object with stac_version, type and assets)"
+REMEDY = "give a valid STAC item (a JSON object with stac_version, type and assets)"
 _MAX_BYTES = 20_000_000
 _ATTEMPTS, _PAUSE, _TIMEOUT = 5, 0.2, 30.0
 #: Answers that may be others a moment later.
@@ -47,7 +47,7 @@ def read_document(address: AnyPath, *, allow_network: bool, paged: bool = False)
     else:
         found = read_json(text, _MAX_BYTES, REMEDY)
     if not isinstance(found, dict):
-        raise InputError("this is no JSON object", file=text, remedy=REMEDY)
+        raise InputError("this is not a JSON object", file=text, remedy=REMEDY)
     return found
 
 
@@ -74,18 +74,19 @@ def _answer(url: str) -> bytes:
         except urllib.error.HTTPError as error:
             if error.code not in _PASSING:
                 raise InputError(
-                    f"the server does not give this document (HTTP status {error.code})", file=url,
+                    f"the server refuses this document (HTTP status {error.code})",
+                    file=url,
                     remedy="check the address",
-                ) from error  # fmt: skip
+                ) from error
             failure = f"HTTP status {error.code}"
         except (OSError, http.client.HTTPException) as error:
             failure = f"no answer ({type(error).__name__})"
         else:
             if len(data) > _MAX_BYTES:
-                raise InputError(f"this document has more than {_MAX_BYTES // 1_000_000} MB", file=url, remedy=REMEDY)
+                raise InputError(f"this document is larger than {_MAX_BYTES // 1_000_000} MB", file=url, remedy=REMEDY)
             count(len(data))
             return data
-    raise StorageError(f"the server does not do what was asked ({failure})", file=url, remedy="try again later")
+    raise StorageError(f"the request to the server failed ({failure})", file=url, remedy="try again later")
 
 
 def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
@@ -100,7 +101,7 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     if text.is_address:
         return text
     if not text or "\0" in text or text.startswith("/vsi") or (":" in text.partition("/")[0] and "://" in text):
-        raise InputError(f"{text[:200]!r} is no place of a file", file=base, field="href", remedy=REMEDY)
+        raise InputError(f"{text[:200]!r} is not the address of a file", file=base, field="href", remedy=REMEDY)
     if here.is_address:
         if here.is_on_web:
             return urljoin(here, text)
@@ -109,7 +110,9 @@ def target(href: str, base: AnyPath, roots: tuple[AnyPath, ...] = ()) -> str:
     path = Path(here).parent / text
     if not within(path, [Path(here).resolve().parent, Path(here).parent, *roots]):
         raise InputError(
-            f"this names {text[:200]!r}, which is outside of its own folder", file=base, field="href",
+            f"this refers to {text[:200]!r}, which is outside its own folder",
+            file=base,
+            field="href",
             remedy=Text("put the files into one folder, or allow another one with ", Setting("scene.roots", "DIR")),
-        )  # fmt: skip
+        )
     return os.fspath(path)

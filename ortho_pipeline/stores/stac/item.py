@@ -61,7 +61,7 @@ class Asset:
 
     @property
     def is_rpc(self) -> bool:
-        """Whether it is a side-car with an RPC."""
+        """Whether it is a sidecar file with an RPC."""
         return bool(_RPC_NAME.search(self.name)) or (self.key.lower() == "rpc" and not self.is_raster)
 
     @property
@@ -91,7 +91,7 @@ class Item:
         Raises
         ------
         InputError
-            If there is none, or several stand beside each other.
+            If there is none, or several are possible.
         """
         rasters = [asset for asset in self.assets if asset.is_raster]
         groups = [[asset for asset in rasters if role in asset.roles] for role in _ROLES]
@@ -111,7 +111,7 @@ class Item:
         return self._chosen(key, [[asset for asset in self.assets if asset.is_table]], "table of points")
 
     def rpc_of(self, image: Asset) -> Asset | None:
-        """Return the side-car with the RPC of an image; None where there is none, or where GDAL finds it by itself.
+        """Return the sidecar with the RPC of an image; None if there is none, or if GDAL finds it by itself.
 
         Raises
         ------
@@ -124,10 +124,11 @@ class Item:
             named = [asset for asset in found if asset.name.startswith(stem)]
             if len(named) != 1:
                 raise InputError(
-                    f"several assets may be the RPC of {image.key!r}: {self._keys(named or found)}",
-                    file=self.address, field="assets",
-                    remedy=Text("name one as ", Setting("scene.rpc"), ", or give the address of the image itself"),
-                )  # fmt: skip
+                    f"several assets could be the RPC of {image.key!r}: {self._keys(named or found)}",
+                    file=self.address,
+                    field="assets",
+                    remedy=Text("choose one with ", Setting("scene.rpc"), ", or give the address of the image itself"),
+                )
             found = named
         if not found:
             return None
@@ -142,9 +143,11 @@ class Item:
             if len(found) == 1:
                 return found[0]
             raise InputError(
-                f"{'several assets are' if found else 'there is no asset'} {key!r}", file=self.address, field="assets",
+                f"{'several assets are' if found else 'there is no asset'} {key!r}",
+                file=self.address,
+                field="assets",
                 remedy=f"one of {self._keys(found or None)}",
-            )  # fmt: skip
+            )
         several: list[Asset] = []
         for group in groups:
             if len(group) == 1:
@@ -152,14 +155,16 @@ class Item:
             several = several or group
         if several:
             raise InputError(
-                f"several assets may be meant: {self._keys(several)}", file=self.address, field="assets",
-                remedy=f"name one, for example {self.address}#{several[0].key}",
-            )  # fmt: skip
+                f"several assets could be the image: {self._keys(several)}",
+                file=self.address,
+                field="assets",
+                remedy=f"choose one, for example {self.address}#{several[0].key}",
+            )
         raise InputError(
             f"no asset is a {what}",
             file=self.address,
             field="assets",
-            remedy=f"name one after a #, of {self._keys() or 'another item'}",
+            remedy=f"add the key of one after a #: {self._keys() or 'another item'}",
         )
 
     def _keys(self, assets: Iterable[Asset] | None = None) -> str:
@@ -194,20 +199,27 @@ def item_at(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath,
 def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath, ...] = ()) -> Item:
     """Return the item that a JSON object is; see `read_item`."""
     if document.get("type") != "Feature" or not isinstance(document.get("stac_version"), str):
-        raise InputError("this is no STAC item", file=address, field="stac_version", remedy=REMEDY)
+        raise InputError("this is not a STAC item", file=address, field="stac_version", remedy=REMEDY)
     assets = document.get("assets")
     if not isinstance(assets, dict):
-        raise InputError("a STAC item has assets", file=address, field="assets", remedy=REMEDY)
+        raise InputError("this STAC item has no assets", file=address, field="assets", remedy=REMEDY)
     place = Location(address).url
     own = next(
-        (link["href"] for link in _list(document.get("links")) if isinstance(link, dict) and link.get("rel") == "self"
-         and isinstance(link.get("href"), str) and Location(link["href"]).is_address and place.is_address),
+        (
+            link["href"]
+            for link in _list(document.get("links"))
+            if isinstance(link, dict)
+            and link.get("rel") == "self"
+            and isinstance(link.get("href"), str)
+            and Location(link["href"]).is_address
+            and place.is_address
+        ),
         place,
-    )  # fmt: skip
+    )
     found = []
     for key, asset in assets.items():
         if not isinstance(asset, dict) or not isinstance(asset.get("href"), str):
-            raise InputError("an asset has an href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
+            raise InputError("this asset has no href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
         roles = tuple(role for role in _list(asset.get("roles")) if isinstance(role, str))
         kind = asset.get("type") if isinstance(asset.get("type"), str) else ""
         systems = tuple(_systems(asset, document.get("properties")))

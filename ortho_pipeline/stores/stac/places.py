@@ -13,7 +13,7 @@ _MOST_RINGS = 1000
 
 
 def boxes_of(document: Mapping[str, Any]) -> tuple[Box, ...]:
-    """Return boxes that hold an item: those of the polygons of its geometry, else its own; none where it says nothing.
+    """Return boxes around an item: those of the polygons of its geometry, else its own; none if it states none.
 
     Polygons come first: items are cut at the antimeridian (RFC 7946), and their own box may then go round the world.
     """
@@ -24,7 +24,7 @@ def boxes_of(document: Mapping[str, Any]) -> tuple[Box, ...]:
 
 
 def extent_boxes(document: Mapping[str, Any]) -> tuple[Box, ...]:
-    """Return the boxes that a collection says to reach over; none where it says nothing."""
+    """Return the boxes of the extent of a collection; none if it states none."""
     place: Any = document.get("extent")
     for key in ("spatial", "bbox"):
         place = place.get(key) if isinstance(place, Mapping) else None

@@ -18,7 +18,7 @@ from ortho_pipeline.surface.cells.copernicus import LIST, Cell, Extent, crs_of_c
 from ortho_pipeline.surface.cells.sources import Source, misplaced
 from ortho_pipeline.surface.dem import DemSurface, dem_of
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
-from ortho_pipeline.surface.mosaic import Samples, laid_out
+from ortho_pipeline.surface.dem_mosaic import Samples, laid_out
 
 _SHOWN = 4
 
@@ -81,7 +81,7 @@ def open_cells(
     Raises
     ------
     CoverageError
-        If land under the extents has no cell, or nobody says whether there is land.
+        If land under the extents has no cell, or it is unknown whether there is land.
     DatumError
         If a cell says to be above another datum than EGM2008, or the geoid grid is not installed.
     InputError
@@ -101,9 +101,11 @@ def open_cells(
     placed += [(cell_of_sea, *cell_of_sea.place(), "") for cell_of_sea in map(SeaCell, sea)]
     if not placed:
         raise CoverageError(
-            "none of the cells under the scene is there", file=source.address, field="surface.dem",
+            "this source has no DEM cells for the scene",
+            file=source.address,
+            field="surface.dem",
             remedy="give a DEM of this place",
-        )  # fmt: skip
+        )
     mosaic = laid_out(source.address, sorted(placed, key=lambda one: one[0].path))
     made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
     cells = {"cells": [cell.name for cell in sorted(there)], "sea_cells": [cell.name for cell in sorted(sea)]}
@@ -122,16 +124,19 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
     declared = declared_vertical(crs) if len(crs.axis_info) > 2 else None
     if declared is not None and declared.vertical != Vertical("EPSG:3855"):
         raise DatumError(
-            f"this cell says that its heights are in {declared.name!r}, and those of this DEM are above EGM2008",
-            file=path, field="surface.dem",
-            remedy=Text("give the cells as a DEM of their own: ", Setting("surface.dem", "FOLDER/*.tif")),
-        )  # fmt: skip
+            f"this cell states the height datum {declared.name!r}, but the heights of this DEM are above EGM2008",
+            file=path,
+            field="surface.dem",
+            remedy=Text("give the cells as an ordinary DEM: ", Setting("surface.dem", "FOLDER/*.tif")),
+        )
     wrong = misplaced(cell, grid.shape, grid.crs_from_pixel)
     if wrong:
         raise InputError(
-            f"this is not the cell that its name says: {wrong}", file=path, field="surface.dem",
+            f"the name of this cell does not match its content: {wrong}",
+            file=path,
+            field="surface.dem",
             remedy="copy it again from the public bucket",
-        )  # fmt: skip
+        )
     unit = file.unit
     file.close()
     return file, crs_of_cells()[0], grid, unit
@@ -140,14 +145,18 @@ def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, st
 def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
     names = ", ".join(cell.name for cell in lost[:_SHOWN]) + (" and others" if len(lost) > _SHOWN else "")
     what = (
-        f"there are no public heights of this land: {names}" if known
-        else f"{names} are not there, and without {LIST} nobody says whether that is sea"
-    )  # fmt: skip
+        f"the public DEM has no heights for this land: {names}"
+        if known
+        else f"{names} are missing, and without {LIST} it is unknown whether this is sea"
+    )
     otherwise = "" if known else f"; or put the list {LIST} beside the cells"
     return CoverageError(
-        what, file=source.address, field="surface.dem",
+        what,
+        file=source.address,
+        field="surface.dem",
         remedy=Text(
-            "give a DEM of this place, or choose how to fill it: ", Setting("surface.fill", "mask"),
-            f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}"
+            "give a DEM of this place, or choose how to fill the gap: ",
+            Setting("surface.fill", "mask"),
+            f" (no pixels), nearest, or an ellipsoidal height in metres{otherwise}",
         ),
-    )  # fmt: skip
+    )

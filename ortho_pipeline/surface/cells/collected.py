@@ -22,14 +22,14 @@ from ortho_pipeline.surface.base import parse_fill
 from ortho_pipeline.surface.cells.copernicus import Extent
 from ortho_pipeline.surface.dem import DemSurface, dem_of
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
-from ortho_pipeline.surface.mosaic import DemMosaic, Samples, laid_out
+from ortho_pipeline.surface.dem_mosaic import DemMosaic, Samples, laid_out
 
 #: Items that one DEM may have.
 _MOST_ITEMS = 10_000
 #: Two items that share more than this part of the smaller one show the same ground; neighbours share rims.
 _SAME_GROUND = 0.5
 _SHOWN = 6
-_CHOOSE = "give a FeatureCollection file of the items that belong together, or make one grid of their files (gdalwarp)"
+_CHOOSE = "give a FeatureCollection file of the items that belong together, or resample them to one grid (gdalwarp)"
 Placed = tuple[Samples, pyproj.CRS, SampleGrid, str]
 
 
@@ -60,7 +60,7 @@ def open_collected(
     CoverageError
         If no item lies there.
     DatumError
-        If items say different things of what their heights are measured above, or nobody says it.
+        If the items state different height datums, or none is stated.
     InputError
         If it is no collection, an item has no raster of heights, or there are too many items.
     """
@@ -72,9 +72,11 @@ def open_collected(
     )
     if not 0 < len(items) <= _MOST_ITEMS:
         raise CoverageError(
-            f"{counted(len(items), 'item')} of this collection {'lies' if len(items) == 1 else 'lie'} under the scene",
-            file=name, field="surface.dem", remedy="give a DEM of this place" if not items else _CHOOSE,
-        )  # fmt: skip
+            f"{counted(len(items), 'item')} of this collection {'covers' if len(items) == 1 else 'cover'} the scene",
+            file=name,
+            field="surface.dem",
+            remedy="give a DEM of this place" if not items else _CHOOSE,
+        )
     chosen = [item.heights(name.asset) for item in items]
     ask_beside(*(asset.href for asset in chosen if Location(asset.href).is_far), allow_network=network)
     opened = [_placed(asset, access, override) for asset in chosen]
@@ -108,13 +110,16 @@ def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Pl
         return (file, system, grid, unit), True
     if own.vertical != declared.vertical and not override:
         raise DatumError(
-            f"this file declares its heights as {own.name!r}, and its STAC item says {declared.name!r}", file=file.path,
+            f"the height datum is {own.name!r} in this file, but {declared.name!r} in its STAC item",
+            file=file.path,
             field="surface.vertical",
             remedy=Text(
-                "say which is true: ", Setting("surface.vertical"), " together with ",
-                Setting("surface.override_vertical")
+                "state the right one: ",
+                Setting("surface.vertical"),
+                " together with ",
+                Setting("surface.override_vertical"),
             ),
-        )  # fmt: skip
+        )
     return (file, crs, grid, unit), False
 
 
@@ -128,7 +133,7 @@ def _stated(asset: Asset, grid: SampleGrid) -> tuple[pyproj.CRS, DeclaredVertica
             if declared is not None and horizontal(crs).equals(grid.crs, ignore_axis_order=True):
                 return crs, declared
         except CrsError:
-            # What cannot be read says nothing; the file itself has the say of where it lies.
+            # Ignore what cannot be read: the position in the file itself decides.
             continue
     return None
 
@@ -147,8 +152,8 @@ def _same_ground(mosaic: DemMosaic, ids: Mapping[str, str]) -> list[Notice]:
     return [
         Notice(
             "dem-items-overlap",
-            f"{counted(len(hidden), 'item')} of the DEM's collection {'shows' if len(hidden) == 1 else 'show'} ground "
-            f"that another one shows too: there the finer one counts, of equal ones that of the later date ({shown})",
+            f"{counted(len(hidden), 'item')} of the DEM's collection {'overlaps' if len(hidden) == 1 else 'overlap'} "
+            f"another one ({shown}). There the finer item was used, and the newer one if both are equally fine",
             items=hidden,
         )
     ]

@@ -40,7 +40,7 @@ class Source(ABC):
 
     @abstractmethod
     def land(self) -> frozenset[Cell] | None:
-        """Return all cells that there ought to be: any other one is sea. None where nobody says."""
+        """Return all existing cells: every other one is sea. None if that is unknown."""
 
 
 def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
@@ -58,10 +58,12 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
         return _Bucket(text, allow_network)
     if not Path(text).is_dir():
         raise InputError(
-            "there is no such folder of cells", file=text, field="surface.source",
-            remedy="give a folder that holds cells by their names in the public bucket, a STAC collection of them, or "
+            "there is no such folder of DEM cells",
+            file=text,
+            field="surface.source",
+            remedy="give a folder of cells with the names of the public bucket, a STAC collection of them, or "
             "an address",
-        )  # fmt: skip
+        )
     return _Folder(text)
 
 
@@ -154,17 +156,21 @@ class _Catalogue(Source):
         folder, _, name = href.rpartition("/")
         if "?" in name:
             raise InputError(
-                "an address with a signature is not read", file=href.partition("?")[0], field="surface.source",
+                "signed URLs are not read",
+                file=href.partition("?")[0],
+                field="surface.source",
                 remedy="give a collection whose assets are open, or the store itself with your credentials",
-            )  # fmt: skip
+            )
         fetch = functools.partial(Objects(folder, allow_network=self._allow_network).fetch, name, limit=LARGEST)
         try:
             return str(kept("dem", href, fetch, fault=functools.partial(fault_of, cell)))
         except FileNotFoundError as error:
             raise InputError(
-                "a collection names this cell, and it is not there", file=href, field="surface.source",
-                remedy="check the collection, or take another source",
-            ) from error  # fmt: skip
+                "the collection lists this cell, but it does not exist",
+                file=href,
+                field="surface.source",
+                remedy="check the collection, or choose another source",
+            ) from error
 
 
 def fault_of(cell: Cell, path: Path | str) -> str:
@@ -183,8 +189,8 @@ def misplaced(cell: Cell, shape: tuple[int, int], place: Affine) -> str:
     """Return how the samples of a file do not lie where those of a cell do; empty if they do."""
     if shape != cell.grid.shape:
         rows, columns = cell.grid.shape
-        return f"it has {shape[1]} x {shape[0]} samples, and this cell has {columns} x {rows}"
+        return f"it has {shape[1]} x {shape[0]} samples instead of {columns} x {rows}"
     own = np.array(cell.grid.crs_from_pixel)
     ends = np.array([[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [1, shape[1], 0, 0, 0, 0], [0, 0, 0, 1, 0, shape[0]]])
     off = np.abs(ends @ (np.array(place) - own)).max() / own[1]
-    return "" if off < _OFF_GRID else "it lies elsewhere than this cell"
+    return "" if off < _OFF_GRID else "it is at another place than this cell"

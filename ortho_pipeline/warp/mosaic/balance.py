@@ -85,8 +85,12 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
     opened = open_layers(placed, memory)
     for one in opened:
         if one.source.palette:
-            raise InputError("indices into a palette have no brightness", file=one.layer.ortho.path,
-                             field="mosaic.balance", remedy="leave it out")  # fmt: skip
+            raise InputError(
+                "palette indices have no brightness to balance",
+                file=one.layer.ortho.path,
+                field="mosaic.balance",
+                remedy="leave it out",
+            )
     number = {id(layer): k for k, layer in enumerate(placed.layers)}
     ends, means = [], []
     for pair in pairs:
@@ -112,9 +116,11 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
         layer, band = wrong[0]
         raise InputError(
             f"band {band + 1} of {placed.layers[layer].ortho.name} would need a gain of {gains[layer, band]:.3g}: it "
-            "does not look like what overlaps it", file=placed.layers[layer].ortho.path, field="mosaic.balance",
-            remedy="leave it out, or make mosaics of scenes of one kind",
-        )  # fmt: skip
+            "does not match the orthos that overlap it",
+            file=placed.layers[layer].ortho.path,
+            field="mosaic.balance",
+            remedy="leave the option out, or make a mosaic of scenes of one kind",
+        )
     return Balance(gains, offsets, before, after, len(cells), float(outlying.mean()))
 
 

@@ -34,7 +34,7 @@ class Ortho:
 
 
 @dataclass(frozen=True)
-class Layer:
+class PlacedOrtho:
     """An orthoimage and where it lies in the mosaic."""
 
     ortho: Ortho
@@ -48,7 +48,7 @@ class Mosaic:
     """Orthos placed on one grid: layers, the topmost first, or the most accurate first at each pixel."""
 
     grid: Grid
-    layers: tuple[Layer, ...]
+    layers: tuple[PlacedOrtho, ...]
     by_pixel: bool = False
 
 
@@ -71,9 +71,11 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     without = [ortho for ortho in orthos if ortho.accuracy is None]
     if order == "most-accurate" and without:
         raise InputError(
-            f"nobody says how accurate {without[0].name} is at each place", file=without[0].path, field="mosaic.order",
-            remedy=Text("give all scenes ", Setting("output.accuracy_raster"), ", or order them by best-view"),
-        )  # fmt: skip
+            f"{without[0].name} has no accuracy raster",
+            file=without[0].path,
+            field="mosaic.order",
+            remedy=Text("rectify all scenes with ", Setting("output.accuracy_raster"), ", or order them by best-view"),
+        )
     if order != "first-on-top":
         orthos = sorted(
             orthos, key=lambda ortho: math.inf if ortho.relief_displacement is None else ortho.relief_displacement
@@ -89,7 +91,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     width, height = round((right - left) / first.dx), round((top - bottom) / first.dy)
     whole = Grid(first.crs, left, top, first.dx, first.dy, width, height)
     layers = [
-        Layer(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
+        PlacedOrtho(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
         for ortho, grid in zip(orthos, grids, strict=True)
     ]
     return Mosaic(whole, tuple(layers), order == "most-accurate")
@@ -101,11 +103,12 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
     if grid.crs != first.crs or not same_pixels or off > _SAME:
         raise InputError(
-            f"{other.name} is not on the grid of {one.name}: {grid.crs.name}, {grid.dx:g} x {grid.dy:g}, off by "
-            f"{off:.3f} px beside {first.crs.name}, {first.dx:g} x {first.dy:g}",
-            file=other.path, field="output",
-            remedy="give all scenes one crs and resolution, and an extent on multiples of it or none",
-        )  # fmt: skip
+            f"{other.name} ({grid.crs.name}, {grid.dx:g} x {grid.dy:g}) is off the grid of {one.name} "
+            f"({first.crs.name}, {first.dx:g} x {first.dy:g}) by {off:.3f} px",
+            file=other.path,
+            field="output",
+            remedy="give all scenes the same CRS and resolution, and no extent or one on multiples of the resolution",
+        )
 
 
 def _check_bands(orthos: Sequence[Ortho]) -> None:
@@ -117,15 +120,16 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
         first = first or kind
         if kind != first:
             raise InputError(
-                f"{ortho.name} has {kind[0]} (valid by {kind[1]}), {orthos[0].name} {first[0]} (by {first[1]})",
-                file=ortho.path, remedy="make mosaics of scenes of one kind",
-            )  # fmt: skip
+                f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
+                file=ortho.path,
+                remedy="make a mosaic of scenes of one kind",
+            )
 
 
 # -- windows ---------------------------------------------------------------------------------------------------------
 
 
-def box_of(layer: Layer) -> Box:
+def box_of(layer: PlacedOrtho) -> Box:
     """Return left, top, right and bottom of a layer in pixels of the mosaic."""
     return layer.left, layer.top, layer.left + layer.grid.width, layer.top + layer.grid.height
 
@@ -148,7 +152,7 @@ def windows(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
             yield left, top, min(side, grid.width - left), min(side, grid.height - top)
 
 
-def circular_errors(layer: Layer, left: int, top: int, width: int, height: int) -> NDArray[np.float32]:
+def circular_errors(layer: PlacedOrtho, left: int, top: int, width: int, height: int) -> NDArray[np.float32]:
     """Return the circular error (m) in a window of an ortho, of the nearest pixel of its raster of accuracy.
 
     Where nothing is known it is larger than any that is.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.imaging.registration import details, measure
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.raster.valid_area import valid_outline
-from ortho_pipeline.warp.mosaic.layout import Box, Layer, Mosaic, box_of, intersection
+from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, PlacedOrtho, box_of, intersection
 
 #: Side of the windows in which seams are measured.
 _SEAM_WINDOW = 384
@@ -30,8 +30,8 @@ _MARGIN = 18
 class Overlap:
     """Two layers whose valid pixels overlap, in `pixels` of the mosaic."""
 
-    first: Layer
-    second: Layer
+    first: PlacedOrtho
+    second: PlacedOrtho
     pixels: float
 
 
@@ -72,7 +72,7 @@ def measure_seam(overlap: Overlap) -> dict[str, Any]:
     }
 
 
-def _shifts(first: Layer, second: Layer, box: Box) -> NDArray[np.float64]:
+def _shifts(first: PlacedOrtho, second: PlacedOrtho, box: Box) -> NDArray[np.float64]:
     sources = [RasterSource(layer.ortho.path) for layer in (first, second)]
     found = [np.zeros((0, 2))]
     for left, top, width, height in _windows(box):

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.source import MEMORY, RasterSource
-from ortho_pipeline.warp.mosaic.layout import Box, Layer, Mosaic, box_of, intersection
+from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, PlacedOrtho, box_of, intersection
 
 
 class Opened:
     """An ortho of a mosaic, open for reading."""
 
-    def __init__(self, layer: Layer, memory: int = MEMORY) -> None:
+    def __init__(self, layer: PlacedOrtho, memory: int = MEMORY) -> None:
         self.layer, self.source = layer, RasterSource(layer.ortho.path, memory=memory)
 
     def read(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:

@@ -84,8 +84,12 @@ def owners_of(placed: Mosaic, balance: Balance | None, *, seamlines: bool, memor
     opened = open_layers(placed, memory)
     for one in opened:
         if seamlines and one.source.palette:
-            raise InputError("indices into a palette have no differences", file=one.layer.ortho.path,
-                             field="mosaic.seamlines", remedy="leave it out")  # fmt: skip
+            raise InputError(
+                "seam lines cannot follow palette indices",
+                file=one.layer.ortho.path,
+                field="mosaic.seamlines",
+                remedy="leave it out",
+            )
     cells = _Cells(placed, opened[0].source.count)
     for number, one in enumerate(opened):
         cells.add(number, one, balance)

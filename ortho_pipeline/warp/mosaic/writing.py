@@ -32,19 +32,27 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
         If GDAL leaves an ortho out.
     """
     if placed.by_pixel:
-        raise InputError("a VRT does not choose pixel by pixel", file=path, field="mosaic.format", remedy="make a COG")
+        raise InputError(
+            "a VRT cannot choose between orthos pixel by pixel", file=path, field="mosaic.format", remedy="write a COG"
+        )
     names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
     with raster_output(path) as temporary:
         made = gdal.BuildVRT(
-            str(temporary), names, outputBounds=placed.grid.extent, xRes=placed.grid.dx, yRes=placed.grid.dy,
+            str(temporary),
+            names,
+            outputBounds=placed.grid.extent,
+            xRes=placed.grid.dx,
+            yRes=placed.grid.dy,
             resolution="user",
-        )  # fmt: skip
+        )
         with written(made) as dataset:
             size = dataset.RasterXSize, dataset.RasterYSize
             listed = {Path(name).resolve() for name in dataset.GetFileList()}
         missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (placed.grid.width, placed.grid.height):
-            raise InputError(f"GDAL leaves out {', '.join(missing) or 'pixels'}", file=path, remedy="make a COG of it")
+            raise InputError(
+                f"GDAL leaves out {', '.join(missing) or 'pixels'} in this VRT", file=path, remedy="write a COG"
+            )
 
 
 def write_cog(
@@ -72,11 +80,13 @@ def write_cog(
     with RasterWriter(path, grid, profile, threads=threads) as writer:
         for left, top, width, height in windows(grid, _WINDOW):
             made = _Window(
-                left, top, np.full((profile.count, height, width), fill, dtype=profile.dtype),
+                left,
+                top,
+                np.full((profile.count, height, width), fill, dtype=profile.dtype),
                 np.zeros((profile.count, height, width), dtype=bool),
                 None if owners is None else owners.window(left, top, width, height),
                 np.full((height, width), np.inf, dtype=np.float32) if owners is not None or placed.by_pixel else None,
-            )  # fmt: skip
+            )
             for number, one in enumerate(opened):
                 clamped += made.put(number, one, balance, profile, by_pixel=placed.by_pixel)
             shown += int(np.count_nonzero(made.valid))
@@ -129,9 +139,13 @@ class _Window:
 
 
 def _balanced(
-    balance: Balance, number: int, values: NDArray[Any], good: NDArray[np.bool_], new: NDArray[np.bool_],
+    balance: Balance,
+    number: int,
+    values: NDArray[Any],
+    good: NDArray[np.bool_],
+    new: NDArray[np.bool_],
     profile: Profile,
-) -> tuple[NDArray[Any], int]:  # fmt: skip
+) -> tuple[NDArray[Any], int]:
     """Return pixels of an ortho as they are in the mosaic, and how many that are new were clamped."""
     exact = balance.apply(number, np.where(good, values, 0).astype(np.float64))
     low, high, _, fill = value_range(profile.dtype, profile)

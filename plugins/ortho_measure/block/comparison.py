@@ -87,9 +87,10 @@ def compare_corrections(
     ]
     model, reason = _recommended([one for one in tried if one.solution.fit is not None])
     return {
-        "rows": [one.row() for one in tried], "left_out": sorted(wrong),
+        "rows": [one.row() for one in tried],
+        "left_out": sorted(wrong),
         "recommendation": {"model": model, "reason": reason},
-    }  # fmt: skip
+    }
 
 
 def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:

@@ -32,7 +32,7 @@ _LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class LeftOutResiduals:
     """Residuals of N points and M rays, each as if it had taken no part, and tests.
 
     Parameters
@@ -53,7 +53,7 @@ class LeftOut:
     chance: Array
 
     @classmethod
-    def of(cls, fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -> LeftOut:
+    def of(cls, fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -> LeftOutResiduals:
         """Return those of an adjustment of some starts."""
         problem, linear = _equations(fit, starts, hold)
         step = step_of(linear)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_measure.marks import GROUND_CRS
-from ortho_measure.places import Places
-from ortho_measure.planning import ALIKE, OFFERED, Grid, Next, apart
+from ortho_measure.places import SceneGeometry
+from ortho_measure.planning import ALIKE, OFFERED, Next, PlanningGrid, apart
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.errors import InputError
@@ -59,7 +59,7 @@ class BlockGrid:
     reach: float
 
     @classmethod
-    def over(cls, images: Sequence[Places], references: Sequence[Target]) -> BlockGrid:
+    def over(cls, images: Sequence[SceneGeometry], references: Sequence[Target]) -> BlockGrid:
         """Return the places of a block, where there are references those that these show."""
         side = int(np.clip(np.sqrt(_PLACES / len(images)), 3, 12))
         scenes = [OtherScene(one.view.intensity, one.model) for one in images]
@@ -69,14 +69,15 @@ class BlockGrid:
             image, ground, everywhere = np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3))
             # Images of too different resolutions offer nothing; they can be measured by hand.
             with contextlib.suppress(InputError):
-                grid = Grid.over(replace(one, references=others), side)
+                grid = PlanningGrid.over(replace(one, references=others), side)
                 to_ground = ground_transform(one.model.crs, GROUND_CRS)
                 image, ground, everywhere = grid.image, to_ground(grid.ground), to_ground(grid.everywhere)
             fresh, fresh_there = (~shown_by(scenes[:number], part, GROUND_CRS) for part in (ground, everywhere))
             if references:
                 fresh &= shown_by(references, ground, GROUND_CRS)
-            parts.append((np.column_stack([np.full(fresh.sum(), number), image[fresh]]), ground[fresh],
-                          everywhere[fresh_there]))  # fmt: skip
+            parts.append(
+                (np.column_stack([np.full(fresh.sum(), number), image[fresh]]), ground[fresh], everywhere[fresh_there])
+            )
         chosen, ground, everywhere = (np.concatenate(part) for part in zip(*parts, strict=True))
         seen, there = (_seen(scenes, part) for part in (ground, everywhere))
         reach = SIDE / 2 * metres_per_pixel(images[0].view)
@@ -87,8 +88,9 @@ class BlockGrid:
         here, points = self.plan(self.ground), self.plan(taken)
         points = points[np.isfinite(points).all(axis=1)]
         kept = ~(np.abs(here[:, None] - points).max(axis=2) < self.reach).any(axis=1)
-        return replace(self, number=self.number[kept], image=self.image[kept], ground=self.ground[kept],
-                       seen=self.seen[kept])  # fmt: skip
+        return replace(
+            self, number=self.number[kept], image=self.image[kept], ground=self.ground[kept], seen=self.seen[kept]
+        )
 
     def plan(self, ground: Array) -> Array:
         """Return ground ``(k, 3)`` east and north (m) of the middle of the block."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_measure.places import Places
+from ortho_measure.places import SceneGeometry
 from ortho_measure.proposals import NEAR, proposal_of, propose
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import OtherScene
@@ -26,16 +26,16 @@ _SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class ProposalPair:
     """An image and another one that shows the same ground, by their models as they are now.
 
     Parameters
     ----------
-    first, second : Places
+    first, second : SceneGeometry
     """
 
-    first: Places
-    second: Places
+    first: SceneGeometry
+    second: SceneGeometry
 
     def carried(self, image: Array) -> Array:
         """Return where the second image has what the first has at ``(N, 2)``, with the ground on the surface."""
@@ -88,11 +88,17 @@ class Pair:
         place = self.second.image_of(local.ground_of(image[None] + found.shift))[0]
         # The error of a match is that of both chips, half and half.
         own = found.covariance / 2
-        told: dict[str, Any] = json_value({
-            "seen": True, "reason": "" if np.isfinite(place).all() else "the heights do not reach here",
-            "image": json_position(place), "covariance": _three(jacobian @ own @ jacobian.T), "own": _three(own),
-            "score": found.score, "scattered": found.scattered,
-        })  # fmt: skip
+        told: dict[str, Any] = json_value(
+            {
+                "seen": True,
+                "reason": "" if np.isfinite(place).all() else "the heights do not reach here",
+                "image": json_position(place),
+                "covariance": _three(jacobian @ own @ jacobian.T),
+                "own": _three(own),
+                "score": found.score,
+                "scattered": found.scattered,
+            }
+        )
         return told
 
 
@@ -102,7 +108,7 @@ class TieSearch:
 
     Parameters
     ----------
-    places : tuple of Places
+    places : tuple of SceneGeometry
         By the models as they are now.
     labels : tuple of str
     reaches : tuple of float
@@ -113,7 +119,7 @@ class TieSearch:
         Whether there are references.
     """
 
-    places: tuple[Places, ...]
+    places: tuple[SceneGeometry, ...]
     labels: tuple[str, ...]
     reaches: tuple[float, ...]
     sigma_height: float
@@ -139,20 +145,22 @@ class TieSearch:
         rays: dict[str, Any] = {}
         before = next((label for label in labels if label in known and label != labels[number]), None)
         if before is not None:
-            pair = Pair(self.places[labels.index(before)], self.places[number])
+            pair = ProposalPair(self.places[labels.index(before)], self.places[number])
             rays[labels[number]] = pair.proposal(np.asarray(known[before], dtype=float), 0.0, 0.0, click)
             return {"rays": rays, "ground": None}
         own = []
         for other, label in enumerate(labels):
             if other != number:
-                pair = Pair(self.places[number], self.places[other])
+                pair = ProposalPair(self.places[number], self.places[other])
                 rays[label] = pair.proposal(click, self.reaches[number], self.sigma_height)
                 if rays[label]["image"] is not None:
                     own.append(rays[label]["own"])
         rays[labels[number]] = {
-            "seen": True, "reason": "", "image": click.tolist(),
+            "seen": True,
+            "reason": "",
+            "image": click.tolist(),
             "covariance": np.mean(own, axis=0).tolist() if own else None,
-        }  # fmt: skip
+        }
         ground = proposal_of(self.places[number], click, None, self.reaches[number]) if self.referenced else None
         return {"rays": json_value(rays), "ground": ground}
 

@@ -16,7 +16,7 @@ from ortho_measure.block.proposals import TieSearch
 from ortho_measure.block.solution import BlockSolution, figures, solve
 from ortho_measure.block.table import block_points, document, marks_of_block
 from ortho_measure.marks import GROUND_CRS, Mark
-from ortho_measure.places import Geometry, Places, Sheet
+from ortho_measure.places import Geometry, SceneGeometry, Sheet
 from ortho_measure.planning import Next
 from ortho_measure.project import Project, moved, now, points_file
 from ortho_pipeline.block.start import Start
@@ -33,7 +33,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.imaging.matching import Reference, View, open_references
+from ortho_pipeline.imaging.matching import Reference, SceneView, open_references
 from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import CORRECTIONS, BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
@@ -55,7 +55,7 @@ class BlockImages:
     labels: tuple[str, ...]
     names: tuple[str, ...]
     scenes: tuple[Scene, ...]
-    places: tuple[Places, ...]
+    places: tuple[SceneGeometry, ...]
 
 
 class BlockSession(Project):
@@ -76,10 +76,15 @@ class BlockSession(Project):
     rendered: list[tuple[SensorModel, ...]]
 
     def __init__(
-        self, images: BlockImages, references: tuple[Reference, ...], output: Path, options: BlockOptions,
-        opened: Sequence[SceneOptions] = (), match: MatchOptions = MatchOptions(),
+        self,
+        images: BlockImages,
+        references: tuple[Reference, ...],
+        output: Path,
+        options: BlockOptions,
+        opened: Sequence[SceneOptions] = (),
+        match: MatchOptions = MatchOptions(),
         heights: SurfaceOptions = SurfaceOptions(),
-    ) -> None:  # fmt: skip
+    ) -> None:
         surface = images.places[0].surface
         maps = [Sheet(one, surface) for one in references]
         super().__init__(output, surface, [one.view for one in images.places], maps)
@@ -100,7 +105,7 @@ class BlockSession(Project):
         self._begin()
 
     @staticmethod
-    def _spread(places: Places) -> Array:
+    def _spread(places: SceneGeometry) -> Array:
         """Return ground in the CRS of the model, all over an image."""
         width, height = places.view.size
         columns, rows = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
@@ -110,9 +115,12 @@ class BlockSession(Project):
     # -- as any project ----------------------------------------------------------------------------------------------
 
     def _identity(self) -> dict[str, Any]:
-        return {"images": [
-            {"name": name, "size": list(view.size)} for name, view in zip(self.images.names, self.views, strict=True)
-        ]}  # fmt: skip
+        return {
+            "images": [
+                {"name": name, "size": list(view.size)}
+                for name, view in zip(self.images.names, self.views, strict=True)
+            ]
+        }
 
     def _source(self) -> dict[str, Any] | None:
         path = self._options.points
@@ -175,8 +183,9 @@ class BlockSession(Project):
         return len(self.rendered) - 1
 
     def _figures(self) -> dict[str, Any]:
-        relative = any(mark.ground_from == "reference" and mark.role != "tie" and mark.counts
-                       for mark in self.marks.by_id.values())  # fmt: skip
+        relative = any(
+            mark.ground_from == "reference" and mark.role != "tie" and mark.counts for mark in self.marks.by_id.values()
+        )
         return {"correction": self.marks.correction, **figures(self._solution, relative)}
 
     def _ahead(self) -> list[Next]:
@@ -201,10 +210,10 @@ class BlockSession(Project):
 
     # -- places ------------------------------------------------------------------------------------------------------
 
-    def places_of(self, number: int) -> Places:
+    def places_of(self, number: int) -> SceneGeometry:
         return self.images.places[number].by(self._solution.models[self.images.labels[number]])
 
-    def at(self, version: int, number: int = 0) -> Places:
+    def at(self, version: int, number: int = 0) -> SceneGeometry:
         """Return the geometry that references were rendered with for an image."""
         if not 0 <= version < len(self.rendered):
             raise InputError("there is no such rendering", field="version")
@@ -217,7 +226,7 @@ class BlockSession(Project):
             found[f"reference-{number}"] = self.at(version, number)
         return found | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
 
-    def rendering(self, name: str, version: int) -> Places | None:
+    def rendering(self, name: str, version: int) -> SceneGeometry | None:
         kind, number = name.split("-")
         return self.at(version, int(number)) if kind == "reference" else None
 
@@ -243,9 +252,14 @@ class BlockSession(Project):
     def _asked(self) -> BlockOptions:
         """Return how `ortho adjust` is asked for the same with the saved points, which say all of themselves."""
         return replace(
-            self._options, points=self.output, crs=None, vertical=None, pixel_origin="corner", check=None,
+            self._options,
+            points=self.output,
+            crs=None,
+            vertical=None,
+            pixel_origin="corner",
+            check=None,
             correction=self.marks.correction or self._options.correction,
-        )  # fmt: skip
+        )
 
     def compared(self) -> dict[str, Any]:
         """Return the corrections compared on the points as they are now."""
@@ -272,8 +286,16 @@ class BlockSession(Project):
 def _nothing() -> Points:
     """Return a table without points."""
     none = np.zeros(0)
-    return Points((), none.reshape(0, 2), none.reshape(0, 3), none.astype("<U7"), none, none.reshape(0, 3),
-                  horizontal(parse_crs(GROUND_CRS)), "")  # fmt: skip
+    return Points(
+        (),
+        none.reshape(0, 2),
+        none.reshape(0, 3),
+        none.astype("<U7"),
+        none,
+        none.reshape(0, 3),
+        horizontal(parse_crs(GROUND_CRS)),
+        "",
+    )
 
 
 def open_block_session(
@@ -313,9 +335,10 @@ def open_block_session(
     bands = match.reference_bands or ()
     references = open_references(match.reference, bands, **access) if match.reference else ()
     places = tuple(
-        Places(View(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights),
-               references)
+        SceneGeometry(
+            SceneView(Intensity(RasterSource(*(one.rasters or (one.path,)), **access)), one.model, heights), references
+        )
         for one in scenes
-    )  # fmt: skip
+    )
     known = BlockImages(tuple(os.fspath(image) for image in images), tuple(labels), tuple(names), scenes, places)
     return BlockSession(known, references, path, points, given, match, surface)

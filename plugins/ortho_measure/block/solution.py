@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_measure.block.left_out import LeftOut
+from ortho_measure.block.left_out import LeftOutResiduals
 from ortho_measure.solution import LEAST_CHECK_POINTS, SUSPICIOUS
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
@@ -34,19 +34,19 @@ class BlockSolution:
     fit : BlockFit, optional
     error : str
         What keeps it from being made, as people read it.
-    left_out : LeftOut, optional
+    left_out : LeftOutResiduals, optional
         What each measurement is off by had it taken no part.
     """
 
     models: Mapping[str, SensorModel]
     fit: BlockFit | None = None
     error: str = ""
-    left_out: LeftOut | None = None
+    left_out: LeftOutResiduals | None = None
 
 
 def solve(
     starts: Mapping[str, Start], points: BlockPoints, hold: float | None, *, robust: bool = True
-) -> BlockSolution:  # fmt: skip
+) -> BlockSolution:
     """Adjust images and points as `ortho adjust` does; where not `robust`, gross errors are left in."""
     models = {label: start.model for label, start in starts.items()}
     if not len(points):
@@ -57,7 +57,7 @@ def solve(
     try:
         priors = {label: start.priors for label, start in starts.items()}
         fit = adjust(models, points, priors=priors, robust=robust, hold=hold)
-        left_out = LeftOut.of(fit, starts, hold)
+        left_out = LeftOutResiduals.of(fit, starts, hold)
     except OrthoError as error:
         return BlockSolution(models, None, error.message)
     except np.linalg.LinAlgError as error:
@@ -74,12 +74,16 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     table, sigmas = fit.points, fit.ground_sigmas
     points: dict[str, dict[str, Any]] = {
         name: {
-            "residuals": {}, "loo": {}, "residual_m": json_position(fit.object_residuals[k]),
-            "loo_m": json_value(without.ground[k]), "sigma_m": json_position(sigmas[k]), "w": json_value(without.w[k]),
+            "residuals": {},
+            "loo": {},
+            "residual_m": json_position(fit.object_residuals[k]),
+            "loo_m": json_value(without.ground[k]),
+            "sigma_m": json_position(sigmas[k]),
+            "w": json_value(without.w[k]),
             "suspicious": bool(without.chance[k] < SUSPICIOUS),
         }
         for k, name in enumerate(table.ids)
-    }  # fmt: skip
+    }
     for ray, (of, image) in enumerate(zip(table.point, table.image, strict=True)):
         point, label = points[table.ids[of]], table.images[image]
         point["residuals"][label] = json_position(fit.residuals[ray])
@@ -91,17 +95,24 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         text = f"the block contradicts its {doubt.what} by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
         points[doubt.point] |= {"suspicious": True, "reason": text}
     return {
-        "error": "", "points": points, "headline": _headline(solution, relative), "sigma0": json_value(fit.sigma0),
-        "redundancy": fit.redundancy, "gauge": fit.gauge,
-        "parameters": json_value({
-            label: {
-                name: {"value": value, "sigma": sigma}
-                for (of, name), value, sigma in zip(fit.parameters, fit.values, fit.sigmas, strict=True) if of == label
+        "error": "",
+        "points": points,
+        "headline": _headline(solution, relative),
+        "sigma0": json_value(fit.sigma0),
+        "redundancy": fit.redundancy,
+        "gauge": fit.gauge,
+        "parameters": json_value(
+            {
+                label: {
+                    name: {"value": value, "sigma": sigma}
+                    for (of, name), value, sigma in zip(fit.parameters, fit.values, fit.sigmas, strict=True)
+                    if of == label
+                }
+                for label in table.images
             }
-            for label in table.images
-        }),
+        ),
         "notices": [str(one) for one in fit.warnings],
-    }  # fmt: skip
+    }
 
 
 def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
@@ -124,7 +135,7 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     return told
 
 
-def _left_out_in_turn(fit: BlockFit, without: LeftOut, to: str, checks: int) -> dict[str, Any]:
+def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks: int) -> dict[str, Any]:
     """Return the accuracy at control points whose ground was left out in turn, where others tell of all of it."""
     apart = without.ground[fit.used_ground]
     apart = apart[np.isfinite(apart).all(axis=1)]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_measure.marks import GROUND_CRS, Mark, Marks, Ray, checked, errors_of
+from ortho_measure.marks import GROUND_CRS, Mark, Marks, RayMark, checked, errors_of
 from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.points.geojson import feature_of
@@ -24,12 +24,15 @@ def block_points(marks: Marks, labels: Sequence[str], source: str) -> BlockPoint
         ground=np.array([_known(mark) for mark in used], dtype=float).reshape(-1, 3),
         roles=np.array([mark.role for mark in used], dtype="<U7"),
         sigma_ground=np.array([[mark.sigma_xy] * 2 + [mark.sigma_h] for mark in used], dtype=float).reshape(-1, 3),
-        crs=horizontal(parse_crs(GROUND_CRS)), images=tuple(labels),
+        crs=horizontal(parse_crs(GROUND_CRS)),
+        images=tuple(labels),
         point=np.array([k for k, _, _ in rays], dtype=np.int64),
         image=np.array([labels.index(label) for _, label, _ in rays], dtype=np.int64),
         measured=np.array([ray.image for _, _, ray in rays], dtype=float).reshape(-1, 2),
-        sigma_image=sigma, source=source, shape_image=shape_of(covariance),
-    )  # fmt: skip
+        sigma_image=sigma,
+        source=source,
+        shape_image=shape_of(covariance),
+    )
 
 
 def _known(mark: Mark) -> tuple[float, ...]:
@@ -56,10 +59,13 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
             ray, feature = mark.rays[label], features[label][name]
             feature["id"] = f"{name} in {names[label]}"
             feature["properties"] |= {
-                "filename": names[label], "measured": ray.how, "score": ray.score, "at": mark.at,
+                "filename": names[label],
+                "measured": ray.how,
+                "score": ray.score,
+                "at": mark.at,
                 "ground_from": None if mark.role == "tie" else mark.ground_from,
                 **({"note": mark.note} if mark.note else {}),
-            }  # fmt: skip
+            }
             found.append(feature)
     left = [mark.to_json() for mark in marks.by_id.values() if not mark.counts]
     return {"type": "FeatureCollection", "features": found, **({"left_out": left} if left else {})}
@@ -81,15 +87,26 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
         rays = {}
         for ray in np.flatnonzero(points.point == k).tolist():
             (column, both), (_, row) = covariance[ray].tolist()
-            rays[points.images[points.image[ray]]] = Ray(
-                image=tuple(points.measured[ray].tolist()), how="file",
+            rays[points.images[points.image[ray]]] = RayMark(
+                image=tuple(points.measured[ray].tolist()),
+                how="file",
                 sigma_image=None if more[ray] else float(points.sigma_image[ray]),
                 covariance=(column, row, both) if more[ray] else None,
-            )  # fmt: skip
+            )
         known = bool(np.isfinite(ground[k]).all())
-        found.append(checked(Mark(
-            id=name, ground=tuple(ground[k].tolist()) if known else None, role=str(points.roles[k]),  # type: ignore[arg-type]
-            sigma_xy=float(points.sigma_ground[k, :2].max()), sigma_h=float(points.sigma_ground[k, 2]), how="file",
-            ground_from="file" if known else None, rays=rays, at=at,
-        )))  # fmt: skip
+        found.append(
+            checked(
+                Mark(
+                    id=name,
+                    ground=tuple(ground[k].tolist()) if known else None,
+                    role=str(points.roles[k]),  # type: ignore[arg-type]
+                    sigma_xy=float(points.sigma_ground[k, :2].max()),
+                    sigma_h=float(points.sigma_ground[k, 2]),
+                    how="file",
+                    ground_from="file" if known else None,
+                    rays=rays,
+                    at=at,
+                )
+            )
+        )
     return found

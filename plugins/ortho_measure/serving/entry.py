@@ -44,7 +44,7 @@ def _secret() -> str:
 
 
 @dataclass
-class Entry:
+class PageEntry:
     """The way to the page of one server.
 
     Parameters

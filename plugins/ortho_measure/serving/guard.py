@@ -1,7 +1,7 @@
 """The guard before the page: this machine alone, the right host, the cookie, and bodies of a size.
 
-Nothing is answered without the cookie, which the address of `Entry` gives once. A page of another origin cannot use it,
-and a name that an attacker lets point at this machine fails at the Host header.
+Every request needs the cookie, which the address of `PageEntry` sets once. Pages of other origins cannot use it. A name
+that an attacker points at this machine fails at the Host header.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
 
-from ortho_measure.serving.entry import REFUSED, Entry, leading_to
+from ortho_measure.serving.entry import REFUSED, PageEntry, leading_to
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -48,12 +48,12 @@ class Guard:
     app : ASGI application
     hosts : set of str
         Host headers that are ours: name and port.
-    entry : Entry
+    entry : PageEntry
     admit : callable, optional
         Told the address of each client that has the cookie.
     """
 
-    def __init__(self, app: App, hosts: set[str], entry: Entry, admit: Admit | None = None) -> None:
+    def __init__(self, app: App, hosts: set[str], entry: PageEntry, admit: Admit | None = None) -> None:
         self._app, self._hosts, self._entry, self._admit = app, {host.encode() for host in hosts}, entry, admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -85,10 +85,15 @@ class Making:
             headline = made.document["report"]["headline"]
             with self._lock:
                 self._files = dict(made.files)
-            self._tell({
-                "state": "done", "share": 1.0, "figure": headline["figure"], "what": headline["what"],
-                "files": [str(path) for path in made.files.values()],
-            })  # fmt: skip
+            self._tell(
+                {
+                    "state": "done",
+                    "share": 1.0,
+                    "figure": headline["figure"],
+                    "what": headline["what"],
+                    "files": [str(path) for path in made.files.values()],
+                }
+            )
 
     def _advance(self, stage: str, share: float) -> None:
         self._tell({"state": "running", "stage": stage, "share": float(share)})

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_measure.block.session import BlockSession
 from ortho_measure.project import Project
-from ortho_measure.serving.entry import Entry
+from ortho_measure.serving.entry import PageEntry
 from ortho_measure.serving.guard import REPORT_POLICY, Admit, App, Guard
 from ortho_measure.serving.listener import LOOPBACK, QUEUE, Listener
 from ortho_measure.serving.log import repetitions_counted
 from ortho_measure.serving.making import PICTURES, Making
-from ortho_measure.serving.tiles import MOST, SIDE, Tiles
+from ortho_measure.serving.tiles import MOST, SIDE, TileServer
 from ortho_measure.session import Session
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import parse_json
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
-from ortho_pipeline.raster.block_cache import limit_cache
+from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.runtime.process_limits import thread_pool
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Windows:
 class _Answers:
     """What is answered to each request; methods of the same names as paths."""
 
-    def __init__(self, session: Project, tiles: Tiles) -> None:
+    def __init__(self, session: Project, tiles: TileServer) -> None:
         self._session, self._tiles, self._windows = session, tiles, Windows()
         self.making = Making(session)
 
@@ -97,10 +97,16 @@ class _Answers:
             "images": [_facts(view.intensity.source.path, view.size) for view in session.views],
             "maps": [_facts(sheet.reference.path, sheet.size) for sheet in session.sheets],
             "labels": list(session.images.labels) if isinstance(session, BlockSession) else None,
-            "output": os.path.basename(session.output), "tile": SIDE, "bands": self._tiles.bands,
-            "corrections": list(CORRECTIONS), "writes": writes, "locked": session.journal.read_only,
-            "healed": session.journal.healed, "stopped": session.stopped, "state": session.state(),
-        }  # fmt: skip
+            "output": os.path.basename(session.output),
+            "tile": SIDE,
+            "bands": self._tiles.bands,
+            "corrections": list(CORRECTIONS),
+            "writes": writes,
+            "locked": session.journal.read_only,
+            "healed": session.journal.healed,
+            "stopped": session.stopped,
+            "state": session.state(),
+        }
 
     def leave(self, given: dict[str, Any]) -> dict[str, Any]:
         """Take note that a window is closed."""
@@ -138,7 +144,7 @@ class _Answers:
             raise InputError("there is no place to match", field="image", remedy=_REMEDY)
         return self.scene.proposal(
             None if image is None else _numbers(image, 2), None if ground is None else _numbers(ground, 3)
-        )  # fmt: skip
+        )
 
     def tie(self, given: dict[str, Any]) -> dict[str, Any]:
         """Match a click in one of several images, or a ground, in all of them."""
@@ -193,8 +199,9 @@ class _Answers:
 
     def _require_writer(self, given: dict[str, Any]) -> None:
         if not self._windows.claim(_window(given)):
-            raise InputError("another window measures these points: this one only shows them", field="window",
-                             remedy="take over")  # fmt: skip
+            raise InputError(
+                "another window measures these points: this one only shows them", field="window", remedy="take over"
+            )
 
     def _band(self, pane: str, band: int) -> int:
         if not 0 <= band <= self._tiles.bands[pane]:
@@ -203,13 +210,17 @@ class _Answers:
 
 
 def application(
-    session: Project, entry: Entry, hosts: set[str], opened: SceneOptions = SceneOptions(), admit: Admit | None = None
+    session: Project,
+    entry: PageEntry,
+    hosts: set[str],
+    opened: SceneOptions = SceneOptions(),
+    admit: Admit | None = None,
 ) -> App:
     """Return the ASGI application of a session."""
     from starlette.applications import Starlette
     from starlette.routing import Route
 
-    given = _Given(session, Tiles(session, opened))
+    given = _Given(session, TileServer(session, opened))
     routes = [
         Route("/", given.page),
         Route("/api/{what}", given.answer, methods=["POST"]),
@@ -223,7 +234,7 @@ def application(
 class _Given:
     """What a request is given: parts of the page, tiles, answers, and what was made; work is done by threads."""
 
-    def __init__(self, session: Project, tiles: Tiles) -> None:
+    def __init__(self, session: Project, tiles: TileServer) -> None:
         self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
         room = resources.files("ortho_measure")
         self._files = {name: room.joinpath("page", name).read_bytes() for name in PAGE}
@@ -289,9 +300,21 @@ class _Given:
 
 #: What the page may ask: methods of `_Answers`.
 ASKED = (
-    "begin", "leave", "act", "state", "predict", "link", "propose", "tie", "typed", "stretch", "compare", "save",
-    "make", "made",
-)  # fmt: skip
+    "begin",
+    "leave",
+    "act",
+    "state",
+    "predict",
+    "link",
+    "propose",
+    "tie",
+    "typed",
+    "stretch",
+    "compare",
+    "save",
+    "make",
+    "made",
+)
 
 
 def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
@@ -306,16 +329,26 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     """
     import uvicorn
 
-    entry, listener = Entry(), Listener(port)
+    entry, listener = PageEntry(), Listener(port)
     number = listener.getsockname()[1]
     hosts = {f"{LOOPBACK}:{number}", f"localhost:{number}"}
     limit_cache(OutputOptions.memory, os.cpu_count() or 1)
     app = application(session, entry, hosts, opened, listener.admit)
     # h11 limits the size of headers. The listener is told the true address of a client, whatever headers claim.
     config = uvicorn.Config(
-        app, loop="asyncio", http="h11", ws="none", lifespan="off", proxy_headers=False, server_header=False,
-        date_header=False, access_log=False, log_config=None, timeout_graceful_shutdown=3, backlog=QUEUE,
-    )  # fmt: skip
+        app,
+        loop="asyncio",
+        http="h11",
+        ws="none",
+        lifespan="off",
+        proxy_headers=False,
+        server_header=False,
+        date_header=False,
+        access_log=False,
+        log_config=None,
+        timeout_graceful_shutdown=3,
+        backlog=QUEUE,
+    )
     try:
         ready(f"http://{LOOPBACK}:{number}{entry.path}")
         # Ctrl-C is how this command ends.

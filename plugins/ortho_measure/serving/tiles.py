@@ -27,7 +27,7 @@ MOST = 1 << 16
 Pixels = NDArray[np.float32]
 
 
-class Tiles:
+class TileServer:
     """Tiles of one project, by the names of its views (`Project`).
 
     Parameters
@@ -53,9 +53,15 @@ class Tiles:
         self.bands = {name: shown[0].source.count for name, shown in self._shown.items()}
 
     def png(
-        self, name: str, version: int, factor: int, column: int, row: int, bands: Sequence[int],
+        self,
+        name: str,
+        version: int,
+        factor: int,
+        column: int,
+        row: int,
+        bands: Sequence[int],
         limits: Sequence[tuple[float, float]],
-    ) -> bytes:  # fmt: skip
+    ) -> bytes:
         """Return a tile as PNG, transparent where nothing is shown.
 
         Parameters

@@ -55,48 +55,72 @@ TITLES = {
 }
 KNOBS = (
     Knob(
-        "SIGMA_IMAGE", SIGMA_IMAGE, "px per axis", "fitted",
+        "SIGMA_IMAGE",
+        SIGMA_IMAGE,
+        "px per axis",
+        "fitted",
         "Noise of pointing: that of the paper's images and people, which nobody has published elsewhere. 0.5 px, which "
         "is customary, would leave 0.71 px of the 0.99.",
         ("3|rigorous even:44|*",),
     ),
     Knob(
-        "OFF_NADIR_DEG", OFF_NADIR_DEG, "degrees", "fitted",
+        "OFF_NADIR_DEG",
+        OFF_NADIR_DEG,
+        "degrees",
+        "fitted",
         "Tilt across the track. The satellite can be turned by 30 degrees; the paper does not say how far it was.",
         ("5|poly1 even:44|*",),
     ),
     Knob(
-        "ROUGHNESS", ROUGHNESS, "", "fitted",
+        "ROUGHNESS",
+        ROUGHNESS,
+        "",
+        "fitted",
         "How much the plains roll: what the models without heights leave over the relief.",
         ("5|poly2 even:44|*", "5|poly3 even:44|*", "5|projective even:44|*"),
     ),
     Knob(
-        "RIDGE", RIDGE, "", "fitted",
+        "RIDGE",
+        RIDGE,
+        "",
+        "fitted",
         "Weight of Tikhonov's regularisation, which the paper has for these two models and does not state; in steps "
         "of a factor 3.",
         ("5|rfm2 even:44|*", "5|rfm3 even:44|*"),
     ),
     Knob(
-        "relief", "plains, one range of mountains in the east, 700 to 1900 m", "", "chosen",
+        "relief",
+        "plains, one range of mountains in the east, 700 to 1900 m",
+        "",
+        "chosen",
         "The heights and the mountains in the east are the paper's. Of four shapes that fit the rows with 44 points "
         "this one was taken in sight of all rows: with the others 80 to 85 % of all rows were within 1.5, with this 85 "
         "%, so that up to five points of a hundred are owed to the choice.",
     ),
     Knob(
-        "PLACES", PLACES, "places in a cell", "chosen",
+        "PLACES",
+        PLACES,
+        "places in a cell",
+        "chosen",
         "Of so many places in each cell the lowest is measured, for road crossings lie in plains and valleys. With one "
         "place three predictions in a hundred fewer are within 1.5; with six as many.",
     ),
     Knob(
-        "SIGMA_GROUND", SIGMA_GROUND, "m per axis", "paper",
+        "SIGMA_GROUND",
+        SIGMA_GROUND,
+        "m per axis",
+        "paper",
         "Better than 1 m in planimetry and elevation; a fortieth of a pixel, so that it decides nothing.",
     ),
     Knob(
-        "SIGMA_POSITION", SIGMA_POSITION, "m per axis", "chosen",
+        "SIGMA_POSITION",
+        SIGMA_POSITION,
+        "m per axis",
+        "chosen",
         "Error of the ephemeris, from which the rigorous model starts; it decides nothing, for position and attitude "
         "are adjusted without weights, as in the paper.",
     ),
-)  # fmt: skip
+)
 NAIVE = (
     "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for the check "
     "points, for p unknowns and k points. It knows the noise of each model from the paper, which the simulation has to "
@@ -105,7 +129,7 @@ NAIVE = (
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperRow:
     """One row of a table: model, choice of control points, and what the paper found (None: not given)."""
 
     table: int
@@ -119,16 +143,16 @@ class Row:
         return f"{self.model} {self.selection}"
 
 
-def _row3(count: int, *paper: float) -> Row:
-    return Row(3, RIGOROUS, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
+def _row3(count: int, *paper: float) -> PaperRow:
+    return PaperRow(3, RIGOROUS, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
 
 
-def _row4(count: int, group: int, control: float, check: float) -> Row:
-    return Row(4, RIGOROUS, f"cluster:{count}:{group}", (None, None, control, None, None, check))
+def _row4(count: int, group: int, control: float, check: float) -> PaperRow:
+    return PaperRow(4, RIGOROUS, f"cluster:{count}:{group}", (None, None, control, None, None, check))
 
 
-def _row5(model: str, count: int, *paper: float) -> Row:
-    return Row(5, model, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
+def _row5(model: str, count: int, *paper: float) -> PaperRow:
+    return PaperRow(5, model, f"even:{count}", (*paper, *[None] * (6 - len(paper))))
 
 
 ROWS = (
@@ -179,7 +203,7 @@ def reproduce(
     off_nadir_deg: float = OFF_NADIR_DEG,
     sigma_image: float = SIGMA_IMAGE,
     sigma_ground: float = SIGMA_GROUND,
-    rows: tuple[Row, ...] = ROWS,
+    rows: tuple[PaperRow, ...] = ROWS,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
     """Run the experiment and return the document of ``ortho reproduce bilsat --json``.
@@ -206,8 +230,9 @@ def reproduce(
     medians = {
         (row.label, QUANTITIES[k]): float(np.median(kept))
         for row, k in asked
-        for kept in [found[rows.index(row), :, k][np.isfinite(found[rows.index(row), :, k])]] if len(kept)
-    }  # fmt: skip
+        for kept in [found[rows.index(row), :, k][np.isfinite(found[rows.index(row), :, k])]]
+        if len(kept)
+    }
     seen = np.isfinite(vectors).any()
     return make_document(
         PAPER,
@@ -226,7 +251,7 @@ def reproduce(
     )
 
 
-def naive(row: Row, k: int) -> float | None:
+def naive(row: PaperRow, k: int) -> float | None:
     """Guess a number of a row from the paper's row of the same model with all points (`NAIVE`)."""
     count = int(row.selection.split(":")[1])
     if count == POINTS:
@@ -265,7 +290,7 @@ def _rigorous(points: Points, position: np.ndarray) -> Fit:
     return fit(start, points, robust=False, name=RIGOROUS)
 
 
-def _fit(row: Row, points: Points, position: np.ndarray) -> Fit | None:
+def _fit(row: PaperRow, points: Points, position: np.ndarray) -> Fit | None:
     # All points stand for all: there is nothing to select.
     chosen = points if row.selection == f"even:{len(points)}" else select_control(points, row.selection)
     try:

@@ -63,9 +63,10 @@ def write_product(
     """
     if not SMALLEST <= size <= LARGEST or seed < 0:
         raise InputError(
-            f"size {size} and seed {seed} are not possible", field="size, seed",
+            f"size {size} and seed {seed} are not possible",
+            field="size, seed",
             remedy=f"a size from {SMALLEST} to {LARGEST} and a seed from 0",
-        )  # fmt: skip
+        )
     out = Path(folder)
     scene = simulated.BilsatScene.make(off_nadir_deg, size=size)
     names = {camera: "image" if camera == "red" else f"image_{camera}" for camera in cameras}

@@ -129,9 +129,11 @@ _STATEMENTS: Sequence[tuple[str, tuple[tuple[str, str], ...], _Test, dict[str, A
         "Control points in a small part of the image fit well, but the check points are clearly worse.",
         (*_checks("rigorous even:4", "rigorous even:12", *_GROUPS), *_controls(*_GROUPS)),
         _clusters,
-        {"why": "How far the error grows depends on how small and how oblong a group is. Five of ours are clearly "
-                "worse than evenly distributed points, one with twelve is 1.3 times as bad; the paper's six are 1.5 to "
-                "5.6 times."},
+        {
+            "why": "How far the error grows depends on how small and how oblong a group is. Five of ours are clearly "
+            "worse than evenly distributed points, one with twelve is 1.3 times as bad; the paper's six are 1.5 to "
+            "5.6 times."
+        },
     ),
     (
         "With 12 of them the check points have around 3 px at most.",
@@ -189,7 +191,9 @@ _STATEMENTS: Sequence[tuple[str, tuple[tuple[str, str], ...], _Test, dict[str, A
             f"12 points in a corner {min(_each(values)[:3]):.2f} to {max(_each(values)[:3]):.2f} px, simple models "
             f"with 20 points {min(_each(values)[3:]):.2f} to {max(_each(values)[3:]):.2f} px",
         ),
-        {"why": "Nor is it so in the paper's own tables: 1.67 to 2.78 px, where five of its six simple models have "
-                "1.11 to 1.43 px with 20 points."},
+        {
+            "why": "Nor is it so in the paper's own tables: 1.67 to 2.78 px, where five of its six simple models have "
+            "1.11 to 1.43 px with 20 points."
+        },
     ),
-)  # fmt: skip
+)

@@ -23,8 +23,11 @@ def simulate(
     """Write a BILSAT-1 frame over Ankara: image, imaging survey, DEM, 44 points, truth."""
     cameras = tuple(XS_CAMERAS) if all_cameras else ("red",)
     files = write_product(folder, seed=seed, off_nadir_deg=off_nadir, size=size, cameras=cameras)
-    return Simulated(files, f"A simulated BILSAT-1 scene (seed {seed}); try\n  ortho rectify {files['image']} "
-                     f"--gcps {files['gcps']} --dem {files['dem']} --correction model -o out")  # fmt: skip
+    return Simulated(
+        files,
+        f"A simulated BILSAT-1 scene (seed {seed}); try\n  ortho rectify {files['image']} "
+        f"--gcps {files['gcps']} --dem {files['dem']} --correction model -o out",
+    )
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:

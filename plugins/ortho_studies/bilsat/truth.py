@@ -56,7 +56,7 @@ OWN = {"red": 0.0, "green": 0.15, "blue": 0.25, "nir": 0.4}
 
 
 @dataclass(frozen=True, eq=False)
-class Hills:
+class BilsatTerrain:
     """Hills from `low` to `high` metres: plains in the west, mountains in the east, as a function of the place."""
 
     low: float = LOW
@@ -175,7 +175,7 @@ class Snapshot:
         moved = tangents * (1 + self.k1 * (tangents**2).sum(axis=1))[:, None]
         return moved / self.pixel_tan + (self.width / 2, self.height / 2)
 
-    def meet(self, image: ArrayLike, hills: Hills, tolerance: float = 1e-6) -> Array:
+    def meet(self, image: ArrayLike, hills: BilsatTerrain, tolerance: float = 1e-6) -> Array:
         """Return where the rays of image points meet the hills: lon, lat, height ``(N, 3)``, to `tolerance` metres.
 
         Newton's method with the level ground in place of the slope: the hills are gentler than the rays.
@@ -199,7 +199,7 @@ def _to_sphere(origin: Array, rays: Array, radius: float) -> Array:
 
 
 def render(
-    camera: Snapshot, hills: Hills, band: str = "red", *, noise_dn: float = 1.0, seed: int = 0
+    camera: Snapshot, hills: BilsatTerrain, band: str = "red", *, noise_dn: float = 1.0, seed: int = 0
 ) -> NDArray[np.uint8]:
     """Make the 8-bit image that a camera takes in a band: every pixel's own ray is followed to the hills."""
     values = np.empty((camera.height, camera.width))
@@ -240,7 +240,7 @@ class BilsatScene:
     """
 
     camera: Snapshot
-    hills: Hills = field(default_factory=Hills)
+    hills: BilsatTerrain = field(default_factory=BilsatTerrain)
     image: Array = field(default_factory=lambda: np.zeros((0, 2)))
     ground: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
@@ -254,7 +254,7 @@ class BilsatScene:
         """
         if points < 4:
             raise InputError("a scene has at least 4 points", field="points")
-        camera, hills = Snapshot.over_ankara(off_nadir_deg, size=size), Hills()
+        camera, hills = Snapshot.over_ankara(off_nadir_deg, size=size), BilsatTerrain()
         random = np.random.default_rng(seed)
         image = np.stack([_spread(points, size, random) for _ in range(PLACES)])
         ground = camera.meet(image.reshape(-1, 2), hills).reshape(PLACES, points, 3)

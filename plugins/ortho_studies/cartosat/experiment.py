@@ -51,7 +51,7 @@ COUNTS = (4, 6, 9, 15, 30)
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperColumn:
     """One column of the paper's tables: model, control points, coordinates of its X, Y, Z, and what the paper found.
 
     Attributes
@@ -75,60 +75,143 @@ class Row:
 
 
 ROWS = (
-    Row(2, "affine3d geocentric", "affine3d geocentric", "even:9", True,
-        (0.32, 0.55, 0.32, 0.41, 1.20, 0.96, 1.33, 0.42, -5.1, 2.3, -3.5, 3.2, -5.4, 2.5)),
-    Row(2, "affine3d geographic", "affine3d geographic", "even:9", False,
-        (0.54, 0.56, 0.55, 0.54, 1.43, 1.17, 1.81, 0.53, -4.0, 3.5, -4.0, 2.8, -4.3, 7.0)),
-    Row(2, "affine3d UTM", "affine3d utm", "even:9", False,
-        (0.33, 0.53, 0.33, 0.42, 0.80, 1.00, 1.81, 0.41, -1.4, 2.5, -4.1, 2.4, -4.2, 7.1)),
-    Row(3, "original RPC", "rpc", "", False,
-        (0.91, 33.27, 15.92, 26.80, 2.7, 72.6, 25.9, 22.46, -4.2, -0.3, 69.3, 74.6, -33.0, -18.2)),
-    Row(4, "RPC shift", "rpc shift", "even:9", False,
-        (0.25, 0.78, 0.26, 0.44, 0.66, 1.12, 2.23, 0.59, -1.4, 2.3, -3.3, 2.0, -6.6, 8.2)),
-    Row(4, "RPC shift + drift", "rpc shift-drift", "even:9", False,
-        (0.25, 0.74, 0.26, 0.46, 0.66, 1.16, 1.99, 0.47, -1.3, 2.3, -4.3, 2.9, -4.8, 7.5)),
-    Row(4, "RPC affine", "rpc affine", "even:9", False,
-        (0.25, 0.52, 0.26, 0.40, 0.65, 0.95, 1.67, 0.38, -1.3, 2.3, -3.6, 2.3, -4.4, 6.8)),
-    Row(5, "RPC shift, 1 GCP", "rpc shift", "cluster:1:5", False,
-        (0.46, 0.79, 0.47, 0.46, 1.17, 1.11, 2.44, 0.38, -2.5, 1.3, -3.3, 2.1, -8.3, 6.5)),
-    Row(5, "RPC shift + drift, 3 GCPs", "rpc shift-drift", "even:3", False,
-        (0.27, 1.03, 0.28, 0.62, 0.77, 1.61, 2.24, 0.35, -1.1, 2.7, -4.7, 4.8, -5.4, 5.5)),
-    Row(6, "pushbroom, 9 GCPs", "pushbroom", "even:9", True,
-        (0.27, 0.54, 0.30, 0.41, 1.29, 0.81, 1.35, 0.38, -5.6, 2.7, -2.1, 3.3, -5.6, 2.9)),
-    Row(6, "pushbroom, 15 GCPs", "pushbroom", "even:15", True,
-        (0.27, 0.59, 0.27, 0.42, 1.29, 0.91, 1.45, 0.44, -5.8, 1.5, -1.8, 3.3, -5.9, 2.5)),
-)  # fmt: skip
+    PaperColumn(
+        2,
+        "affine3d geocentric",
+        "affine3d geocentric",
+        "even:9",
+        True,
+        (0.32, 0.55, 0.32, 0.41, 1.20, 0.96, 1.33, 0.42, -5.1, 2.3, -3.5, 3.2, -5.4, 2.5),
+    ),
+    PaperColumn(
+        2,
+        "affine3d geographic",
+        "affine3d geographic",
+        "even:9",
+        False,
+        (0.54, 0.56, 0.55, 0.54, 1.43, 1.17, 1.81, 0.53, -4.0, 3.5, -4.0, 2.8, -4.3, 7.0),
+    ),
+    PaperColumn(
+        2,
+        "affine3d UTM",
+        "affine3d utm",
+        "even:9",
+        False,
+        (0.33, 0.53, 0.33, 0.42, 0.80, 1.00, 1.81, 0.41, -1.4, 2.5, -4.1, 2.4, -4.2, 7.1),
+    ),
+    PaperColumn(
+        3,
+        "original RPC",
+        "rpc",
+        "",
+        False,
+        (0.91, 33.27, 15.92, 26.80, 2.7, 72.6, 25.9, 22.46, -4.2, -0.3, 69.3, 74.6, -33.0, -18.2),
+    ),
+    PaperColumn(
+        4,
+        "RPC shift",
+        "rpc shift",
+        "even:9",
+        False,
+        (0.25, 0.78, 0.26, 0.44, 0.66, 1.12, 2.23, 0.59, -1.4, 2.3, -3.3, 2.0, -6.6, 8.2),
+    ),
+    PaperColumn(
+        4,
+        "RPC shift + drift",
+        "rpc shift-drift",
+        "even:9",
+        False,
+        (0.25, 0.74, 0.26, 0.46, 0.66, 1.16, 1.99, 0.47, -1.3, 2.3, -4.3, 2.9, -4.8, 7.5),
+    ),
+    PaperColumn(
+        4,
+        "RPC affine",
+        "rpc affine",
+        "even:9",
+        False,
+        (0.25, 0.52, 0.26, 0.40, 0.65, 0.95, 1.67, 0.38, -1.3, 2.3, -3.6, 2.3, -4.4, 6.8),
+    ),
+    PaperColumn(
+        5,
+        "RPC shift, 1 GCP",
+        "rpc shift",
+        "cluster:1:5",
+        False,
+        (0.46, 0.79, 0.47, 0.46, 1.17, 1.11, 2.44, 0.38, -2.5, 1.3, -3.3, 2.1, -8.3, 6.5),
+    ),
+    PaperColumn(
+        5,
+        "RPC shift + drift, 3 GCPs",
+        "rpc shift-drift",
+        "even:3",
+        False,
+        (0.27, 1.03, 0.28, 0.62, 0.77, 1.61, 2.24, 0.35, -1.1, 2.7, -4.7, 4.8, -5.4, 5.5),
+    ),
+    PaperColumn(
+        6,
+        "pushbroom, 9 GCPs",
+        "pushbroom",
+        "even:9",
+        True,
+        (0.27, 0.54, 0.30, 0.41, 1.29, 0.81, 1.35, 0.38, -5.6, 2.7, -2.1, 3.3, -5.6, 2.9),
+    ),
+    PaperColumn(
+        6,
+        "pushbroom, 15 GCPs",
+        "pushbroom",
+        "even:15",
+        True,
+        (0.27, 0.59, 0.27, 0.42, 1.29, 0.91, 1.45, 0.44, -5.8, 1.5, -1.8, 3.3, -5.9, 2.5),
+    ),
+)
 #: The column of the paper from which somebody guesses another: see `NAIVE`.
 GUESSED = {
-    "affine3d geocentric": "affine3d UTM", "affine3d geographic": "affine3d UTM", "affine3d UTM": "RPC affine",
-    "RPC shift": "RPC affine", "RPC shift + drift": "RPC shift", "RPC affine": "RPC shift + drift",
-    "RPC shift, 1 GCP": "RPC shift", "RPC shift + drift, 3 GCPs": "RPC shift + drift",
-    "pushbroom, 9 GCPs": "affine3d geocentric", "pushbroom, 15 GCPs": "pushbroom, 9 GCPs",
-}  # fmt: skip
+    "affine3d geocentric": "affine3d UTM",
+    "affine3d geographic": "affine3d UTM",
+    "affine3d UTM": "RPC affine",
+    "RPC shift": "RPC affine",
+    "RPC shift + drift": "RPC shift",
+    "RPC affine": "RPC shift + drift",
+    "RPC shift, 1 GCP": "RPC shift",
+    "RPC shift + drift, 3 GCPs": "RPC shift + drift",
+    "pushbroom, 9 GCPs": "affine3d geocentric",
+    "pushbroom, 15 GCPs": "pushbroom, 9 GCPs",
+}
 NAIVE = (
     "the same number in the neighbouring column of the paper (the same model with more control points or one parameter "
     "more or less; 3D affine for the pushbroom, in the same coordinates). For the original RPCs there is none."
 )
 KNOBS = (
     Knob(
-        "SIGMA_COLUMN", simulated.SIGMA_COLUMN, "px", "fitted",
+        "SIGMA_COLUMN",
+        simulated.SIGMA_COLUMN,
+        "px",
+        "fitted",
         "Noise in the columns of each image, from s0 with few control points, where nearly all redundancy is the "
         "parallax across the track.",
         ("5|s0 of *|s0",),
     ),
     Knob(
-        "SIGMA_ROW", simulated.SIGMA_ROW, "px", "fitted",
+        "SIGMA_ROW",
+        simulated.SIGMA_ROW,
+        "px",
+        "fitted",
         "Noise in the rows: what the affine correction leaves in the rows, and the height.",
         ("4|RPC affine|fore y", "4|RPC affine|aft y", "4|RPC affine|Z"),
     ),
     Knob(
-        "SIGMA_GROUND", list(simulated.SIGMA_GROUND), "m (east, north, up)", "fitted",
+        "SIGMA_GROUND",
+        list(simulated.SIGMA_GROUND),
+        "m (east, north, up)",
+        "fitted",
         "Noise on the ground, the same for both images (a roundabout's centre is not where it seems), from what the "
         "affine correction leaves in X and Y. The height has the paper's 0.3 m of its control.",
         ("4|RPC affine|X", "4|RPC affine|Y"),
     ),
     Knob(
-        "BIASES, shifts", {view: [bias.col, bias.row] for view, bias in simulated.BIASES.items()}, "px (column, row)",
+        "BIASES, shifts",
+        {view: [bias.col, bias.row] for view, bias in simulated.BIASES.items()},
+        "px (column, row)",
         "fitted",
         "What the original RPCs are off by. Their sizes are table 3's; the signs were chosen so that X, Y and Z have "
         "the paper's signs; that these have the paper's sizes is the geometry of the orbit.",
@@ -137,29 +220,42 @@ KNOBS = (
     Knob(
         "BIASES, slopes",
         {view: [bias.row_per_col, bias.row_per_row] for view, bias in simulated.BIASES.items()},
-        "px of rows per px of columns, of rows", "fitted",
+        "px of rows per px of columns, of rows",
+        "fitted",
         "How the bias changes over the image: what shift, drift and affine leave in the rows.",
         ("4|RPC *|fore y", "4|RPC *|aft y"),
     ),
     Knob(
-        "CELLS", simulated.CELLS, "places for each point", "fitted",
+        "CELLS",
+        simulated.CELLS,
+        "places for each point",
+        "fitted",
         "How low the points lie: of so many places the lowest are measured, since roundabouts lie where people live. "
         "It shows in the columns of the 3D affine model, whose parallel rays miss what height does to either side.",
         ("2|affine3d UTM|fore x", "2|affine3d UTM|aft x"),
     ),
     Knob(
-        "single control point", "nearest to the middle of the field", "", "fitted",
+        "single control point",
+        "nearest to the middle of the field",
+        "",
+        "fitted",
         "The paper does not say where it lay. Its RMS with one point is that with nine; one at the rim gives 1.35 px.",
         ("5|RPC shift, 1 GCP|fore y",),
     ),
     Knob(
-        "SIGMA_RADIUS", SIGMA_RADIUS, "m", "fitted",
+        "SIGMA_RADIUS",
+        SIGMA_RADIUS,
+        "m",
+        "fitted",
         "Sigma of the flying height, a soft constraint of the pushbroom, which the paper does not state: the metadata "
         "said 638 km of a satellite at 618 km. The usual 5 km give the same RMS to 8 %, but an s0 of 0.74.",
         ("6|s0 of pushbroom, 9 GCPs|s0",),
     ),
     Knob(
-        "FIELD_MIDDLE, FIELD_HALF", [list(simulated.FIELD_MIDDLE), list(simulated.FIELD_HALF)], "of the image", "paper",
+        "FIELD_MIDDLE, FIELD_HALF",
+        [list(simulated.FIELD_MIDDLE), list(simulated.FIELD_HALF)],
+        "of the image",
+        "paper",
         "The points covered the top left quarter of the scene, all over Hobart; of it the part that both images see "
         "(swaths of 29.42 and 26.24 km), evenly. Formerly a smaller field, crowded towards its middle line, was fitted "
         "to the 3D affine model in geographic coordinates, which therefore is worse than it was.",
@@ -169,22 +265,28 @@ KNOBS = (
         "SAID_ALTITUDE", simulated.SAID_ALTITUDE, "m", "paper", "What the metadata said; the satellite flies at 618 km."
     ),
     Knob(
-        "relief", "a flat city under one mountain, 0 to 1260 m", "", "paper",
+        "relief",
+        "a flat city under one mountain, 0 to 1260 m",
+        "",
+        "paper",
         "From sea level to over 1260 m at Mount Wellington, whose place is that on maps; how the lower hills roll is "
         "a choice in sight of no row.",
     ),
-)  # fmt: skip
+)
 #: Models of the curves over the number of control points.
 CURVES = {
-    "3D affine, UTM": "affine3d utm", "RPC shift": "rpc shift", "RPC shift + drift": "rpc shift-drift",
-    "RPC affine": "rpc affine", "pushbroom": "pushbroom",
-}  # fmt: skip
+    "3D affine, UTM": "affine3d utm",
+    "RPC shift": "rpc shift",
+    "RPC shift + drift": "rpc shift-drift",
+    "RPC affine": "rpc affine",
+    "pushbroom": "pushbroom",
+}
 
 
 def reproduce(
     realisations: int = 50,
     *,
-    rows: tuple[Row, ...] = ROWS,
+    rows: tuple[PaperColumn, ...] = ROWS,
     counts: tuple[int, ...] = COUNTS,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
@@ -279,11 +381,16 @@ class Block:
     def pushbroom(self, view: str) -> SensorModel:
         """Return the line scanner that the metadata of a view determine."""
         return pushbroom_of_metadata(
-            np.column_stack([self.corners[view], np.zeros(4)]), self.size, self.size,
-            altitude=simulated.SAID_ALTITUDE, along_deg=simulated.TILTS_DEG[view],
-            focal_length=simulated.FOCAL_LENGTH, pixel_size=simulated.PITCH, heights=simulated.RPC_HEIGHTS,
+            np.column_stack([self.corners[view], np.zeros(4)]),
+            self.size,
+            self.size,
+            altitude=simulated.SAID_ALTITUDE,
+            along_deg=simulated.TILTS_DEG[view],
+            focal_length=simulated.FOCAL_LENGTH,
+            pixel_size=simulated.PITCH,
+            heights=simulated.RPC_HEIGHTS,
             sigmas=SoftSigmas(radius=SIGMA_RADIUS),
-        )  # fmt: skip
+        )
 
     def fit(self, model: str, selection: str) -> BlockFit | None:
         """Adjust the pair; None where the control points do not determine the model.
@@ -355,12 +462,12 @@ def error_vectors(model: str, seed: int = 0) -> tuple[Array, Array]:
 # -- the document ----------------------------------------------------------------------------------------------------
 
 
-def _numbers(rows: tuple[Row, ...]) -> list[Number]:
+def _numbers(rows: tuple[PaperColumn, ...]) -> list[Number]:
     """Return the numbers of `RMS` of all rows, then those of `OTHERS`."""
     papers = {row.label: row.paper for row in ROWS}
     split = len(RMS)
 
-    def number(row: Row, k: int) -> Number:
+    def number(row: PaperColumn, k: int) -> Number:
         name = (*RMS, *OTHERS)[k]
         label = row.label if k < split else f"{'s0' if name == 's0' else 'extremes'} of {row.label}"
         guess = papers[GUESSED[row.label]][k] if row.label in GUESSED else None

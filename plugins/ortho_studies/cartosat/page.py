@@ -66,7 +66,7 @@ def page(document: Mapping[str, Any], vectors: Mapping[str, tuple[Array, Array]]
             f"Errors of 60 check points in the fore image, one realisation. {caption}",
         )
         for model, caption in DRAWN.items()
-    ]  # fmt: skip
+    ]
     return shared.page(
         document,
         heading="CARTOSAT-1: the paper’s tables and ours",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_studies.cartosat.truth import GSD_ALONG, PLANE, SIZE, Array, Hills, Scanner
+from ortho_studies.cartosat.truth import GSD_ALONG, PLANE, SIZE, Array, CartosatPass, HobartTerrain
 from ortho_studies.simulation.waves import texture
 
 
@@ -18,7 +18,7 @@ def brightness(lon: ArrayLike, lat: ArrayLike, *, finest: float) -> Array:
     return np.clip(0.45 + 0.12 * value / np.sqrt(len(lengths) / 2), 0.0, 1.0)
 
 
-def render(camera: Scanner, hills: Hills, *, noise_dn: float = 3.0, seed: int = 0) -> NDArray[np.uint16]:
+def render(camera: CartosatPass, hills: HobartTerrain, *, noise_dn: float = 3.0, seed: int = 0) -> NDArray[np.uint16]:
     """Make the 10-bit image that a camera takes: every pixel's own ray is followed to the hills."""
     pixels = np.empty((camera.size, camera.size), dtype=np.uint16)
     finest = 4.5 * GSD_ALONG * SIZE / camera.size

@@ -60,9 +60,10 @@ def write_product(
     """
     if not SMALLEST <= size <= LARGEST or seed < 0:
         raise InputError(
-            f"size {size} and seed {seed} are not possible", field="size, seed",
+            f"size {size} and seed {seed} are not possible",
+            field="size, seed",
             remedy=f"a size from {SMALLEST} to {LARGEST} and a seed from 0",
-        )  # fmt: skip
+        )
     out = Path(folder)
     pair = simulated.StereoPair.make(size=size, seed=seed, jitter=jitter)
     files: dict[str, Path] = {}
@@ -93,22 +94,37 @@ def metadata_text(pair: simulated.StereoPair, view: str) -> str:
     level = simulated.geocentric(np.column_stack([seen, np.zeros(4)]))
     across = math.dist(level[0], level[1]) / pair.size
     fields = {
-        "ProductID": f"SIMULATED-{BANDS[view]}", "SatID": "CARTOSAT-1", "Sensor": f"PAN_{view.upper()}",
-        "DateOfPass": "01-OCT-2006", "SceneCenterTime": "01-OCT-2006 00:13:22.512345", "Path": "0406", "Row": "0454",
-        "NoScans": f"{pair.size}", "NoPixels": f"{pair.size}", "BitsPerPixel": "10", "MapProjection": "-NA-",
-    }  # fmt: skip
+        "ProductID": f"SIMULATED-{BANDS[view]}",
+        "SatID": "CARTOSAT-1",
+        "Sensor": f"PAN_{view.upper()}",
+        "DateOfPass": "01-OCT-2006",
+        "SceneCenterTime": "01-OCT-2006 00:13:22.512345",
+        "Path": "0406",
+        "Row": "0454",
+        "NoScans": f"{pair.size}",
+        "NoPixels": f"{pair.size}",
+        "BitsPerPixel": "10",
+        "MapProjection": "-NA-",
+    }
     for name, (lon, lat) in corners.items():
         fields |= {f"Image{name}Lat": f"{lat:.6f}", f"Image{name}Lon": f"{lon:.6f}"}
     for name, (x, y) in box.items():
         fields |= {f"Prod{name}Lat": f"{edges[y, 1]:.6f}", f"Prod{name}Lon": f"{edges[x, 0]:.6f}"}
     fields |= {
-        "SceneCenterLat": f"{middle[1]:.6f}", "SceneCenterLon": f"{middle[0]:.6f}",
-        "SceneCenterRoll": "-NA-", "SceneCenterPitch": "-NA-", "SceneCenterYaw": "-NA-",
-        "SatelliteAltitude": f"{simulated.SAID_ALTITUDE / 1e3:.3f}", "SatelliteHeadingAngle": "-NA-",
-        "ViewAngleAlongTrack": f"{simulated.TILTS_DEG[view]:.6f}", "ViewAngleAcrossTrack": "-NA-",
-        "InputResolutionAlong": f"{simulated.GSD_ALONG * shrunk:.4f}", "InputResolutionAcross": f"{across:.4f}",
-        "SunAzimuthAtCenter": "48.213000", "SunElevationAtCenter": "41.650000",
-    }  # fmt: skip
+        "SceneCenterLat": f"{middle[1]:.6f}",
+        "SceneCenterLon": f"{middle[0]:.6f}",
+        "SceneCenterRoll": "-NA-",
+        "SceneCenterPitch": "-NA-",
+        "SceneCenterYaw": "-NA-",
+        "SatelliteAltitude": f"{simulated.SAID_ALTITUDE / 1e3:.3f}",
+        "SatelliteHeadingAngle": "-NA-",
+        "ViewAngleAlongTrack": f"{simulated.TILTS_DEG[view]:.6f}",
+        "ViewAngleAcrossTrack": "-NA-",
+        "InputResolutionAlong": f"{simulated.GSD_ALONG * shrunk:.4f}",
+        "InputResolutionAcross": f"{across:.4f}",
+        "SunAzimuthAtCenter": "48.213000",
+        "SunElevationAtCenter": "41.650000",
+    }
     return "".join(f"{key}{' ' * (k % 3)}={' ' * (k % 2)}{value}\n" for k, (key, value) in enumerate(fields.items()))
 
 

@@ -24,9 +24,10 @@ def statements(medians: Mapping[str, Array]) -> list[Statement]:
     """
     return [
         Statement(sentence, holds, detail, why, bool(why))
-        for sentence, labels, test, why in _RANKINGS if set(labels) <= set(medians)
+        for sentence, labels, test, why in _RANKINGS
+        if set(labels) <= set(medians)
         for holds, detail in [test(*(medians[label] for label in labels))]
-    ]  # fmt: skip
+    ]
 
 
 def _plan(row: Array) -> float:

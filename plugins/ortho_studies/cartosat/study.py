@@ -14,8 +14,11 @@ from ortho_studies.simulation.page import text
 def simulate(folder: str | PathLike[str], *, seed: int = 0, size: int = 1200, jitter: float = 0.0) -> Simulated:
     """Write a CARTOSAT-1 stereo pair over Hobart: BANDF and BANDA with _MET.TXT and _RPC.TXT, DEM, 69 points, truth."""
     files = write_product(folder, seed=seed, size=size, jitter=jitter)
-    return Simulated(files, f"A simulated CARTOSAT-1 stereo pair (seed {seed}); try\n  ortho adjust {files['fore']} "
-                     f"{files['aft']} --points {files['points']} --model rpc --correction affine -o out")  # fmt: skip
+    return Simulated(
+        files,
+        f"A simulated CARTOSAT-1 stereo pair (seed {seed}); try\n  ortho adjust {files['fore']} "
+        f"{files['aft']} --points {files['points']} --model rpc --correction affine -o out",
+    )
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:

@@ -57,7 +57,7 @@ CELLS = 1.2
 
 
 @dataclass(frozen=True)
-class Bias:
+class RpcBias:
     """Error of the vendor's RPC over the points, predicted minus true, in pixels; slopes are pixels per pixel."""
 
     col: float
@@ -69,8 +69,8 @@ class Bias:
 
 #: Shifts of table 3, and slopes.
 BIASES = {
-    "fore": Bias(-0.9, -33.27, 2.7e-4, 2.4e-4),
-    "aft": Bias(-15.92, -26.8, 1.3e-4),
+    "fore": RpcBias(-0.9, -33.27, 2.7e-4, 2.4e-4),
+    "aft": RpcBias(-15.92, -26.8, 1.3e-4),
 }
 
 
@@ -78,7 +78,7 @@ BIASES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Hills:
+class HobartTerrain:
     """Hobart, roughly: a flat city on an estuary under one high mountain, as a function of the place."""
 
     low: float = LOW
@@ -134,7 +134,7 @@ class Attitude:
 
 
 @dataclass(frozen=True, eq=False)
-class Scanner:
+class CartosatPass:
     """One camera on one pass: a line scanner on a circular orbit over a turning Earth.
 
     In the orbital frame x points forward, y to the right, z down to the Earth's centre; the camera is turned about y by
@@ -243,12 +243,12 @@ class Scanner:
 
 
 @dataclass(frozen=True, eq=False)
-class Believed(SensorModel):
+class ScannerModel(SensorModel):
     """A scanner as a model of the host, so that an RPC can be fitted to it; never seen by an estimator."""
 
     kind: ClassVar[str] = "simulated-scanner"
 
-    scanner: Scanner
+    scanner: CartosatPass
 
     @property
     def crs(self) -> str:
@@ -266,7 +266,7 @@ class Believed(SensorModel):
 
 
 @lru_cache(maxsize=16)
-def aim(view: str, *, size: int = SIZE) -> Scanner:
+def aim(view: str, *, size: int = SIZE) -> CartosatPass:
     """Return the camera of a view ('fore' or 'aft'), aimed at the middle of the scene; its columns do not drift there.
 
     A smaller `size` has larger pixels, so that the image covers the same ground.
@@ -283,7 +283,7 @@ def aim(view: str, *, size: int = SIZE) -> Scanner:
     along = np.cos(azimuth) * np.cross(up, east) + np.sin(azimuth) * east
     radius = float(np.linalg.norm(ground)) + ALTITUDE
     tilt = np.radians(TILTS_DEG[view])
-    camera = Scanner(size, up, along, radius, tilt, 0.0, 1.0, PITCH / FOCAL_LENGTH * SIZE / size)
+    camera = CartosatPass(size, up, along, radius, tilt, 0.0, 1.0, PITCH / FOCAL_LENGTH * SIZE / size)
     for _ in range(12):
         look = camera._look(ground, np.zeros(1))[0]
         ahead, behind = (camera._look(ground, np.array([time]))[0] for time in (0.5, -0.5))
@@ -303,7 +303,7 @@ def _level(height: float) -> Callable[[Array, Array], Array]:
 
 
 @lru_cache(maxsize=16)
-def biased(camera: Scanner, bias: Bias) -> Scanner:
+def biased(camera: CartosatPass, bias: RpcBias) -> CartosatPass:
     """Return the camera as the vendor believes it to be: attitude and its rates off, so that `bias` comes out.
 
     The five numbers of a bias are matched by five errors of the attitude over the field of the points, at low heights.
@@ -347,13 +347,19 @@ class StereoPair:
         True lon, lat (degrees), ellipsoidal height of the points.
     """
 
-    cameras: dict[str, Scanner]
+    cameras: dict[str, CartosatPass]
     ground: Array
-    hills: Hills = field(default_factory=Hills)
+    hills: HobartTerrain = field(default_factory=HobartTerrain)
 
     @classmethod
     def make(
-        cls, *, size: int = SIZE, points: int = POINTS, seed: int = 1, jitter: float = 0.0, hills: Hills | None = None
+        cls,
+        *,
+        size: int = SIZE,
+        points: int = POINTS,
+        seed: int = 1,
+        jitter: float = 0.0,
+        hills: HobartTerrain | None = None,
     ) -> Self:
         """Make a pair; the places of the points and the phases of the pitch jitter come from `seed`.
 
@@ -369,7 +375,7 @@ class StereoPair:
         """
         if points < 4:
             raise InputError("a stereo pair has at least 4 points", field="points")
-        hills = hills or Hills()
+        hills = hills or HobartTerrain()
         random = np.random.default_rng(seed)
         cameras = {}
         for view in TILTS_DEG:
@@ -393,9 +399,9 @@ class StereoPair:
         """Return the true image points ``(N, 2)`` of a view."""
         return self.cameras[view].project(self.ground)
 
-    def rpc(self, view: str, bias: Bias | None = None) -> RPC:
+    def rpc(self, view: str, bias: RpcBias | None = None) -> RPC:
         """Return the vendor's RPC of a view, in this package's convention."""
-        believed = Believed(biased(self.cameras[view], BIASES[view] if bias is None else bias))
+        believed = ScannerModel(biased(self.cameras[view], BIASES[view] if bias is None else bias))
         centre, half = believed.domain
         west, south, east, north = *(centre - 1.02 * half)[:2], *(centre + 1.02 * half)[:2]
         return fit_rpc(believed, (west, south, east, north), RPC_HEIGHTS).rpc

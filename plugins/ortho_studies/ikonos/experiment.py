@@ -70,44 +70,65 @@ NAIVE = (
 REVERSED = 2 / 3
 KNOBS = (
     Knob(
-        "POINTING", POINTING, "px per axis", "fitted",
+        "POINTING",
+        POINTING,
+        "px per axis",
+        "fitted",
         "Noise of pointing, from the model that has nothing else left. It came out at the half pixel that is customary "
         "a priori (Willneff et al. have it), but it was found in sight of this row, so the row is not counted.",
         ("2|DLT|*",),
     ),
     Knob(
-        "ROUGHNESS", ROUGHNESS, "", "fitted",
+        "ROUGHNESS",
+        ROUGHNESS,
+        "",
+        "fitted",
         "How much the hills rise. Only its product with the tangent of the tilt has an effect.",
         ("2|quadratic polynomial|*",),
     ),
     Knob("SIGMA_GROUND", SIGMA_GROUND, "m per axis", "paper", "The accuracy of the map of 1:500."),
     Knob(
-        "STEEPNESS, BEND", [STEEPNESS, BEND], "", "published",
+        "STEEPNESS, BEND",
+        [STEEPNESS, BEND],
+        "",
+        "published",
         "The slope of the city, through heights that are published: the railway station 1117 m, the centre (35.696 "
         "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. Formerly 4.0 and 0.9 fitted 2D affine; with "
         "the heights of the city itself 2D affine and projective come out by a third too small. A tilt of 27 degrees "
         "would make up for that, but nothing tells it.",
     ),
     Knob(
-        "REVERSED", REVERSED, "of the realisations", "published",
+        "REVERSED",
+        REVERSED,
+        "of the realisations",
+        "published",
         "A scan against the flight, in which lines of sight are not parallel along it: two of the three real products "
         "that were looked at have it, so it is drawn. Formerly all scans were reversed, which 3D affine asked for.",
     ),
     Knob(
-        "OFF_NADIR_DEG", OFF_NADIR_DEG, "degrees", "chosen",
+        "OFF_NADIR_DEG",
+        OFF_NADIR_DEG,
+        "degrees",
+        "chosen",
         "Tilt. Geo products are ordered with at least 60 degrees of elevation; this is between. All models without "
         "heights have errors in proportion to its tangent.",
     ),
     Knob(
-        "relief", "waves of 0.4 to 25 km, 1050 to 1800 m", "", "chosen",
+        "relief",
+        "waves of 0.4 to 25 km, 1050 to 1800 m",
+        "",
+        "chosen",
         "How the hills fall off with their wavelength. Of longest waves of 12, 25 and 40 km the second was taken in "
         "sight of all rows, so that the cubic polynomial is no pure prediction.",
     ),
     Knob(
-        "BIAS", list(BIAS), "m", "published",
+        "BIAS",
+        list(BIAS),
+        "m",
+        "published",
         "Error of the vendor's line of sight: 10 to 25 m are usual for Geo products. All models of table 2 take it up.",
     ),
-)  # fmt: skip
+)
 #: What a vendor's model is good for: heights (m) of the RPC and of the model from metadata.
 HEIGHTS = (900.0, 2000.0)
 #: Own models of the scene by number of points: model, correction, points. ``own``: its own parameters are adjusted.
@@ -165,9 +186,15 @@ def geo_model(scene: GeoScene) -> MapPlane:
     """Return the model from the metadata alone: plane, and the direction to the satellite."""
     azimuth, elevation = np.radians(scene.view)
     return MapPlane.from_view(
-        MAP_CRS, (scene.west, scene.north), (scene.pixel, scene.pixel), (scene.columns, scene.rows),
-        REFERENCE_HEIGHT, float(azimuth), float(elevation), HEIGHTS,
-    )  # fmt: skip
+        MAP_CRS,
+        (scene.west, scene.north),
+        (scene.pixel, scene.pixel),
+        (scene.columns, scene.rows),
+        REFERENCE_HEIGHT,
+        float(azimuth),
+        float(elevation),
+        HEIGHTS,
+    )
 
 
 def vendor_rpc(scene: GeoScene) -> SensorModel:
@@ -344,8 +371,11 @@ def statements(table: Array) -> list[Statement]:
             ours == order,
             ", ".join(said[name] for name in ours) + f" m; {100 * ordered:.0f} % of the realisations have all six so",
         ),
-        Statement("The DLT model was the best model for the test area.", ours[0] == "dlt",
-                  f"in {100 * best:.0f} % of the realisations"),
+        Statement(
+            "The DLT model was the best model for the test area.",
+            ours[0] == "dlt",
+            f"in {100 * best:.0f} % of the realisations",
+        ),
         Statement(
             "An accuracy of 1.1 m is achieved with DLT.",
             medians[names.index("dlt")] < 1.25,
@@ -358,7 +388,7 @@ def statements(table: Array) -> list[Statement]:
             bool(min(apart) > 0.5),
             " and ".join(f"{100 * share:.0f} %" for share in apart) + " of the realisations",
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _relief_note(relief: Array) -> str:

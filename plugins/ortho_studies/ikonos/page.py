@@ -37,12 +37,13 @@ def page(document: Mapping[str, Any], vectors: Mapping[str, tuple[Array, Array]]
     size = (EXTENT, EXTENT)
     figures = [
         Figure(
-            shared.draw_vectors(f"Errors of the check points, {NAMES[name]}", *vectors[name], size, units="m",
-                                kind="check"),
+            shared.draw_vectors(
+                f"Errors of the check points, {NAMES[name]}", *vectors[name], size, units="m", kind="check"
+            ),
             f"Figure 4 ({letter}): {NAMES[name]}. Measured minus predicted, one realisation; mind the scale.",
         )
         for letter, name in zip(_LETTERS, TABLE_2, strict=True)
-    ]  # fmt: skip
+    ]
     return shared.page(
         document,
         heading="IKONOS: the paper’s table and ours",

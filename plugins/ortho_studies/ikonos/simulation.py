@@ -38,7 +38,7 @@ _RULE = "=" * 62
 
 
 @dataclass(frozen=True)
-class Component:
+class SimulatedComponent:
     """One image file of the order: a cut of the scene, in pan's pixels, and its name."""
 
     identifier: str
@@ -109,23 +109,25 @@ def _check(size: int, pixel: float, seed: int, components: int, multispectral: b
             f"size {size}, seed {seed} and {counted(components, 'component')} are not possible",
             field="size, seed, components",
             remedy=f"a size from {SMALLEST} to {LARGEST}, a seed from 0, and 1 to {MOST_COMPONENTS} components",
-        )  # fmt: skip
+        )
     if not pixel >= FINEST or size * pixel > simulated.EXTENT * (1 + 1e-9):
         raise InputError(
-            f"{size} pixels of {pixel:g} m are not possible", field="size, pixel",
+            f"{size} pixels of {pixel:g} m are not possible",
+            field="size, pixel",
             remedy=f"pixels of at least {FINEST} m, and a scene of at most {simulated.EXTENT:g} m",
-        )  # fmt: skip
+        )
     if size % (components * (RATIO if multispectral else 1)):
         raise InputError(
-            f"{size} columns cannot be cut so", field="size",
+            f"{size} columns cannot be cut so",
+            field="size",
             remedy=f"a multiple of {components * (RATIO if multispectral else 1)}",
-        )  # fmt: skip
+        )
 
 
-def _cut(scene: GeoScene, count: int) -> list[Component]:
+def _cut(scene: GeoScene, count: int) -> list[SimulatedComponent]:
     wide = scene.columns // count
     return [
-        Component(f"{k:07d}", replace(scene, west=scene.west + k * wide * scene.pixel, columns=wide))
+        SimulatedComponent(f"{k:07d}", replace(scene, west=scene.west + k * wide * scene.pixel, columns=wide))
         for k in range(count)
     ]
 
@@ -140,7 +142,7 @@ def _of_band(scene: GeoScene, band: str) -> GeoScene:
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
-def _write_points(measured: Points, cuts: list[Component], path: Path) -> None:
+def _write_points(measured: Points, cuts: list[SimulatedComponent], path: Path) -> None:
     """Write the points in the panchromatic component that each of them lies in, named where there are several."""
     wide = cuts[0].scene.columns
     of = np.clip(measured.image[:, 0] // wide, 0, len(cuts) - 1).astype(int)
@@ -151,7 +153,7 @@ def _write_points(measured: Points, cuts: list[Component], path: Path) -> None:
 
 
 def _write_image(
-    out: Path, cut: Component, whole: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
+    out: Path, cut: SimulatedComponent, whole: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
 ) -> Iterator[tuple[str, Path]]:
     grid = _of_band(cut.scene, band)
     name = "_".join(
@@ -194,7 +196,7 @@ def _write_heights(scene: GeoScene, step: float, path: Path) -> None:
 # -- metadata --------------------------------------------------------------------------------------------------------
 
 
-def metadata_text(scene: GeoScene, cuts: list[Component], multispectral: bool) -> str:
+def metadata_text(scene: GeoScene, cuts: list[SimulatedComponent], multispectral: bool) -> str:
     """Return the text of ``po_<order>_metadata.txt``: sections between rules, nesting by three blanks."""
     sections = [
         ["Version Number: 2.2"],
@@ -275,7 +277,7 @@ def _space(scene: GeoScene, components: int) -> list[str]:
     ]
 
 
-def _component(cut: Component, multispectral: bool) -> list[str]:
+def _component(cut: SimulatedComponent, multispectral: bool) -> list[str]:
     bands = ("pan", *MULTISPECTRAL) if multispectral else ("pan",)
     names = " ".join(f"po_{ORDER}_{band}_{cut.identifier}.tif" for band in bands)
     grid = cut.scene

@@ -19,8 +19,11 @@ def simulate(
     if off_nadir is not None:
         options["off_nadir_deg"] = off_nadir
     files = write_product(folder, seed=seed, **options)
-    return Simulated(files, f"A simulated IKONOS Geo scene (seed {seed}); try\n  ortho rectify {files['image']} "
-                     f"--gcps {files['gcps']} --dem {files['dem']} -o out")  # fmt: skip
+    return Simulated(
+        files,
+        f"A simulated IKONOS Geo scene (seed {seed}); try\n  ortho rectify {files['image']} "
+        f"--gcps {files['gcps']} --dem {files['dem']} -o out",
+    )
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:

@@ -95,7 +95,7 @@ class Slope:
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class IkonosPass:
     """A satellite that flies and scans: where it is, and which plane it sees, at each time (s); ECEF metres.
 
     Attributes
@@ -137,8 +137,9 @@ class Scan:
             If the line of sight would miss the ground by far or graze it.
         """
         if not 0 <= off_nadir_deg <= 45:
-            raise InputError(f"{off_nadir_deg:g} degrees off nadir are not possible", field="off_nadir_deg",
-                             remedy="0 to 45 degrees")  # fmt: skip
+            raise InputError(
+                f"{off_nadir_deg:g} degrees off nadir are not possible", field="off_nadir_deg", remedy="0 to 45 degrees"
+            )
         aim = geocentric(np.array([[LON, LAT, REFERENCE_HEIGHT]]))[0]
         up = aim / np.linalg.norm(aim)
         east = np.cross([0.0, 0.0, 1.0], up)
@@ -214,7 +215,7 @@ class GeoScene:
         Size of a pixel (m), and size of the image.
     """
 
-    scan: Scan
+    scan: IkonosPass
     terrain: Slope
     attitude_error: Array
     west: float
@@ -247,14 +248,20 @@ class GeoScene:
         """
         random = np.random.default_rng([seed, 6])
         azimuth = random.uniform(0.0, 360.0) if azimuth_deg is None else azimuth_deg
-        scan = Scan.over_tehran(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth, reverse=reverse)
+        scan = IkonosPass.over_tehran(off_nadir_deg=off_nadir_deg, azimuth_deg=azimuth, reverse=reverse)
         columns, rows = (round(EXTENT / pixel) if size is None else size for size in (columns, rows))
         x, y = to_map().transform(LON, LAT)
         west, north = round(x - columns * pixel / 2), round(y + rows * pixel / 2)
         scene = cls(
-            scan, Slope(bend, roughness, seed), _attitude_error(scan, random), float(west), float(north), pixel,
-            columns, rows,
-        )  # fmt: skip
+            scan,
+            Slope(bend, roughness, seed),
+            _attitude_error(scan, random),
+            float(west),
+            float(north),
+            pixel,
+            columns,
+            rows,
+        )
         image = np.concatenate([_spread(points, columns, rows, random) for _ in ("control", "check")])
         return replace(scene, image=image, ground=scene.meet(image))
 
@@ -397,7 +404,7 @@ def _enu_axes(lon: float, lat: float) -> tuple[Array, Array, Array]:
     return east, north, np.cross(east, north)
 
 
-def _attitude_error(scan: Scan, random: np.random.Generator) -> Array:
+def _attitude_error(scan: IkonosPass, random: np.random.Generator) -> Array:
     """Return a small rotation (rad) that moves the line of sight by a length within `BIAS` at the ground."""
     look = scan.aim - scan.satellite(np.zeros(1))[0]
     distance = float(np.linalg.norm(look))

@@ -63,9 +63,14 @@ QUICKBIRD_POINTS = 39
 QUICKBIRD_AREA = (16e3, simulated.FIELD[1])
 #: The row from which somebody guesses another: see `NAIVE`.
 GUESSED = {
-    "affine3d": "affine12", "affine12": "dlt", "dlt": "affine12", "affine14": "affine12", SHIFT: AFFINE, AFFINE: SHIFT,
+    "affine3d": "affine12",
+    "affine12": "dlt",
+    "dlt": "affine12",
+    "affine14": "affine12",
+    SHIFT: AFFINE,
+    AFFINE: SHIFT,
     RELATIVE: AFFINE,
-}  # fmt: skip
+}
 GUESSED_QUICKBIRD = {SHIFT: "affine12", "affine12": SHIFT, "affine3d": SHIFT}
 NAIVE = (
     "the paper’s own number in the same column for the model with the nearest number of unknowns (that of the improved "
@@ -121,11 +126,18 @@ def reproduce(realisations: int = 100, *, progress: Callable[[float], None] | No
 
 def _numbers() -> list[Number]:
     columns = [f"{name} {axis}" for name in simulated.SCENES for axis in "XY"]
-    one = [Number("1", row, column, "m", papers[k], TABLE_1[GUESSED[row]][k] if row in GUESSED else None,
-               draw=row == ABSOLUTE)
-           for row, papers in TABLE_1.items() for k, column in enumerate(columns)]  # fmt: skip
-    return one + [Number("3.1", row, axis, "m", papers[k], QUICKBIRD[GUESSED_QUICKBIRD[row]][k])
-                  for row, papers in QUICKBIRD.items() for k, axis in enumerate("XY")]  # fmt: skip
+    one = [
+        Number(
+            "1", row, column, "m", papers[k], TABLE_1[GUESSED[row]][k] if row in GUESSED else None, draw=row == ABSOLUTE
+        )
+        for row, papers in TABLE_1.items()
+        for k, column in enumerate(columns)
+    ]
+    return one + [
+        Number("3.1", row, axis, "m", papers[k], QUICKBIRD[GUESSED_QUICKBIRD[row]][k])
+        for row, papers in QUICKBIRD.items()
+        for k, axis in enumerate("XY")
+    ]
 
 
 def _medians(numbers: list[Number], found: Array) -> dict[tuple[str, str, str], float]:
@@ -214,9 +226,7 @@ def largest_correlation(result: Fit) -> float:
 
 
 def _quickbird() -> tuple[simulated.Rectified, RPC]:
-    product = simulated.Rectified.of(
-        simulated.quickbird(), simulated.QUICKBIRD["plane"], simulated.QUICKBIRD["pixel"]
-    )  # fmt: skip
+    product = simulated.Rectified.of(simulated.quickbird(), simulated.QUICKBIRD["plane"], simulated.QUICKBIRD["pixel"])
     return product, simulated.vendor_rpc(product)
 
 
@@ -235,7 +245,7 @@ def _quickbird_numbers(product: simulated.Rectified, rpc: RPC, coast: simulated.
 # -- geometry and curves ---------------------------------------------------------------------------------------------
 
 
-def _geometry(cameras: dict[str, simulated.Scanner]) -> dict[str, float]:
+def _geometry(cameras: dict[str, simulated.TurningScanner]) -> dict[str, float]:
     """Return what the paper tells of the acquisition, as the cameras have it."""
     first, second = cameras.values()
     now = np.zeros(1)
@@ -276,9 +286,10 @@ def _edge_curve() -> Curve:
         "width at half height, and blur [pixels]",
         {
             f"{label} along the {axis}": (list(ENHANCEMENTS), [one[key][k] for one in found])
-            for key, label in names.items() for k, axis in enumerate(("line", "scan"))
+            for key, label in names.items()
+            for k, axis in enumerate(("line", "scan"))
         },
-    )  # fmt: skip
+    )
 
 
 # -- figures ---------------------------------------------------------------------------------------------------------

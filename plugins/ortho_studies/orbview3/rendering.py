@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_studies.orbview3.truth import ALTITUDE, PIXEL, PLANE, Array, Coast, Scanner
+from ortho_studies.orbview3.truth import ALTITUDE, PIXEL, PLANE, Array, Coast, TurningScanner
 
 #: Width of a pixel in distances of neighbouring ones, for the two CCD lines are staggered by half a pixel.
 STAGGERED = 2
@@ -67,7 +67,7 @@ def _filtered(values: Array, kernel: Array, axis: int, step: int) -> Array:
 
 
 def render(
-    camera: Scanner, coast: Coast, *, noise_dn: float = 6.0, enhancement: float = ENHANCEMENT, seed: int = 0
+    camera: TurningScanner, coast: Coast, *, noise_dn: float = 6.0, enhancement: float = ENHANCEMENT, seed: int = 0
 ) -> NDArray[np.uint16]:
     """Make the 11-bit image that a camera takes: the rays of the pixels' corners are followed to the ground."""
     oversampling, pixel = 2, float(camera.pixel_tan * ALTITUDE)

@@ -59,9 +59,10 @@ def write_product(
     """
     if not SMALLEST <= pixel <= LARGEST or seed < 0:
         raise InputError(
-            f"pixels of {pixel} m and seed {seed} are not possible", field="pixel, seed",
+            f"pixels of {pixel} m and seed {seed} are not possible",
+            field="pixel, seed",
             remedy=f"whole metres from {SMALLEST} to {LARGEST} and a seed from 0",
-        )  # fmt: skip
+        )
     out, coast = Path(folder), simulated.Coast()
     ground = simulated.places(simulated.POINTS, coast, seed)
     believed = {name: simulated.scanner(name, shrink=pixel) for name in simulated.SCENES}
@@ -87,7 +88,7 @@ def write_product(
     return files
 
 
-def label(camera: simulated.Scanner, rpc: RPC, coast: simulated.Coast, name: str) -> str:
+def label(camera: simulated.TurningScanner, rpc: RPC, coast: simulated.Coast, name: str) -> str:
     """Return the label of a scene in the layout of the USGS, with what the vendor believes of the camera."""
     last = np.array([camera.width - 1, camera.height - 1])
     corners = camera.meet(np.array(list(CORNERS.values())) * last + 0.5, coast)
@@ -97,17 +98,27 @@ def label(camera: simulated.Scanner, rpc: RPC, coast: simulated.Coast, name: str
     places = [
         line
         for corner, (lon, lat, height) in zip(CORNERS, corners.tolist(), strict=True)
-        for line in _group(corner, [("latitude", f"{lat:.10f}"), ("longitude", f"{lon:.10f}"),
-                                    ("height", f"{height:.7f}")])
-    ]  # fmt: skip
+        for line in _group(
+            corner, [("latitude", f"{lat:.10f}"), ("longitude", f"{lon:.10f}"), ("height", f"{height:.7f}")]
+        )
+    ]
     product = [
-        *_lines([("distributionMediaType", '"Simulated"'), ("productCloudCoverPercentage", 999), ("bytesPerPixel", 2),
-                 ("bitsPerPixel", 11), ("spacingUnits", '"meters"'), ("numScanLines", camera.height),
-                 ("pixelsPerScanLine", camera.width), ("lineSpacing", spacing[0][1]),
-                 ("pixelSpacing", spacing[1][1])]),
+        *_lines(
+            [
+                ("distributionMediaType", '"Simulated"'),
+                ("productCloudCoverPercentage", 999),
+                ("bytesPerPixel", 2),
+                ("bitsPerPixel", 11),
+                ("spacingUnits", '"meters"'),
+                ("numScanLines", camera.height),
+                ("pixelsPerScanLine", camera.width),
+                ("lineSpacing", spacing[0][1]),
+                ("pixelSpacing", spacing[1][1]),
+            ]
+        ),
         *_block("geodeticCorners", places),
         *_block("rationalFunctions", _rational_functions(rpc)),
-    ]  # fmt: skip
+    ]
     image = [
         ("firstLineAcquisitionDateTime", ACQUIRED[name]),
         ("circularError", f"{CIRCULAR_ERROR[name]:.10f}"),
@@ -147,7 +158,7 @@ def _block(name: str, lines: list[str]) -> list[str]:
     return [f"BEGIN_GROUP = {name};", *(f"  {line}" for line in lines), f"END_GROUP = {name};"]
 
 
-def _spacing(camera: simulated.Scanner) -> tuple[float, float]:
+def _spacing(camera: simulated.TurningScanner) -> tuple[float, float]:
     """Return the distance (m) of neighbouring pixel centres along and across the line, in the middle of the scene."""
     middle = np.array([camera.width / 2, camera.height / 2])
     seen = camera.meet(middle + np.array([[0, 0], [1, 0], [0, 1]]), simulated.level(simulated.LEVEL))
@@ -165,7 +176,9 @@ def _write_image(pixels: NDArray[np.uint16], path: Path) -> None:
             dataset.GetRasterBand(1).WriteArray(pixels)
 
 
-def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast, step: float, path: Path) -> None:
+def _write_heights(
+    cameras: dict[str, simulated.TurningScanner], coast: simulated.Coast, step: float, path: Path
+) -> None:
     seen = np.concatenate([camera.outline(h) for camera in cameras.values() for h in simulated.RPC_HEIGHTS])
     xy = np.stack(simulated.to_map().transform(seen[:, 0], seen[:, 1]), axis=1)
     margin = 500.0 + step
@@ -173,7 +186,7 @@ def _write_heights(cameras: dict[str, simulated.Scanner], coast: simulated.Coast
     write_terrain(path, coast, box, step, simulated.MAP_CRS, GEOID)
 
 
-def _truth(cameras: dict[str, simulated.Scanner], ground: Array, seed: int, pixel: int) -> dict[str, Any]:
+def _truth(cameras: dict[str, simulated.TurningScanner], ground: Array, seed: int, pixel: int) -> dict[str, Any]:
     return {
         "about": "truth of two simulated OrbView-3 scenes",
         "seed": seed,
@@ -189,7 +202,5 @@ def _truth(cameras: dict[str, simulated.Scanner], ground: Array, seed: int, pixe
             }
             for name, camera in cameras.items()
         },
-        "points": [
-            {"id": f"P{k + 1:02d}", "lon_lat_h": point} for k, point in enumerate(ground.tolist())
-        ],
-    }  # fmt: skip
+        "points": [{"id": f"P{k + 1:02d}", "lon_lat_h": point} for k, point in enumerate(ground.tolist())],
+    }

@@ -165,18 +165,22 @@ def _on_parameters(findings: Findings) -> Iterator[Statement]:
         "The paper does not state its significance; with 10 % it would be 2.4 and 2.2.",
     )
     shares = {
-        scene: ", ".join(f"{name} {100 * often / len(findings.numbers[f'{scene} pruned']):.0f} %"
-                         for name, often in sorted(findings.pruned[scene].items()))
+        scene: ", ".join(
+            f"{name} {100 * often / len(findings.numbers[f'{scene} pruned']):.0f} %"
+            for name, often in sorted(findings.pruned[scene].items())
+        )
         for scene in simulated.SCENES
-    }  # fmt: skip
+    }
     yield Statement(
         "In scene 471890 these are a2 and a3 (column per column and per row), in 443940 a3 and a5 (row per column).",
         min(alike) > 0.5,
-        "exactly these in " + " and ".join(f"{100 * share:.0f} %" for share in alike) + " of the realisations; "
+        "exactly these in "
+        + " and ".join(f"{100 * share:.0f} %" for share in alike)
+        + " of the realisations; "
         + "; ".join(f"{scene}: {shares[scene]}" for scene in simulated.SCENES),
         "Which parameters are needed depends on the drift of the attitude, which is drawn for each scene: nothing that "
         "a simulation could predict. That column per column is needed least often agrees with scene 471890 only.",
-    )  # fmt: skip
+    )
     ratios = [findings.median(f"{scene} pruned ratio") for scene in simulated.SCENES]
     yield Statement(
         "Without them the root mean square discrepancies do not change.",

@@ -14,8 +14,11 @@ from ortho_studies.simulation.page import text
 def simulate(folder: str | PathLike[str], *, seed: int = 0, pixel: int = 8) -> Simulated:
     """Write two OrbView-3 scenes over Zonguldak: images with .pvl and _rpc.txt, DEM, 34 points, truth."""
     files = write_product(folder, seed=seed, pixel=pixel)
-    return Simulated(files, f"Two simulated OrbView-3 scenes (seed {seed}); try\n  ortho fit {files['image_471890']} "
-                     f"--gcps {files['gcps_471890']} --correction affine --prune")  # fmt: skip
+    return Simulated(
+        files,
+        f"Two simulated OrbView-3 scenes (seed {seed}); try\n  ortho fit {files['image_471890']} "
+        f"--gcps {files['gcps_471890']} --correction affine --prune",
+    )
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:

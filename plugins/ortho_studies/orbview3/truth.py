@@ -102,7 +102,7 @@ class Coast:
 
 
 @dataclass(frozen=True, eq=False)
-class Scanner:
+class TurningScanner:
     """A line scanner that turns on a circular orbit over a turning Earth, so that its sight follows a straight path.
 
     The line of pixels lies in the plane of the line of sight and of `line`, apart from a yaw. Light time, aberration
@@ -282,7 +282,7 @@ def orbit(altitude: float, side: float) -> tuple[Array, Array, float]:
     return radial, along, float(np.linalg.norm(ground)) + altitude
 
 
-def scanner(name: str, *, shrink: int = 1) -> Scanner:
+def scanner(name: str, *, shrink: int = 1) -> TurningScanner:
     """Return the camera of one of `SCENES` without attitude error.
 
     Parameters
@@ -291,20 +291,34 @@ def scanner(name: str, *, shrink: int = 1) -> Scanner:
         So many times larger and fewer pixels, for small images of the same ground.
     """
     middle, east = SCENES[name]
-    camera = Scanner(
-        COLUMNS // shrink, LINES // shrink, *orbit(ALTITUDE, SIDE), middle, (float(east), 0.0),
-        LINES_PER_SECOND * PIXEL, shrink / LINES_PER_SECOND, shrink * PIXEL / ALTITUDE, yaw_rate=east * YAW_RATE,
-    )  # fmt: skip
+    camera = TurningScanner(
+        COLUMNS // shrink,
+        LINES // shrink,
+        *orbit(ALTITUDE, SIDE),
+        middle,
+        (float(east), 0.0),
+        LINES_PER_SECOND * PIXEL,
+        shrink / LINES_PER_SECOND,
+        shrink * PIXEL / ALTITUDE,
+        yaw_rate=east * YAW_RATE,
+    )
     before, after = (np.linalg.norm(camera.target(time) - camera.flight(time)[0]) for time in np.array([[-0.5], [0.5]]))
     return replace(camera, gain=float(TURNING * camera.speed * np.log(after / before)))
 
 
-def quickbird() -> Scanner:
+def quickbird() -> TurningScanner:
     """Return QuickBird's camera over the same area, which scans against the flight with its 6900 lines a second."""
-    return Scanner(
-        27_000, 27_000, *orbit(QUICKBIRD["altitude"], QUICKBIRD["side"]), 0.0, (0.0, 1.0), 6900.0 * 0.61,
-        1 / 6900.0, 0.61 / QUICKBIRD["altitude"], flight_line=False,
-    )  # fmt: skip
+    return TurningScanner(
+        27_000,
+        27_000,
+        *orbit(QUICKBIRD["altitude"], QUICKBIRD["side"]),
+        0.0,
+        (0.0, 1.0),
+        6900.0 * 0.61,
+        1 / 6900.0,
+        0.61 / QUICKBIRD["altitude"],
+        flight_line=False,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,14 +328,14 @@ class Rectified:
     Its pixels are squares of `pixel` metres in `MAP_CRS` from the corner `west`, `north`.
     """
 
-    camera: Scanner
+    camera: TurningScanner
     plane: float
     pixel: float
     west: float
     north: float
 
     @classmethod
-    def of(cls, camera: Scanner, plane: float, pixel: float) -> Rectified:
+    def of(cls, camera: TurningScanner, plane: float, pixel: float) -> Rectified:
         """Project the image of a camera to the plane of an ellipsoidal height (m)."""
         x, y = to_map().transform(*camera.outline(plane)[:, :2].T)
         return cls(camera, plane, pixel, float(x.min()), float(y.max()))
@@ -344,12 +358,12 @@ def to_map() -> pyproj.Transformer:
 
 
 @dataclass(frozen=True, eq=False)
-class Believed(SensorModel):
+class VendorCamera(SensorModel):
     """A camera as its vendor believes it, as a model of the host, so that an RPC can be fitted to it."""
 
     kind: ClassVar[str] = "simulated-scanner"
 
-    camera: Scanner | Rectified
+    camera: TurningScanner | Rectified
 
     @property
     def crs(self) -> str:
@@ -365,15 +379,15 @@ class Believed(SensorModel):
         return self.camera.project(ground)
 
 
-def vendor_rpc(camera: Scanner | Rectified) -> RPC:
+def vendor_rpc(camera: TurningScanner | Rectified) -> RPC:
     """Return the RPC that a vendor fits to the camera as he believes it to be."""
-    believed = Believed(camera)
+    believed = VendorCamera(camera)
     centre, half = believed.domain
     (west, south, _), (east, north, _) = (centre - half).tolist(), (centre + half).tolist()
     return fit_rpc(believed, (west, south, east, north), RPC_HEIGHTS).rpc
 
 
-def with_attitude_error(camera: Scanner, seed: int, *, scale: float = 1.0) -> Scanner:
+def with_attitude_error(camera: TurningScanner, seed: int, *, scale: float = 1.0) -> TurningScanner:
     """Return the camera as it really was: bias, drift and wobble of the attitude drawn from `seed`."""
     random = np.random.default_rng([seed, 1, *(int(part) + 1 for part in camera.heading)])
     sizes = np.array([SIGMA_BIAS, SIGMA_DRIFT, *[SIGMA_WOBBLE] * (DEGREES - 1)])
@@ -414,7 +428,7 @@ def places(count: int, coast: Coast, seed: int, area: tuple[float, float] = FIEL
 
 
 def measure(
-    camera: Scanner | Rectified,
+    camera: TurningScanner | Rectified,
     ground: Array,
     seed: int,
     *,

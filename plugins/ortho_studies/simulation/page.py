@@ -17,8 +17,11 @@ from ortho_studies.simulation.tables import VERDICTS, is_covered, is_missed
 _SIDE, _MARGIN = 520.0, 18.0
 _UNITS = {"px": ("pixel", "pixels"), "m": ("metre", "metres")}
 _SOURCES = {
-    "paper": "this paper", "published": "published elsewhere, or customary", "chosen": "chosen", "fitted": "fitted to",
-}  # fmt: skip
+    "paper": "this paper",
+    "published": "published elsewhere, or customary",
+    "chosen": "chosen",
+    "fitted": "fitted to",
+}
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,10 @@ def text(document: Mapping[str, Any]) -> str:
         lines.append("")
     for one in document["statements"]:
         why = f" {one['why']}" if one["why"] else ""
-        lines.append(f"{'!' if one['verdict'] == VERDICTS[2] else ' '} {one['text']} {_capital(one['verdict'])}: "
-                     f"{one['detail']}.{why}")  # fmt: skip
+        lines.append(
+            f"{'!' if one['verdict'] == VERDICTS[2] else ' '} {one['text']} {_capital(one['verdict'])}: "
+            f"{one['detail']}.{why}"
+        )
     return "\n".join([*lines, *([""] if document["statements"] else []), *verdict(document)])
 
 

@@ -93,8 +93,14 @@ class Knob:
 
     def to_json(self) -> dict[str, Any]:
         """Return the knob as JSON values."""
-        return {"name": self.name, "value": self.value, "units": self.units, "source": self.source, "why": self.why,
-                "rows": list(self.rows)}  # fmt: skip
+        return {
+            "name": self.name,
+            "value": self.value,
+            "units": self.units,
+            "source": self.source,
+            "why": self.why,
+            "rows": list(self.rows),
+        }
 
 
 @dataclass(frozen=True)
@@ -167,10 +173,14 @@ def make_document(
     values = np.asarray(found, dtype=np.float64)
     lines = [_line(number, values[:, k], knobs) for k, number in enumerate(numbers)]
     tables = [
-        {"table": table, "title": title,
-         "rows": [row for row, number in zip(lines, numbers, strict=True) if number.table == table]}
-        for table, title in titles.items() if any(number.table == table for number in numbers)
-    ]  # fmt: skip
+        {
+            "table": table,
+            "title": title,
+            "rows": [row for row, number in zip(lines, numbers, strict=True) if number.table == table],
+        }
+        for table, title in titles.items()
+        if any(number.table == table for number in numbers)
+    ]
     return {
         "schema_version": SCHEMA_VERSION,
         "paper": paper,
@@ -194,10 +204,18 @@ def _line(number: Number, values: Array, knobs: Sequence[Knob]) -> dict[str, Any
     fitted = [knob.name for knob in knobs if knob.fits(number)]
     role = ROLES[3] if number.paper is None else ROLES[1] if fitted else ROLES[2] if number.draw else ROLES[0]
     return {
-        "label": number.label, "quantity": number.quantity, "units": number.units, "role": role, "fitted_by": fitted,
-        "paper": number.paper, "naive": number.naive, "median": middle, "p5": low, "p95": high,
+        "label": number.label,
+        "quantity": number.quantity,
+        "units": number.units,
+        "role": role,
+        "fitted_by": fitted,
+        "paper": number.paper,
+        "naive": number.naive,
+        "median": middle,
+        "p5": low,
+        "p95": high,
         "failed": len(values) - len(finite),
-    }  # fmt: skip
+    }
 
 
 def is_within(row: Mapping[str, Any], factor: float = FACTORS[0], which: str = "median") -> bool:

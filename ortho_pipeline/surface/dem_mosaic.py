@@ -40,7 +40,7 @@ _OFF_GRID, _SAME_STEP = 0.01, 1e-6
 _MOST_BETWEEN = 12
 #: Samples of an arc that says to be the whole circle.
 _CIRCLE = 360.0
-_WARP = "make one grid of them (gdalwarp in1.tif in2.tif out.tif), or leave out what does not belong"
+_WARP = "resample them to one grid (gdalwarp in1.tif in2.tif out.tif), or leave out the files that do not belong"
 
 
 class Samples(Protocol):
@@ -56,7 +56,7 @@ class Samples(Protocol):
 
     @property
     def unit(self) -> str:
-        """The unit of the heights, as the file calls it; empty where it says nothing."""
+        """The unit of the heights as the file states it; empty if it states none."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ class Samples(Protocol):
 
 
 def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
-    """Return the files that a pattern such as ``folder/*.tif`` stands for, by name; None where it is no pattern.
+    """Return the files that match a pattern such as ``folder/*.tif``, by name; None if it is not a pattern.
 
     Raises
     ------
@@ -88,9 +88,11 @@ def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
     found = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
     if not 0 < len(found) <= _MOST_FILES:
         raise InputError(
-            f"{counted(len(found), 'file')} of this pattern", file=text, field="surface.dem",
+            f"{counted(len(found), 'file')} of this pattern",
+            file=text,
+            field="surface.dem",
             remedy="give a DEM, or a pattern of the files that make one",
-        )  # fmt: skip
+        )
     return found
 
 
@@ -108,7 +110,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Layer:
+class ResolutionLayer:
     """Parts of one spacing.
 
     Parameters
@@ -152,7 +154,7 @@ class DemMosaic:
     crs: pyproj.CRS
     grid: SampleGrid
     unit: str
-    layers: tuple[Layer, ...]
+    layers: tuple[ResolutionLayer, ...]
     _local: threading.local = field(default_factory=threading.local, init=False, repr=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -193,7 +195,7 @@ class DemMosaic:
             out = np.where(np.isnan(found), out, found)
         return out
 
-    def _lay(self, layer: Layer, out: Array, left: int, top: int, metres_per_unit: float) -> None:
+    def _lay(self, layer: ResolutionLayer, out: Array, left: int, top: int, metres_per_unit: float) -> None:
         """Write the heights of a layer over `out`, whose first sample is the column `left` and the row `top` of it."""
         height, width = out.shape
         for part, column in layer.within(left, top, width, height):
@@ -261,10 +263,12 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
         _refuse_other_system(first, crs, grid, other, its_crs, its_grid)
         if (its_crs is not crs and _datum(its_crs) != _datum(crs)) or its_unit != unit:
             raise DatumError(
-                f"this file has {_said(its_crs, its_unit)}, and {first.path} has {_said(crs, unit)}: they are not one "
-                "DEM", file=other.path, field="height datum",
+                f"this file has {_said(its_crs, its_unit)}, but {first.path} has {_said(crs, unit)}: they are not one "
+                "DEM",
+                file=other.path,
+                field="height datum",
                 remedy="leave one of the two out, or bring them to one datum and unit (gdalwarp -t_srs)",
-            )  # fmt: skip
+            )
     layers: dict[float, list[tuple[Samples, SampleGrid]]] = {}
     for samples, _, own, _ in placed:
         steps = [step for step in layers if abs(own.crs_from_pixel[1] / step - 1) < _SAME_STEP]
@@ -280,15 +284,19 @@ def _refuse_other_system(
 ) -> None:
     if its_grid.crs is not grid.crs and not its_grid.crs.equals(grid.crs):
         raise CrsError(
-            f"this file is in {its_crs.name!r}, and {first.path} in {crs.name!r}", file=other.path, field="CRS",
+            f"this file is in {its_crs.name!r}, but {first.path} is in {crs.name!r}",
+            file=other.path,
+            field="CRS",
             remedy=_WARP,
-        )  # fmt: skip
+        )
     (_, a, b, _, c, d), (_, own_a, own_b, _, own_c, own_d) = grid.crs_from_pixel, its_grid.crs_from_pixel
     if b or c or own_b or own_c or abs(own_d / d - 1) > 1e-6 or own_a * a < 0:
         raise CrsError(
-            f"the rows of this file do not have the direction and spacing of those of {first.path}", file=other.path,
-            field="geotransform", remedy=_WARP,
-        )  # fmt: skip
+            f"the rows of this file differ in direction or spacing from those of {first.path}",
+            file=other.path,
+            field="geotransform",
+            remedy=_WARP,
+        )
 
 
 def _datum(crs: pyproj.CRS) -> tuple[object, object] | None:
@@ -298,7 +306,7 @@ def _datum(crs: pyproj.CRS) -> tuple[object, object] | None:
 
 def _said(crs: pyproj.CRS, unit: str) -> str:
     declared: DeclaredVertical | None = declared_vertical(crs)
-    return f"heights in {declared.name if declared else 'a datum that it does not say'!r} ({unit or 'no unit'})"
+    return f"heights in {declared.name if declared else 'no stated datum'!r} ({unit or 'no unit'})"
 
 
 def _west(members: Sequence[tuple[Samples, SampleGrid]]) -> float:
@@ -324,9 +332,11 @@ def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) ->
             return count
     one, other = members[-1][0][0], members[0][0][0]
     raise CrsError(
-        f"there are no common columns for the samples of this file and those of {other.path}", file=one.path,
-        field="geotransform", remedy=_WARP,
-    )  # fmt: skip
+        f"the columns of this file do not match those of {other.path}",
+        file=one.path,
+        field="geotransform",
+        remedy=_WARP,
+    )
 
 
 def _whole_grid(name: str, grids: Sequence[SampleGrid], between: int) -> SampleGrid:
@@ -351,7 +361,7 @@ def _whole_grid(name: str, grids: Sequence[SampleGrid], between: int) -> SampleG
     return replace(grids[0], shape=(bottom, columns), crs_from_pixel=(x, dx, 0.0, y, 0.0, dy))
 
 
-def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> Layer:
+def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> ResolutionLayer:
     """Return parts of one spacing as a layer of the whole."""
     x, dx, _, y, _, dy = whole.crs_from_pixel
     step = members[0][1].crs_from_pixel[1]
@@ -362,10 +372,12 @@ def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> 
         column, row = (grid.crs_from_pixel[0] - first) / width, (grid.crs_from_pixel[3] - y) / dy
         if max(abs(column - round(column)), abs(row - round(row))) > _OFF_GRID:
             raise CrsError(
-                "this file lies between the samples of the others", file=samples.path, field="geotransform",
+                "the samples of this file are not on the grid of the other files",
+                file=samples.path,
+                field="geotransform",
                 remedy=_WARP,
-            )  # fmt: skip
+            )
         parts.append(Part(samples, round(column), round(row), grid.shape))
     circle = round(_CIRCLE / abs(step)) if whole.crs.is_geographic else 0
     closed = whole.crs.is_geographic and abs(whole.shape[1] * dx) > _CIRCLE - 1e-9
-    return Layer(tuple(parts), round((first - x) / dx), round(step / dx), circle, closed)
+    return ResolutionLayer(tuple(parts), round((first - x) / dx), round(step / dx), circle, closed)

@@ -23,11 +23,11 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter, classes_profile
 from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
-from ortho_pipeline.warp.layers.accuracy import layer_grid, overviews, tiles
-from ortho_pipeline.warp.layers.hiding import of_classes
-from ortho_pipeline.warp.layers.sight import Sight
-from ortho_pipeline.warp.layers.visibility import Visibility
-from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+from ortho_pipeline.warp.quality.accuracy import layer_grid, overviews, tiles
+from ortho_pipeline.warp.quality.hiding import of_classes
+from ortho_pipeline.warp.quality.sight import Sight
+from ortho_pipeline.warp.quality.visibility import Visibility
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Classes of the mask of shadows, by their values; 0 stands for nothing.
 LIT, SHADED, WITHOUT = 1, 2, 4
@@ -52,9 +52,10 @@ class Sun:
     def __post_init__(self) -> None:
         if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
             raise InputError(
-                f"the sun does not stand at an azimuth of {self.azimuth_deg:g} and {self.elevation_deg:g} degrees over "
-                "the horizon", field="output.sun", remedy="give degrees from north and over the horizon, above 0",
-            )  # fmt: skip
+                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} degrees are no position of the sun",
+                field="output.sun",
+                remedy="give the azimuth from north and an elevation above 0, in degrees",
+            )
 
     @property
     def way(self) -> Array:
@@ -104,9 +105,15 @@ def write_angles(
     grid = layer_grid(sight.grid, step)
     own, names = sight.on(grid), ["view_zenith", "view_azimuth", *(["sun_incidence"] if sun else [])]
     profile = Profile(
-        count=len(names), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=tuple(names),
-        interpretations=(0,) * len(names), scales=((1.0, 0.0, "degree"),) * len(names), metadata=_metadata(sun),
-    )  # fmt: skip
+        count=len(names),
+        dtype=np.dtype(np.float32),
+        validity="nodata",
+        nodata=math.nan,
+        descriptions=tuple(names),
+        interpretations=(0,) * len(names),
+        scales=((1.0, 0.0, "degree"),) * len(names),
+        metadata=_metadata(sun),
+    )
     low, high = math.inf, -math.inf
     options = {"LEVEL": "1", **overviews(grid)}
     threads = (resources or Resources()).threads or 1
@@ -126,9 +133,13 @@ def _metadata(sun: Sun | None) -> Mapping[str, str]:
 
 
 def _angles(
-    sight: Sight, surface: Surface, size: tuple[int, int], heights: tuple[float, float],
-    window: tuple[int, int, int, int], sun: Sun | None,
-) -> Array:  # fmt: skip
+    sight: Sight,
+    surface: Surface,
+    size: tuple[int, int],
+    heights: tuple[float, float],
+    window: tuple[int, int, int, int],
+    sun: Sun | None,
+) -> Array:
     """Return the bands ``(n, height, width)`` of a window (left, top, width, height) of a layer."""
     left, top, width, height = window
     columns, rows = np.meshgrid(left + 0.5 + np.arange(width), top + 0.5 + np.arange(height))

@@ -35,13 +35,21 @@ _VRT_NAMES = frozenset(
 )
 #: Parts of a VRT that hold text only, whatever is in them.
 _VRT_TEXTS = frozenset(
-    {"srs", "metadata", "gcplist", "histograms", "gdalrasterattributetable", "colortable", "categorynames",
-     "description"}
-)  # fmt: skip
+    {
+        "srs",
+        "metadata",
+        "gcplist",
+        "histograms",
+        "gdalrasterattributetable",
+        "colortable",
+        "categorynames",
+        "description",
+    }
+)
 #: What holds the text of a coordinate system in VRTs, side-cars of GDAL and of Esri, and DIMAP, in lower case.
 _CRS_NAMES = frozenset({"srs", "projection", "wkt", "horizontal_cs_code", "horizontal_cs_name"})
 _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
-PLAIN_VRT = "make a file of it first (gdal_translate in.vrt out.tif)"
+PLAIN_VRT = "convert it to a file first (gdal_translate in.vrt out.tif)"
 
 
 @dataclass(frozen=True)
@@ -57,10 +65,10 @@ class Named:
 def _header(path: Any, limit: int = _MAX_HEADER) -> str:
     """Return a header as C reads it: up to the first NUL."""
     if not path.is_file():
-        raise InputError("this is not a file", file=path, remedy="put a file there, or take it away")
+        raise InputError("this is not a file", file=path, remedy="put a file there, or remove it")
     if path.stat().st_size > limit:
         raise InputError(
-            "a header of more than 5 MB is not opened", file=path, remedy="make one file of it (gdal_translate)"
+            "the header is larger than 5 MB", file=path, remedy="convert it to one file (gdal_translate in out.tif)"
         )
     data = path.read_bytes().partition(b"\0")[0]
     try:
@@ -106,9 +114,11 @@ def _names_of_vrt(path: Any) -> Iterator[Named]:
             values = [text.lower() for text in _value(child)]
             if name not in _VRT_NAMES or (name == "subclass" and not _VRT_CLASSES.issuperset(values)):
                 raise InputError(
-                    f"only plain VRTs are opened, and {child[1]} {' '.join(values)[:40]} is none", file=path,
-                    field=child[1][:80], remedy=PLAIN_VRT,
-                )  # fmt: skip
+                    f"only plain VRTs are opened; {child[1]} {' '.join(values)[:40]} is not allowed",
+                    file=path,
+                    field=child[1][:80],
+                    remedy=PLAIN_VRT,
+                )
             if name == "sourcefilename":
                 yield _source(child, path, band)
             kinds = [text.lower() for part, one in _parts(child) if part == "subclass" for text in _value(one)]
@@ -120,7 +130,9 @@ def _source(node: Any, path: Any, band: str) -> Named:
     texts = _value(node)
     relative = [text.strip() for name, one in _parts(node) if name == "relativetovrt" for text in _value(one)]
     if len(texts) != 1 or len(relative) > 1 or not set(relative) <= {"0", "1"}:
-        raise InputError("a source of this VRT has no plain name", file=path, field="SourceFilename", remedy=PLAIN_VRT)
+        raise InputError(
+            "a source of this VRT has no plain file name", file=path, field="SourceFilename", remedy=PLAIN_VRT
+        )
     return Named(texts[0], "SourceFilename", relative=relative == ["1"], raw=band == "raw")
 
 
@@ -165,14 +177,19 @@ def products_of_volume(path: Any) -> list[str]:
     if document is None or _inner(document, "raster_data"):
         return []
     components = [
-        part for content in _inner(document, "dataset_content") for parts in _inner(content, "dataset_components")
+        part
+        for content in _inner(document, "dataset_content")
+        for parts in _inner(content, "dataset_components")
         for part in _inner(parts, "component")
-    ]  # fmt: skip
+    ]
     return [
         text.strip()
-        for part in components if any("DIMAP" in _value(kind) for kind in _inner(part, "component_type"))
-        for place in _inner(part, "component_path") for href in _inner(place, "href") for text in _value(href)
-    ]  # fmt: skip
+        for part in components
+        if any("DIMAP" in _value(kind) for kind in _inner(part, "component_type"))
+        for place in _inner(part, "component_path")
+        for href in _inner(place, "href")
+        for text in _value(href)
+    ]
 
 
 def _inner(node: Any, name: str) -> list[Any]:
@@ -201,14 +218,16 @@ def _names_of_isis3(path: Any) -> Iterator[Named]:
     data = _beginning(path, _MAX_HEADER)
     end = re.search(rb"\r?\n(END|End)\r?\n", data + (b"\n" if len(data) < _MAX_HEADER else b""))
     if end is None and len(data) >= _MAX_HEADER:
-        raise InputError("a label of more than 5 MB is not opened", file=path, remedy="make a GeoTIFF of it")
+        raise InputError(
+            "the label is larger than 5 MB", file=path, remedy="convert it to GeoTIFF (gdal_translate in out.tif)"
+        )
     text = data.decode("latin-1")
     raw = "geotiff" not in text.lower()
     for match in re.finditer(r"\^core", text, re.IGNORECASE):
         named = re.compile(r"""\s*=\s*("[^"'\r\n]*"|(?!/\*)[^"'\s(#]+)\s""").match(text + "\n", match.end())
         if named is None:
             raise InputError(
-                "^Core has no plain value", file=path, field="^Core", remedy="make a GeoTIFF of it (gdal_translate)"
+                "^Core has no plain value", file=path, field="^Core", remedy="convert it to GeoTIFF (gdal_translate)"
             )
         yield Named(named[1].strip('"'), "^Core", raw=raw)
 
@@ -226,9 +245,11 @@ def _names_of_pcidsk(path: Any) -> Iterator[Named]:
     names = [images[k + 64 : k + 128].strip(b" \0") for k in range(0, len(images), 1024)]
     if len(images) < 1024 * count or any(name and not name.startswith(b"/SIS=") for name in names):
         raise InputError(
-            "the channels of this PCIDSK file lie in other files", file=path, field="IHi.2",
-            remedy="make one file of it (gdal_translate in.pix out.tif)",
-        )  # fmt: skip
+            "the channels of this PCIDSK file are in other files",
+            file=path,
+            field="IHi.2",
+            remedy="convert it to one file (gdal_translate in.pix out.tif)",
+        )
     yield from ()
 
 
@@ -246,6 +267,10 @@ def _beginning(path: Any, size: int) -> bytes:
 
 
 NAMES_OF: dict[str, Any] = {
-    "VRT": _names_of_vrt, "DIMAP": _names_of_dimap, "ERS": _names_of_ers, "ISIS3": _names_of_isis3,
-    "PCIDSK": _names_of_pcidsk, "TIL": _names_of_til,
-}  # fmt: skip
+    "VRT": _names_of_vrt,
+    "DIMAP": _names_of_dimap,
+    "ERS": _names_of_ers,
+    "ISIS3": _names_of_isis3,
+    "PCIDSK": _names_of_pcidsk,
+    "TIL": _names_of_til,
+}

@@ -22,8 +22,8 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.base import Surface, Window
 from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.rays import levels, polynomials
-from ortho_pipeline.warp.layers import visibility_kernel as kernel
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality import visibility_kernel as kernel
+from ortho_pipeline.warp.quality.sight import Sight
 
 #: Pixels between nodes: of places in the DEM, and of directions.
 NEAR, FAR = 128, 256
@@ -121,9 +121,14 @@ class Visibility:
         directions = np.nan_to_num(polynomials(slopes.reshape(_LEVELS, count, 2).swapaxes(0, 1)))
         square = float(np.nanmax(tangents**2)) if np.isfinite(tangents).any() else 0.0
         return kernel.Rays(
-            samples, NEAR, directions.reshape(*shape, _LEVELS, 2), FAR, self._middle, self._half,
+            samples,
+            NEAR,
+            directions.reshape(*shape, _LEVELS, 2),
+            FAR,
+            self._middle,
+            self._half,
             square / (2 * _EARTH),
-        )  # fmt: skip
+        )
 
     @staticmethod
     def _nodes(left: int, top: int, width: int, height: int, spacing: int) -> tuple[Array, Array]:

@@ -11,7 +11,6 @@ What GDAL alone can tell (`GetFileList`, overviews in metadata) is asked of the 
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import re
@@ -24,43 +23,32 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, network_is_closed, place, within
+from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, place, within
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options.texts import Setting, Text
-from ortho_pipeline.raster.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
+from ortho_pipeline.raster.opening.drivers import (
+    DRIVERS,
+    PLAIN,
+    REFERRING,
+    driver_for,
+    identified,
+    remove_network_drivers,
+    require_driver,
+)
+from ortho_pipeline.raster.opening.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
 from ortho_pipeline.stores.beside import ask_beside
 
 gdal.UseExceptions()
 
-#: Raster drivers that only read pixels out of the file they are given (and its side-cars).
-_PLAIN = (
-    "GTiff", "COG", "NITF", "JP2OpenJPEG", "JP2KAK", "JPEG", "PNG", "HFA", "ENVI", "PCRaster", "DTED",
-    "SRTMHGT", "AAIGrid", "GTX", "NTv2", "EHdr", "BMP", "USGSDEM", "SGI", "BYN", "MEM",
-)  # fmt: skip
-#: Drivers whose headers name other files: each is used for a file whose names have been seen.
-_REFERRING = ("VRT", "DIMAP", "ERS", "ISIS3", "PCIDSK", "TIL")
-DRIVERS = _PLAIN + _REFERRING
-#: Raster drivers that send requests; a process of the command line does without them.
-_FETCHING = (
-    "WMS", "WMTS", "WCS", "HTTP", "OGCAPI", "PLMOSAIC", "PLSCENES", "STACTA", "STACIT", "EEDAI", "DAAS", "NGW", "MRF",
-    "PostGISRaster", "GeoRaster", "Rasterlite", "RASDAMAN", "TileDB", "GTI", "Zarr", "netCDF", "JPIPKAK", "DODS",
-)  # fmt: skip
 #: Side-cars that GDAL opens as rasters, by their ending after the whole name of an image or after its stem.
 _RASTER_SIDE_CAR = re.compile(r"\.(ovr|msk|aux|rrd|r[0-9])$")
 #: Side-cars that say in which coordinate system a raster is.
 _CRS_SIDE_CARS = (".aux.xml", ".prj", ".hdr")
 #: Side-cars with text that GDAL reads while it opens an image.
 _TEXT_SIDE_CAR = re.compile(r"\.(rpb|imd|eph|att|geo|tab|wld|\w{1,3}w)|[_.]?rpc\.(txt|xml)|_metadata\.txt")
-#: Formats that a GDAL may have been built without, by the beginning of a file: wheels have fewer drivers.
-_BEGINNINGS = {
-    b"NITF": "NITF", b"EHFA_HEADER_TAG": "HFA", b"\x00\x00\x00\x0cjP": "JP2OpenJPEG", b"UHL1": "DTED",
-    b"ncols": "AAIGrid",
-}  # fmt: skip
-_ENDINGS = {".til": "TIL", ".hgt": "SRTMHGT", ".ers": "ERS", ".pix": "PCIDSK"}
-_BEGINNING = 4096
 _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
-_OUTSIDE = ", put the files into one folder, or make one file of them (gdal_translate in out.tif)"
+_OUTSIDE = ", put the files into one folder, or convert them to one file (gdal_translate in out.tif)"
 
 
 def open_seen(
@@ -75,8 +63,7 @@ def open_seen(
     drivers : sequence of str
         Those of `DRIVERS` that may read it.
     siblings : bool
-        Whether GDAL may look at side-car files.
-
+        Whether GDAL may read sidecar files.
     Returns
     -------
     gdal.Dataset, DecodedUnit
@@ -89,21 +76,12 @@ def open_seen(
     RuntimeError
         If GDAL cannot open the file.
     """
-    _without_fetching_drivers()
+    remove_network_drivers()
     if siblings:
         ask_beside(path, allow_network=True)
     gate = _Gate(path, roots)
     dataset = gate.open(path, drivers, siblings)
     return dataset, gate.block
-
-
-@functools.cache
-def _without_fetching_drivers() -> None:
-    if network_is_closed():
-        for name in _FETCHING:
-            driver = gdal.GetDriverByName(name)
-            if driver is not None:
-                driver.Deregister()
 
 
 @dataclass(frozen=True)
@@ -136,22 +114,22 @@ class _Gate:
             self._see_folder(there)
             allowed = ["DIMAP"]
             product = self._product_in(there)
-            _require_driver("DIMAP", there)
+            require_driver("DIMAP", there)
             if product is not None:
                 name = os.fspath(product)
                 self._see_named(product, "DIMAP", frozenset())
         else:
             self._see_texts_beside(there)
-            kind = _identified(name, drivers)
-            if kind is None and not isinstance(there, VsiPath) and (format := _format_of(there)) is not None:
-                _require_driver(format, there)
-            if kind in _REFERRING:
+            kind = identified(name, drivers)
+            if kind is None and not isinstance(there, VsiPath) and (format := driver_for(there)) is not None:
+                require_driver(format, there)
+            if kind in REFERRING:
                 self._see_named(there, kind, frozenset())
             if kind == "DIMAP" and (product := self._product_of(there)) is not None:
                 there, name = product, os.fspath(product)
             if siblings:
                 self._see_side_cars(there)
-            allowed = [kind] if kind in _REFERRING else [one for one in drivers if one in _PLAIN]
+            allowed = [kind] if kind in REFERRING else [one for one in drivers if one in PLAIN]
         options: dict[str, Any] = {} if siblings else {"sibling_files": [name.rpartition("/")[2]]}
         dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=allowed, **options)
         self._see_open(dataset, there)
@@ -163,34 +141,38 @@ class _Gate:
         """See to a raster that another file leads to: GDAL opens it with any driver, lazily or at once."""
         key = str(path.resolve())
         if key in chain:
-            raise InputError("this VRT is a source of itself", file=path, remedy="take one of the two out of the other")
+            raise InputError("this VRT refers to itself", file=path, remedy="remove the circular reference")
         if key in self._seen:
             return
         self._seen.add(key)
         if len(self._seen) > _MANY:
-            raise InputError(f"this leads to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
+            raise InputError(f"this raster refers to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
         name = str(path)
         self._see_texts_beside(path)
-        kind = _identified(name, DRIVERS)
-        first = None if kind is None else _identified(name, None)
+        kind = identified(name, DRIVERS)
+        first = None if kind is None else identified(name, None)
         if kind is None or first not in DRIVERS or (kind == "VRT" and isinstance(path, VsiPath)):
             raise InputError(
-                f"{path.name!r} is not a raster of an allowed format, and GDAL would open it "
-                f"({first or kind or 'by whatever driver takes it'})",
-                file=by, field=field, remedy="take it away, or make a GeoTIFF of it (gdal_translate)",
-            )  # fmt: skip
-        if kind in _REFERRING:
+                f"{path.name!r} is not a raster of an allowed format, but GDAL would open it "
+                f"({first or kind or 'with another driver'})",
+                file=by,
+                field=field,
+                remedy="remove it, or convert it to GeoTIFF (gdal_translate in out.tif)",
+            )
+        if kind in REFERRING:
             self._see_named(path, kind, chain | {key})
         self._see_side_cars(path)
-        allowed = [kind] if kind in _REFERRING else list(_PLAIN)
+        allowed = [kind] if kind in REFERRING else list(PLAIN)
         try:
             dataset = gdal.OpenEx(name, gdal.OF_RASTER | gdal.OF_READONLY, allowed_drivers=allowed)
         except (RuntimeError, UnicodeDecodeError) as error:
             # GDAL would go on with its other drivers.
             raise InputError(
                 f"{path.name!r} cannot be opened ({str(error).strip().partition(chr(10))[0]})",
-                file=by, field=field, remedy="the file is damaged: copy it again, or take it away",
-            ) from error  # fmt: skip
+                file=by,
+                field=field,
+                remedy="the file is damaged: copy it again, or remove it",
+            ) from error
         self._see_open(dataset, path)
 
     def _see_folder(self, folder: Any) -> None:
@@ -209,9 +191,10 @@ class _Gate:
         found = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
         if len(found) > 1:
             raise InputError(
-                f"this folder has several products: {', '.join(sorted(found)[:6])}", file=folder,
-                remedy="name the DIM_*.XML of one of them, or an image",
-            )  # fmt: skip
+                f"this folder has several products: {', '.join(sorted(found)[:6])}",
+                file=folder,
+                remedy="give the DIM_*.XML of one of them, or an image",
+            )
         return folder / found[0] if found == names and found else None
 
     def _product_of(self, volume: Any) -> Any:
@@ -222,19 +205,23 @@ class _Gate:
         ]
         if len(places) > 1:
             raise InputError(
-                f"this volume has several products: {', '.join(str(place) for place in places[:6])}", file=volume,
-                field="Dataset_Components", remedy="name one of them",
-            )  # fmt: skip
+                f"this volume has several products: {', '.join(str(place) for place in places[:6])}",
+                file=volume,
+                field="Dataset_Components",
+                remedy="give one of them",
+            )
         if places and isinstance(places[0], str):
             raise InputError(
-                f"its product {places[0]!r} is not there", file=volume, field="COMPONENT_PATH",
-                remedy="copy the delivery with its folders, or name an image",
-            )  # fmt: skip
+                f"its product {places[0]!r} is missing",
+                file=volume,
+                field="COMPONENT_PATH",
+                remedy="copy the delivery with its folders, or give an image",
+            )
         return places[0] if places else None
 
     def _see_texts_beside(self, path: Any) -> None:
-        """See to the texts in side-cars: some drivers read them, and ask PROJ for their CRS, to identify a file."""
-        for other in self._beside(path):
+        """Check the texts in sidecars: some drivers read them and pass their CRS to PROJ to identify a file."""
+        for other in _beside(path):
             rest = other.lower()
             for start in (path.name.lower(), path.stem.lower()):
                 rest = rest.removeprefix(start)
@@ -249,7 +236,7 @@ class _Gate:
     def _see_side_cars(self, path: Any) -> None:
         """See to what GDAL takes up as overviews and masks because of its name."""
         name, stem = path.name.lower(), path.stem.lower()
-        for other in self._beside(path):
+        for other in _beside(path):
             lower = other.lower()
             if lower == name:
                 continue
@@ -257,11 +244,13 @@ class _Gate:
             if _RASTER_SIDE_CAR.fullmatch(rest):
                 side_car = path.parent / other
                 self._must_be_inside(side_car, path, other)
-                if _identified(str(side_car), None) not in _PLAIN:
+                if identified(str(side_car), None) not in PLAIN:
                     raise InputError(
-                        f"the side-car {other!r} is not a plain raster", file=path, field=other,
-                        remedy="take it away; gdaladdo makes new overviews",
-                    )  # fmt: skip
+                        f"the sidecar file {other!r} is not a plain raster",
+                        file=path,
+                        field=other,
+                        remedy="remove it; gdaladdo makes new overviews",
+                    )
                 # Overviews of an HFA file in .rrd are read by that driver alone, and are not rasters of their own.
                 if rest != ".rrd":
                     self._see(side_car, path, other, frozenset())
@@ -279,7 +268,7 @@ class _Gate:
                     self._see(target, path, named.field, chain)
 
     def _targets(self, named: Named, by: Any) -> Iterator[Any]:
-        """Yield the places that a name may stand for, all of them inside."""
+        """Yield the paths that a name may mean, all of them inside the allowed folders."""
         # With and without what some drivers strip or turn.
         for name in {named.name, named.name.strip(), named.name.strip().replace("\\", "/")}:
             if not name or name.startswith("/vsi") or re.search(r"[<>{}:\x00-\x1f]", name.strip()):
@@ -309,30 +298,24 @@ class _Gate:
         except OSError as error:
             # Longer than a file system takes, or in a folder that may not be read.
             raise InputError(
-                f"{(name or path.name)[:80]!r} cannot be a file here ({error.strerror})", file=by, field=field,
-                remedy="correct the name, or take it away",
-            ) from error  # fmt: skip
+                f"{(name or path.name)[:80]!r} is not a usable file name ({error.strerror})",
+                file=by,
+                field=field,
+                remedy="correct the name, or remove it",
+            ) from error
         if not plain:
             raise InputError(
-                f"{name or path.name!r} is not a file", file=by, field=field, remedy="put a file there, or take it away"
+                f"{name or path.name!r} is not a file", file=by, field=field, remedy="put a file there, or remove it"
             )
 
     def _outside(self, name: str, by: Any, field: str, path: Path | None) -> None:
         root = "DIR" if path is None else os.path.commonpath([path.parent, Path(by).resolve().parent])
         raise InputError(
-            f"this file reads {name[:200]!r}, which is outside of its own folder",
-            file=by, field=field,
-            remedy=Text("name a folder that holds both with ", Setting("scene.roots", root), _OUTSIDE),
-        )  # fmt: skip
-
-    @staticmethod
-    def _beside(path: Any) -> list[str]:
-        """Return the names beside a file that begin as its own; behind a URL, those of the side-cars that are there."""
-        folder = path.parent
-        if isinstance(folder, VsiPath) and not (Location(str(folder)).in_archive and folder.is_dir()):
-            names = (path.name + ending for ending in (".ovr", ".msk", ".aux", ".aux.xml"))
-            return [name for name in names if (folder / name).exists()]
-        return listing(folder).beginning(path.stem)
+            f"this file refers to {name[:200]!r}, which is outside its own folder",
+            file=by,
+            field=field,
+            remedy=Text("allow a folder that contains both with ", Setting("scene.roots", root), _OUTSIDE),
+        )
 
     # -- what GDAL tells ---------------------------------------------------------------------------------------------
 
@@ -348,16 +331,26 @@ class _Gate:
         transform = dataset.GetGeoTransform(can_return_null=True)
         if transform is not None and not all(map(math.isfinite, transform)):
             raise InputError(
-                "the geotransform of this raster is not finite", file=path, field="geotransform",
-                remedy="set the true one with gdal_edit.py -a_ullr",
-            )  # fmt: skip
+                "the geotransform of this raster is not finite",
+                file=path,
+                field="geotransform",
+                remedy="set the right one with gdal_edit.py -a_ullr",
+            )
         kind = dataset.GetDriver().ShortName
         for name in _listed(dataset):
             file = place(name)
-            if str(file) == str(path):
-                continue
-            self._must_be_inside(file, path, kind, name)
+            if str(file) != str(path):
+                self._must_be_inside(file, path, kind, name)
         self.block = max(self.block, DecodedUnit(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+
+
+def _beside(path: Any) -> list[str]:
+    """Return the names beside a file that begin as its own; behind a URL, those of the side-cars that are there."""
+    folder = path.parent
+    if isinstance(folder, VsiPath) and not (Location(str(folder)).in_archive and folder.is_dir()):
+        names = (path.name + ending for ending in (".ovr", ".msk", ".aux", ".aux.xml"))
+        return [name for name in names if (folder / name).exists()]
+    return listing(folder).beginning(path.stem)
 
 
 def _see_crs(texts: Iterable[str], path: Any) -> None:
@@ -402,7 +395,7 @@ def _listed(dataset: gdal.Dataset) -> list[str]:
     try:
         return list(dataset.GetFileList() or [])
     except RuntimeError:
-        # Of a side-car that it cannot read GDAL complains once; who needs what stands in it is told by its reader.
+        # GDAL reports a sidecar that it cannot read once; the reader of its content reports it again.
         return list(dataset.GetFileList() or [])
 
 
@@ -410,39 +403,3 @@ def _is_below(path: VsiPath, folder: AnyPath) -> bool:
     """Tell whether a path lies in a folder by its text, in which dots lead nowhere."""
     rest = str(path).removeprefix(f"{os.fspath(folder)}/")
     return rest != str(path) and not {"", ".", ".."} & set(rest.split("/"))
-
-
-def _format_of(path: Path) -> str | None:
-    """Return the driver that a file needs by its name or beginning, None where these tell nothing."""
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(_BEGINNING)
-    except OSError:
-        return None
-    if b"<Dimap_Document" in beginning:
-        return "DIMAP"
-    known = (driver for start, driver in _BEGINNINGS.items() if beginning.startswith(start))
-    return next(known, _ENDINGS.get(path.suffix.lower()))
-
-
-def _require_driver(name: str, file: Any) -> None:
-    """Raise an `InputError` if this GDAL was built without a driver."""
-    if gdal.GetDriverByName(name) is None:
-        raise InputError(
-            f"this is for GDAL's driver {name}, and this GDAL ({gdal.__version__}) was built without it", file=file,
-            remedy="take a GDAL that has it (that of Debian and Ubuntu has), or name a GeoTIFF: one image of a "
-            "product, or what gdal_translate makes elsewhere",
-        )  # fmt: skip
-
-
-def _identified(name: str, drivers: Sequence[str] | None) -> str | None:
-    """Return the driver that takes a file first, among some or among all; GDAL reads its beginning only."""
-    allowed = {} if drivers is None else {"allowed_drivers": list(drivers)}
-    try:
-        driver = gdal.IdentifyDriverEx(name, gdal.OF_RASTER, **allowed)
-    except (RuntimeError, UnicodeDecodeError):
-        return None
-    return None if driver is None else str(driver.ShortName)
-
-
-# -- headers -----------------------------------------------------------------------------------------------------------

@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numba
 from numba.core.caching import FunctionCache, NullCache
 
-from ortho_pipeline.runtime.kernels import places
-from ortho_pipeline.runtime.kernels.marked import Marked
+from ortho_pipeline.runtime.compilation import places
+from ortho_pipeline.runtime.compilation.marked import Marked
 
 log = logging.getLogger(__name__)
 
@@ -75,8 +75,12 @@ class _Place:
         return _sources(self._function.__module__)
 
     def get_disambiguator(self) -> str:
-        """Return what tells the kernel from those of the same name in other modules."""
-        return hashlib.sha256(os.fsencode(os.path.abspath(self._path))).hexdigest()[:16]
+        """Return what tells the kernel from those of the same name in other modules, and in other versions.
+
+        An index names the types of arguments: that of a version with other types could not be read.
+        """
+        place = os.fsencode(os.path.abspath(self._path))
+        return hashlib.sha256(place + self.get_source_stamp().encode()).hexdigest()[:16]
 
 
 class _Kept(NullCache):
@@ -115,7 +119,8 @@ def _sources(module: str) -> str:
 @functools.cache
 def _say_once() -> None:
     log.warning(
-        "Compiled kernels are not kept, because %s. Every run compiles them again, for some seconds. "
+        "Compiled kernels are not cached, because %s. Every run compiles them again, for some seconds. "
         "Remedy: set %s to a folder of your own to which nobody else can write",
-        places.own()[1], places.FOLDER,
-    )  # fmt: skip
+        places.own()[1],
+        places.FOLDER,
+    )

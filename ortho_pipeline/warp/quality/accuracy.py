@@ -36,10 +36,10 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp.block_kernel import DemWindow
-from ortho_pipeline.warp.layers import accuracy_kernel
-from ortho_pipeline.warp.layers.accuracy_kernel import Heights, Nodes
-from ortho_pipeline.warp.layers.error_ellipse import circular_error, circular_error_of_all, radii
-from ortho_pipeline.warp.layers.sight import Sight
+from ortho_pipeline.warp.quality import accuracy_kernel
+from ortho_pipeline.warp.quality.accuracy_kernel import Heights, Nodes
+from ortho_pipeline.warp.quality.error_ellipse import circular_error, circular_error_of_all, radii
+from ortho_pipeline.warp.quality.sight import Sight
 
 #: Bands of the layer.
 BANDS = ("sigma_e", "sigma_n", "rho", "ce90")
@@ -70,13 +70,13 @@ class Budget:
     covariance : (P, P), optional
         Of the model's parameters.
     stated : float, optional
-        Standard deviation (m, per axis) of a model that nobody adjusted, as its vendor states it.
+        Standard deviation (m, per axis) of a model that was not adjusted, as its vendor states it.
     heights : float or Surface, optional
         Standard deviation (m) of the heights; as a surface it has them for "heights".
     datum : float
         Standard deviation (m) of the datum of the heights.
     reference : float
-        Standard deviation (m, per axis) of what all points have in common, beside what the covariance has of it.
+        Standard deviation (m, per axis) of the error common to all points, in addition to the covariance's part.
     interpolation_px : float
         Bound on the warp's error (px).
     """
@@ -240,10 +240,15 @@ def write_accuracy(
     grid = layer_grid(sight.grid, step)
     layer = _Layer(budget, sight.on(grid), surface, size, heights, resources.memory // 8)
     profile = Profile(
-        count=len(BANDS), dtype=np.dtype(np.float32), validity="nodata", nodata=math.nan, descriptions=BANDS,
-        interpretations=(0,) * len(BANDS), metadata=dict(metadata or {}),
+        count=len(BANDS),
+        dtype=np.dtype(np.float32),
+        validity="nodata",
+        nodata=math.nan,
+        descriptions=BANDS,
+        interpretations=(0,) * len(BANDS),
+        metadata=dict(metadata or {}),
         scales=tuple((1.0, 0.0, unit) for unit in ("m", "m", "", "m")),
-    )  # fmt: skip
+    )
     # Little is gained by more effort, and half of the time of the layer would be spent on it.
     options = {"LEVEL": "1", "PREDICTOR": "NO", **overviews(grid)}
     with RasterWriter(path, grid, profile, creation_options=options, threads=resources.threads or 1) as writer:
@@ -373,10 +378,14 @@ class _Layer:
             part = (slice(j, j + -(-nj // spacing) + 1), slice(i, i + -(-ni // spacing) + 1))
             here = (slice(row, row + nj), slice(column, column + ni))
             accuracy_kernel.fill(
-                Nodes(nodes[part], samples[part], spacing, self.middle, self.half), self._heights(samples[part]),
-                self.budget.even, (float(self.size[0]), float(self.size[1])), radii(), bands[(slice(None), *here)],
+                Nodes(nodes[part], samples[part], spacing, self.middle, self.half),
+                self._heights(samples[part]),
+                self.budget.even,
+                (float(self.size[0]), float(self.size[1])),
+                radii(),
+                bands[(slice(None), *here)],
                 self.totals,
-            )  # fmt: skip
+            )
 
     def _pieces(self, samples: Array, height: int, width: int, spacing: int) -> Iterator[tuple[int, int, int, int]]:
         """Yield the pieces (row, column, rows, columns) of a tile whose windows of heights fit into the memory."""

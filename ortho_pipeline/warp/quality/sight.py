@@ -79,8 +79,17 @@ class Sight:
         """Return how output positions ``(n,)`` are seen at their heights."""
         half = _HALF_PIXEL
         # All places in one call: for a few nodes calls cost more than what they compute.
-        steps = np.array([(0, 0, 0), (half, 0, 0), (-half, 0, 0), (0, half, 0), (0, -half, 0), (0, 0, _HALF_METRE),
-                          (0, 0, -_HALF_METRE)])  # fmt: skip
+        steps = np.array(
+            [
+                (0, 0, 0),
+                (half, 0, 0),
+                (-half, 0, 0),
+                (0, half, 0),
+                (0, -half, 0),
+                (0, 0, _HALF_METRE),
+                (0, 0, -_HALF_METRE),
+            ]
+        )
         at = [(part + step[:, None]).ravel() for part, step in zip((columns, rows, heights), steps.T, strict=True)]
         ground = self.ground(*at).reshape(len(steps), -1, 3)
         image = self.model.ground_to_image(ground.reshape(-1, 3)).reshape(len(steps), -1, 2)

@@ -1,4 +1,4 @@
-"""What is done about hidden pixels while an ortho is made: a mask of them beside it, no value in it, or another's."""
+"""Occluded pixels of an ortho: write a mask of them, leave them empty, or fill them from another ortho."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from ortho_pipeline.raster.ortho import RasterWriter, classes_profile
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp.layers.sight import Sight
-from ortho_pipeline.warp.layers.visibility import Visibility
-from ortho_pipeline.warp.layers.visibility_kernel import HIDDEN, VOID
+from ortho_pipeline.warp.quality.sight import Sight
+from ortho_pipeline.warp.quality.visibility import Visibility
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
 CLASSES = {
-    1: ("visible", "#d9e8d0"), 2: ("hidden", "#b4500b"), 3: ("outside of the image", "#e6e6e6"),
+    1: ("visible", "#d9e8d0"),
+    2: ("hidden", "#b4500b"),
+    3: ("outside of the image", "#e6e6e6"),
     4: ("without a height", "#6b6b6b"),
-}  # fmt: skip
+}
 VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
 
 

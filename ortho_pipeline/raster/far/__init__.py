@@ -1,1 +1,0 @@
-"""Rasters on other machines: their windows are read before their turn."""

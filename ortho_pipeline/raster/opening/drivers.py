@@ -1,0 +1,123 @@
+"""GDAL's drivers: which may read a raster, and which one a file needs."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.locations import network_is_closed
+
+gdal.UseExceptions()
+
+#: Raster drivers that only read pixels out of the file they are given (and its side-cars).
+PLAIN = (
+    "GTiff",
+    "COG",
+    "NITF",
+    "JP2OpenJPEG",
+    "JP2KAK",
+    "JPEG",
+    "PNG",
+    "HFA",
+    "ENVI",
+    "PCRaster",
+    "DTED",
+    "SRTMHGT",
+    "AAIGrid",
+    "GTX",
+    "NTv2",
+    "EHdr",
+    "BMP",
+    "USGSDEM",
+    "SGI",
+    "BYN",
+    "MEM",
+)
+#: Drivers whose headers name other files: each is used for a file whose names have been seen.
+REFERRING = ("VRT", "DIMAP", "ERS", "ISIS3", "PCIDSK", "TIL")
+DRIVERS = PLAIN + REFERRING
+#: Raster drivers that send requests; a process of the command line does without them.
+_FETCHING = (
+    "WMS",
+    "WMTS",
+    "WCS",
+    "HTTP",
+    "OGCAPI",
+    "PLMOSAIC",
+    "PLSCENES",
+    "STACTA",
+    "STACIT",
+    "EEDAI",
+    "DAAS",
+    "NGW",
+    "MRF",
+    "PostGISRaster",
+    "GeoRaster",
+    "Rasterlite",
+    "RASDAMAN",
+    "TileDB",
+    "GTI",
+    "Zarr",
+    "netCDF",
+    "JPIPKAK",
+    "DODS",
+)
+#: Formats that a GDAL may have been built without, by the beginning of a file: wheels have fewer drivers.
+_BEGINNINGS = {
+    b"NITF": "NITF",
+    b"EHFA_HEADER_TAG": "HFA",
+    b"\x00\x00\x00\x0cjP": "JP2OpenJPEG",
+    b"UHL1": "DTED",
+    b"ncols": "AAIGrid",
+}
+_ENDINGS = {".til": "TIL", ".hgt": "SRTMHGT", ".ers": "ERS", ".pix": "PCIDSK"}
+_BEGINNING = 4096
+
+
+@functools.cache
+def remove_network_drivers() -> None:
+    """Remove the drivers that send requests where the network is closed to this process."""
+    if network_is_closed():
+        for name in _FETCHING:
+            driver = gdal.GetDriverByName(name)
+            if driver is not None:
+                driver.Deregister()
+
+
+def driver_for(path: Path) -> str | None:
+    """Return the driver that a file needs by its name or beginning, None where these tell nothing."""
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(_BEGINNING)
+    except OSError:
+        return None
+    if b"<Dimap_Document" in beginning:
+        return "DIMAP"
+    known = (driver for start, driver in _BEGINNINGS.items() if beginning.startswith(start))
+    return next(known, _ENDINGS.get(path.suffix.lower()))
+
+
+def require_driver(name: str, file: Any) -> None:
+    """Raise an `InputError` if this GDAL was built without a driver."""
+    if gdal.GetDriverByName(name) is None:
+        raise InputError(
+            f"this file needs GDAL's driver {name}, but this GDAL ({gdal.__version__}) was built without it",
+            file=file,
+            remedy="use a GDAL that has it, such as the one of Debian or Ubuntu; or give a GeoTIFF "
+            "(an image of the product, or one converted with gdal_translate)",
+        )
+
+
+def identified(name: str, drivers: Sequence[str] | None) -> str | None:
+    """Return the driver that takes a file first, among some or among all; GDAL reads its beginning only."""
+    allowed = {} if drivers is None else {"allowed_drivers": list(drivers)}
+    try:
+        driver = gdal.IdentifyDriverEx(name, gdal.OF_RASTER, **allowed)
+    except (RuntimeError, UnicodeDecodeError):
+        return None
+    return None if driver is None else str(driver.ShortName)

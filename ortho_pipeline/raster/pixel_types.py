@@ -1,0 +1,48 @@
+"""Types of pixels: GDAL's names and numbers of them, and what they can hold."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import PIXEL_TYPES
+
+
+def numpy_type(gdal_type: int) -> np.dtype[Any]:
+    """Return the numpy type of GDAL's number of a pixel type."""
+    from osgeo import gdal_array
+
+    return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
+
+
+def nodata_of(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
+    """Return the nodata value of a band, None if it has none that the pixel type can hold."""
+    value = band.GetNoDataValue()
+    return value if value is not None and holds(dtype, value) else None
+
+
+def holds(dtype: np.dtype[Any], value: float) -> bool:
+    """Tell whether a pixel of this type can have a value (of floating point: nearly)."""
+    if dtype.kind == "f":
+        return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
+    limits = np.iinfo(dtype)
+    return float(value).is_integer() and bool(limits.min <= value <= limits.max)
+
+
+def pixel_type(name: str) -> np.dtype[Any]:
+    """Return the type of pixels that GDAL calls `name`."""
+    code = gdal.GetDataTypeByName(name)
+    if name.lower() not in {known.lower() for known in PIXEL_TYPES}:
+        raise InputError(f"{name!r} is not a pixel type", field="output.dtype", remedy=", ".join(PIXEL_TYPES))
+    return numpy_type(code)
+
+
+def read_type(own: np.dtype[Any], wanted: str | None) -> np.dtype[Any]:
+    """Return the type in which pixels are read that are written as `wanted`."""
+    if wanted is None or pixel_type(wanted) == own:
+        return own
+    return np.promote_types(np.promote_types(own, pixel_type(wanted)), np.float32)

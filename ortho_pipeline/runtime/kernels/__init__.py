@@ -1,1 +1,0 @@
-"""How kernels are compiled and kept; they are made with `runtime.compiled`."""
