@@ -53,8 +53,7 @@ class UndecidedCrop(InputError):
         self.scene, self.offset = scene, offset
         moved, kept = (Setting("scene.crop_offset", f"{column:g},{row:g}") for column, row in (offset, (0, 0)))
         super().__init__(
-            f"this image is a crop that begins at {_text(offset)} of a larger image, and nothing shows whether its RPC "
-            "belongs to the crop or to the larger image",
+            f"this image is a crop that begins at {_text(offset)} of a larger image; its RPC can belong to either",
             file=scene.path,
             field="scene.crop_offset",
             remedy=Text(
@@ -62,7 +61,7 @@ class UndecidedCrop(InputError):
                 moved,
                 " if the RPC belongs to the larger image, or ",
                 kept,
-                " if it belongs to this crop; control points, a DEM of the crop alone, or a reference decide it too",
+                " if it belongs to this crop; control points, a reference, or a DEM of the crop alone also decide this",
             ),
         )
         self.choices = ((moved, "the RPC belongs to the larger image"), (kept, "the RPC belongs to this crop"))
@@ -92,9 +91,9 @@ def checked(offset: Sequence[float]) -> tuple[float, float]:
     """
     if len(offset) != 2 or not all(math.isfinite(value) for value in offset):
         raise InputError(
-            f"{', '.join(f'{value:g}' for value in offset)} is not the place of a crop",
+            f"{', '.join(f'{value:g}' for value in offset)} is not the offset of a crop",
             field="scene.crop_offset",
-            remedy="give the column and row of its first pixel in the whole image: COL,ROW",
+            remedy="give the column and row of its first pixel in the larger image: COL,ROW",
         )
     return float(offset[0]), float(offset[1])
 
@@ -139,14 +138,14 @@ def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) ->
     """
     if offset is not None:
         stated = checked(offset)
-        text = f"the image is taken for a crop whose first pixel is {_text(stated)} of the whole"
+        text = f"the image is a crop that begins at {_text(stated)} of a larger image, as stated"
         return _moved(scene, stated, Notice("crop-stated", text, offset=stated))
     noted = noted_offset(dataset)
     if noted is None:
         remark = _elsewhere(scene) or _small(scene)
         return scene if remark is None else replace(scene, warnings=(*scene.warnings, remark))
     if not isinstance(scene.model, RPC):
-        return _settled(scene, noted, True, "other models than RPCs are of the whole image")
+        return _settled(scene, noted, True, "models other than RPCs always belong to the larger image")
     ranges = _ranges(scene.model)
     decided = _by_size(scene, dataset, ranges, noted) or _by_range(scene, ranges, noted)
     if decided is None:
@@ -203,12 +202,12 @@ def _settled(scene: Scene, offset: tuple[float, float], is_moved: bool, why: str
     where = f"this image is a crop that begins at {_text(offset)} of a larger image"
     if is_moved:
         text = Text(
-            f"{where}, and its model was moved there ({why}); if it belongs to the crop: ",
+            f"{where}. The model was shifted to the crop ({why}). If it already belongs to the crop, give ",
             Setting("scene.crop_offset", "0,0"),
         )
         return _moved(scene, offset, Notice("crop-noted", text, offset=offset))
     text = Text(
-        f"{where}, and its model belongs to the crop ({why}); if it belongs to the larger image: ",
+        f"{where}. The model already belongs to the crop ({why}). If it belongs to the larger image, give ",
         Setting("scene.crop_offset", f"{offset[0]:g},{offset[1]:g}"),
     )
     return replace(scene, warnings=(*scene.warnings, Notice("crop-kept", text, offset=offset)))
@@ -222,14 +221,14 @@ def _by_size(scene: Scene, dataset: Any, ranges: Array, offset: tuple[float, flo
     size = scene.width, scene.height
     own = size_of_image(place(scene.model_source))
     if own is not None and (own == size or fits(size, own, offset)):
-        return own != size, f"the file of the RPC is of an image of {own[0]} x {own[1]} pixels"
+        return own != size, f"the RPC file is for an image of {own[0]} x {own[1]} pixels"
     whole = _size_of_whole(dataset)
     if whole is None or not fits(size, whole, offset):
         return None
     # The middle of the range is that of the image, however far the range reaches beyond it on both sides.
     middle = ranges.mean(axis=1) - np.array(whole) / 2
     decided = nearer(float(np.hypot(*(middle + offset))), float(np.hypot(*middle)), offset)
-    return None if decided is None else (decided, f"by the size of the whole, {whole[0]} x {whole[1]} pixels")
+    return None if decided is None else (decided, f"the larger image has {whole[0]} x {whole[1]} pixels")
 
 
 def _size_of_whole(dataset: Any) -> tuple[int, int] | None:
@@ -259,10 +258,10 @@ def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple
     # A program that moved the RPC wrote it into the crop; a range that begins elsewhere tells nothing of either.
     in_the_crop = not place(scene.model_source).is_file()
     if of_crop and of_whole and in_the_crop and (np.abs(ranges[:, 0] + first_of_crop) <= 1.0).all():
-        return False, "the range of the RPC in the crop begins at the first pixel of the larger image"
+        return False, "the range of the RPC begins at the first pixel of the larger image"
     if of_crop == of_whole:
         return None
-    return of_whole, f"for the {'crop' if of_whole else 'larger image'} its range would be too small"
+    return of_whole, f"its range is too small for the {'crop' if of_whole else 'larger image'}"
 
 
 def _ranges(model: RPC) -> Array:
@@ -291,9 +290,8 @@ def _elsewhere(scene: Scene) -> Notice | None:
         return None
     (left, right), (top, bottom) = ranges
     text = Text(
-        f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, which does not meet "
-        f"this image of {scene.width} x {scene.height} pixels: is it a crop with the RPC of the whole? Say where "
-        "it lies with ",
+        f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, but this image has "
+        f"{scene.width} x {scene.height} pixels. If it is a crop with the RPC of a larger image, give ",
         Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("rpc-elsewhere", text, **dict(zip(("columns", "rows"), ranges.tolist(), strict=True)))
@@ -310,9 +308,8 @@ def _small(scene: Scene) -> Notice | None:
     if not (begins and small):
         return None
     text = Text(
-        f"the image has {scene.width} x {scene.height} pixels, its RPC is for about {sizes[0]:.0f} x {sizes[1]:.0f}: "
-        "if it was cut out of that image, the RPC is right for it only if both begin at the same corner; say where it "
-        "lies with ",
+        f"the image has {scene.width} x {scene.height} pixels, but its RPC is for about {sizes[0]:.0f} x "
+        f"{sizes[1]:.0f}. If it is a crop that begins elsewhere than the larger image, give ",
         Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("maybe-a-crop", text, rpc_size=sizes)

@@ -39,9 +39,9 @@ def check_formats(names: Sequence[str], known: Mapping[str, Format]) -> tuple[Fo
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise InputError(
-            f"no format is called {', '.join(unknown) or 'nothing'}",
+            f"unknown format {', '.join(unknown)}" if unknown else "no format is given",
             field="formats",
-            remedy=f"one or more of {', '.join(known)}",
+            remedy=f"use one or more of {', '.join(known)}",
         )
     return tuple(known[name] for name in dict.fromkeys(names))
 

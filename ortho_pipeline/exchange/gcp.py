@@ -56,11 +56,9 @@ def gcps_of_model(
     gcps = gcps[np.isfinite(gcps).all(axis=1)]
     if len(gcps) < 4:
         raise InputError(
-            "the rays of the image do not meet the ground: there is no grid of control points",
+            "the rays of the image do not meet the ground, so no control points can be made",
             field="model",
-            remedy=Text(
-                "give the metadata of this very image, and a DEM or ", Setting("surface.height"), " that lies under it"
-            ),
+            remedy=Text("give the metadata of this image, and a DEM of this place or ", Setting("surface.height")),
         )
     return gcps
 
@@ -101,7 +99,7 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
         # A VRT keeps four decimals of pixels and twelve of degrees.
         other = copy.GetMetadata("RPC") or copy.GetGeoTransform(can_return_null=True)
         if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or other:
-            raise ModelError("the control points that were written are others when they are read again", file=path)
+            raise ModelError("the written control points differ when they are read again", file=path)
 
 
 def _without_georeferencing(dataset: gdal.Dataset) -> gdal.Dataset:
@@ -151,10 +149,10 @@ def write_geolocation(
     lonlat = _lonlat(model, image.reshape(-1, 2), surface)[:, :2].reshape(*image.shape[:2], 2)
     if not np.isfinite(lonlat).all():
         raise InputError(
-            "some rays of the image do not meet the ground: geolocation arrays would have holes",
+            "some rays of the image do not meet the ground, so geolocation arrays would have gaps",
             field="model" if surface is None else "surface.dem",
             remedy=Text(
-                "give the metadata of this very image, and a DEM that covers the whole scene, or ",
+                "give the metadata of this image, and a DEM that covers the whole scene or ",
                 Setting("surface.height"),
             ),
         )

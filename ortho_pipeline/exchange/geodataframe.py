@@ -110,10 +110,10 @@ def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
             f"no column {' and '.join(missing)}",
             file=source,
             field="columns",
-            remedy="name the columns of the place in the image (px from the outer corner of the first pixel) so",
+            remedy="add the image position as columns col and row (px from the outer corner of the first pixel)",
         )
     if not frame.columns.is_unique:
-        raise InputError("two columns of one name", file=source, field="columns", remedy="rename one of them")
+        raise InputError("two columns have the same name", file=source, field="columns", remedy="rename one of them")
     table = Table(
         _FRAME,
         crs=None if frame.crs is None else frame.crs.to_wkt(),
@@ -136,7 +136,7 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> PointRo
         return number(_plain(record[name]), source, f"{where}, {name}")
 
     if place is not None and (place.geom_type != "Point" or place.is_empty):
-        raise InputError(f"{place.geom_type} is not the place of a point", file=source, field=f"{where}, geometry")
+        raise InputError(f"{place.geom_type} is not a point", file=source, field=f"{where}, geometry")
     x, y = (math.nan, math.nan) if place is None else (place.x, place.y)
     if record.get("h") is not None:
         height = cell("h")

@@ -20,7 +20,7 @@ _MAX_BYTES = 50_000_000
 
 
 #: What is done about a damaged file.
-_REMEDY = "give a <stem>_model.json as it was written, or write it again"
+_REMEDY = "give an unchanged <stem>_model.json, or write it again"
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
         model_from_dict(model)
     except InputError as error:
         raise PluginError(
-            f"this model could not be read again: {error.message}",
+            f"the written model cannot be read again: {error.message}",
             file=path,
-            remedy="its plugin must offer the class in the hook ortho_models; a script: register it in models.KINDS",
+            remedy="return its class from the hook ortho_models of the plugin; in a script, add it to models.KINDS",
         ) from error
     document = {
         "document": DOCUMENT,
@@ -106,7 +106,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         )
     if version != SCHEMA_VERSION:
         raise InputError(
-            f"schema version {version!r} is not known here (this version reads {SCHEMA_VERSION})",
+            f"unknown schema version {version!r}; this version reads {SCHEMA_VERSION}",
             file=path,
             field="schema_version",
             remedy="update ortho-pipeline",
@@ -116,7 +116,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)
     ):
         raise InputError(
-            f"{size!r} is not an image size", file=path, field="size", remedy="two positive integers, or null"
+            f"{size!r} is not an image size", file=path, field="size", remedy="give two positive integers, or null"
         )
     try:
         model = model_from_dict(document["model"])

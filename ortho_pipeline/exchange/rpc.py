@@ -216,7 +216,7 @@ def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> No
     if not difference <= DISAGREEMENT:
         apart = f"by {difference:.1f} px" if np.isfinite(difference) else "completely"
         raise InputError(
-            f"the RPC of the file and that of {sidecar_name} differ {apart} at the centre of the scene",
+            f"the RPC in the file and the RPC in {sidecar_name} differ {apart} at the centre of the scene",
             file=name,
             field="scene.rpc",
             remedy=Text(
@@ -303,7 +303,7 @@ def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -
     ground = box_grid(*domain_box(rpc), (5, 5, 3))
     worst = np.nanmax(np.abs(written.ground_to_image(ground) - rpc.ground_to_image(ground)))
     if not worst < 1e-6 or dataset.GetGCPCount():
-        raise ModelError(f"the RPC that was written is off by {worst:g} px when it is read again", file=path)
+        raise ModelError(f"the written RPC is off by {worst:g} px when it is read again", file=path)
 
 
 # -- RPC of any model ------------------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ def read_rpc_text(path: str | PathLike[str]) -> RPC:
     if text.lstrip()[:1] == "<":
         fields, origin = _fields_of_xml(text, path)
     elif len(text) > MAX_PLAIN:
-        raise InputError("this file has more than 1 MB, which no RPC text has", file=path)
+        raise InputError("this file is larger than 1 MB, so it is not an RPC text", file=path)
     elif "linenumcoef" in lowered:
         fields, origin = _fields_of_rpb(text, path), 0.0
     elif "line_num_coeff_00" in lowered:
@@ -164,7 +164,7 @@ def _rpc(fields: Mapping[str, str], file: str | PathLike[str] | None, origin: fl
 def _text_of(path: str | PathLike[str]) -> str:
     data = files.read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
-        raise InputError("this file has more than 5 MB, which no RPC file has", file=path)
+        raise InputError("this file is larger than 5 MB, so it is not an RPC file", file=path)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError("this file is UTF-16 text", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
@@ -203,7 +203,7 @@ def _coefficients(fields: Mapping[str, str], key: str, file: str | PathLike[str]
 
 def _put(fields: dict[str, str], key: str, value: str, file: str | PathLike[str]) -> None:
     if fields.setdefault(key, value) != value:
-        raise InputError("this field is there twice, with two values", file=file, field=key)
+        raise InputError("this field appears twice, with different values", file=file, field=key)
 
 
 def _is_rpc_key(key: str) -> bool:
@@ -227,10 +227,10 @@ def _fields_of_geom(text: str, path: str | PathLike[str]) -> dict[str, str]:
         key, _, value = line[:500].partition(":")
         key, value = key.strip(), value.strip()
         if key.startswith("adjustment_") and key.endswith((".parameter", ".center")) and _number(value, path, key):
-            raise InputError("this file has an adjustment of its own, which is not applied", file=path, field=key)
+            raise InputError("this file contains an adjustment, which cannot be applied", file=path, field=key)
         key = key.rpartition(".")[2].upper().replace("LON_", "LONG_")
         if key == "POLYNOMIAL_FORMAT" and value != "B":
-            raise InputError(f"polynomials of format {value!r} are not read, only B (RPC00B)", file=path, field=key)
+            raise InputError(f"polynomials of format {value!r} cannot be read, only B (RPC00B)", file=path, field=key)
         term = re.fullmatch(r"(\w+_COEFF)_(\d\d)", key, re.ASCII)
         if term:
             key = f"{term[1]}_{int(term[2]) + 1}"
@@ -255,7 +255,7 @@ def _fields_of_rpb(text: str, path: str | PathLike[str]) -> dict[str, str]:
 
 def _check_spec(text: str, path: str | PathLike[str]) -> None:
     if text.strip().upper() != "RPC00B":
-        raise InputError(f"{text[:40]!r} is not read, only RPC00B", file=path, field="SpecId")
+        raise InputError(f"{text[:40]!r} cannot be read, only RPC00B", file=path, field="SpecId")
 
 
 def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str], float]:

@@ -89,10 +89,10 @@ def fit_rpc(
     worst = float(np.abs(rpc.ground_to_image(ground) - image).max())
     if not worst <= REFUSE_ERROR and not force:
         raise InputError(
-            f"an RPC stands for this model only to {worst:.3g} px",
+            f"an RPC represents this model only to {worst:.3g} px",
             remedy="fit it over a smaller box or height range, or accept the error (force)",
         )
-    message = Notice("rpc-approximate", f"the RPC stands for the model only to {worst:.3g} px", max_error_px=worst)
+    message = Notice("rpc-approximate", f"the RPC represents the model only to {worst:.3g} px", max_error_px=worst)
     if worst > WARN_ERROR:
         log.warning("%s", message)
     return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())
@@ -147,7 +147,7 @@ def _samples(
     good = np.isfinite(image).all(axis=1)
     if good.mean() < 0.5:
         raise InputError(
-            f"the model maps only {good.mean():.0%} of the box to be fitted into the image",
+            f"the model maps only {good.mean():.0%} of the box into the image",
             field="box",
             remedy="give a box within the scene",
         )

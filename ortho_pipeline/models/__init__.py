@@ -30,12 +30,12 @@ def require_view(model: SensorModel) -> None:
     """
     centre, half = model.domain
     if not (np.isfinite(centre).all() and np.isfinite(half).all()):
-        raise InputError("the ground that this model is meant for has no finite bounds", field="model")
+        raise InputError("the domain of this model is not finite", field="model")
     parts = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3), axis=-1).reshape(-1, 3)
     with np.errstate(all="ignore"):
         image = model.ground_to_image(centre + parts * half)
     if np.isinf(image).any() or not np.isfinite(image).all(axis=1).any():
-        raise InputError("this model maps none of the ground that it is meant for into an image", field="model")
+        raise InputError("this model maps no ground of its domain into an image", field="model")
 
 
 __all__ = [

@@ -259,7 +259,9 @@ class SensorModel(ABC):
         given = {key: value for key, value in data.items() if key != "kind"}
         if set(given) != names:
             wrong = sorted(set(given) ^ names)
-            raise InputError(f"a model of kind {cls.kind!r} has the fields {sorted(names)}", field=", ".join(wrong))
+            raise InputError(
+                f"a model of kind {cls.kind!r} must have the fields {sorted(names)}", field=", ".join(wrong)
+            )
         return cls(**given)
 
     def _replace(self, **changes: Any) -> Self:
@@ -293,9 +295,9 @@ def model_from_dict(data: dict[str, Any]) -> SensorModel:
     kind = data.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(
-            f"no installed sensor model is of kind {kind!r}",
+            f"unknown kind of sensor model {kind!r}",
             field="kind",
-            remedy=f"known kinds are {', '.join(sorted(KINDS))}; install the plugin that offers it in ortho_models",
+            remedy=f"use one of {', '.join(sorted(KINDS))}, or install the plugin that has this kind in ortho_models",
         )
     try:
         return KINDS[kind].from_dict(data)
@@ -304,7 +306,7 @@ def model_from_dict(data: dict[str, Any]) -> SensorModel:
         raise InputError(
             f"this is not a model of kind {kind!r} ({str(error)[:200]})",
             field=kind,
-            remedy="leave what was written as it is, or write the model again",
+            remedy="write the model again, and do not edit the file",
         ) from error
 
 
@@ -321,7 +323,7 @@ def as_image(image: ArrayLike) -> Array:
 def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != columns:
-        raise InputError(f"{what} points have the shape (N, {columns}), not {array.shape}")
+        raise InputError(f"{what} points must have the shape (N, {columns}), not {array.shape}")
     return array
 
 
@@ -330,7 +332,7 @@ def checked_names(free: Iterable[str], known: Iterable[str], where: str) -> tupl
     names = tuple(free)
     unknown = sorted(set(names) - set(known))
     if unknown or len(set(names)) != len(names):
-        raise InputError(f"free parameters are different names {where}", field=", ".join(unknown) or "free")
+        raise InputError(f"free parameters must be different names {where}", field=", ".join(unknown) or "free")
     return names
 
 

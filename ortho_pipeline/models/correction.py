@@ -84,7 +84,7 @@ class OverAnother(SensorModel):
     def from_dict(cls, data: dict[str, Any]) -> Self:
         inner = data.get("model")
         if not isinstance(inner, dict):
-            raise InputError(f"a model of kind {cls.kind!r} needs the model that it moves", field="model")
+            raise InputError(f"a model of kind {cls.kind!r} needs the model that it corrects", field="model")
         return super().from_dict({**data, "model": model_from_dict(inner)})
 
 
@@ -115,10 +115,10 @@ class ImageCorrection(OverAnother):
 
     def __post_init__(self) -> None:
         if self.correction not in FREE:
-            raise InputError(f"no correction is called {self.correction!r}", remedy=f"one of {', '.join(FREE)}")
+            raise InputError(f"unknown correction {self.correction!r}", remedy=f"use one of {', '.join(FREE)}")
         coefficients = np.array(self.coefficients, dtype=np.float64)
         if coefficients.shape != (6,) or not np.isfinite(coefficients).all():
-            raise InputError("a correction has 6 finite coefficients", field="coefficients")
+            raise InputError("a correction needs 6 finite coefficients", field="coefficients")
         (a, b), (c, d) = _matrix(coefficients).tolist()
         if abs(a * d - b * c) < 1e-6:
             raise InputError("this correction cannot be inverted", field="coefficients")

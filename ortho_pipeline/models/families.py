@@ -257,8 +257,8 @@ def family_of(name: str) -> Family:
     """
     if name not in _BY_NAME:
         raise InputError(
-            f"no model family is called {name!r}",
+            f"unknown model family {name!r}",
             field="points.model",
-            remedy=f"one of {', '.join(family.name for family in _FAMILIES)}",
+            remedy=f"use one of {', '.join(family.name for family in _FAMILIES)}",
         )
     return _BY_NAME[name]

@@ -69,13 +69,13 @@ class Interior:
         for name in INTERIOR:
             value = float(getattr(self, name))
             if not math.isfinite(value):
-                raise InputError(f"{value} is not a number for a camera", field=name)
+                raise InputError(f"{value} is not a finite number", field=name)
             object.__setattr__(self, name, value)
         for name in ("width", "height", "focal_length", "pitch_x", "pitch_y"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{getattr(self, name)} is not positive", field=name)
         if self.width != int(self.width) or self.height != int(self.height):
-            raise InputError("a frame has whole numbers of columns and rows", field="width, height")
+            raise InputError("the numbers of columns and rows must be integers", field="width, height")
 
     @property
     def field_of_view(self) -> float:

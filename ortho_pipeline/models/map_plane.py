@@ -80,11 +80,11 @@ class MapPlane(SensorModel):
         object.__setattr__(self, "size", tuple(int(value) for value in self.size))
         object.__setattr__(self, "plane", float(self.plane))
         if not (self.pixel[0] > 0 and self.pixel[1] > 0 and len(self.size) == 2 and min(self.size) > 0):
-            raise InputError("pixels and images have a positive size", field="pixel, size")
+            raise InputError("sizes of pixels and images must be positive", field="pixel, size")
         if not self.heights[0] < self.heights[1]:
-            raise InputError("the lower height comes first", field="heights", remedy="give low,high in metres")
+            raise InputError("the lower height must come first", field="heights", remedy="give low,high in metres")
         if not self.heights[0] <= self.plane <= self.heights[1]:
-            raise InputError(f"the plane at {self.plane} m does not lie within the heights", field="heights")
+            raise InputError(f"the plane at {self.plane} m is outside the heights", field="heights")
         _check_map(self.map_crs)
 
     @classmethod
@@ -114,9 +114,9 @@ class MapPlane(SensorModel):
         """
         if not (math.isfinite(azimuth) and LOWEST_ELEVATION < elevation <= math.pi / 2):
             raise InputError(
-                f"a satellite {math.degrees(elevation):.3g} degrees above the horizon takes no such image",
+                f"an elevation of {math.degrees(elevation):.3g} degrees is not possible for such an image",
                 field="elevation",
-                remedy="it is an angle from 5 to 90 degrees",
+                remedy="give an angle from 5 to 90 degrees",
             )
         middle = np.array([[corner[0] + pixel[0] * size[0] / 2, corner[1] - pixel[1] * size[1] / 2, plane]])
         away = _along(map_crs, middle, azimuth) / -math.tan(elevation)
@@ -216,7 +216,7 @@ def _along(map_crs: str, place: Array, azimuth: float) -> Array:
     to_geographic = ground_transform(map_crs, "EPSG:4979")
     lon, lat, height = to_geographic(place)[0]
     if not math.isfinite(lon):
-        raise InputError("the scene does not lie in the domain of its map projection", field="corner")
+        raise InputError("the scene is outside the area of its map projection", field="corner")
     lon2, lat2, _ = pyproj.Geod(ellps="WGS84").fwd(lon, lat, math.degrees(azimuth), _STEP)
     there = ground_transform("EPSG:4979", map_crs)(np.array([[lon2, lat2, height]]))[0]
     # A metre up there is shorter on the ellipsoid, to which maps belong.
@@ -228,5 +228,5 @@ def _check_map(text: str) -> None:
     crs = parse_crs(text)
     if not crs.is_projected or any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info[:2]):
         raise InputError(
-            f"{crs.name!r} is not a map projection in metres", field="map_crs", remedy="for example a UTM zone"
+            f"{crs.name!r} is not a map projection in metres", field="map_crs", remedy="use for example a UTM zone"
         )

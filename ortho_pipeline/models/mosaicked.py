@@ -43,9 +43,9 @@ class Pieces(SensorModel):
         for name in ("models", "offsets", "sizes"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not self.models or not len(self.models) == len(self.offsets) == len(self.sizes):
-            raise InputError("each piece has a model, an offset and a size", field="models, offsets, sizes")
+            raise InputError("each piece needs a model, an offset and a size", field="models, offsets, sizes")
         if len({model.crs for model in self.models}) != 1:
-            raise InputError("the models of the pieces are in different systems", field="models")
+            raise InputError("the models of the pieces have different CRSs", field="models")
 
     @property
     def first(self) -> SensorModel:
@@ -125,7 +125,7 @@ class Cropped(OverAnother):
     def __post_init__(self) -> None:
         offset = np.asarray(self.offset, dtype=np.float64)
         if offset.shape != (2,) or not np.isfinite(offset).all():
-            raise InputError("a crop has a column and a row where it begins", field="offset")
+            raise InputError("the offset of a crop must be a column and a row", field="offset")
         object.__setattr__(self, "offset", (float(offset[0]), float(offset[1])))
 
     # -- parameters --------------------------------------------------------------------------------------------------

@@ -96,11 +96,11 @@ class RPC(SensorModel):
         for name in ("col_num", "col_den", "row_num", "row_den"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (20,):
-                raise InputError(f"an RPC has 20 coefficients here, not {values.size}", field=name)
+                raise InputError(f"an RPC needs 20 coefficients, not {values.size}", field=name)
             if not np.isfinite(values).all():
                 raise InputError("an RPC needs finite coefficients", field=name)
             if not values.any():
-                raise InputError("all coefficients of an RPC are zero here", field=name)
+                raise InputError("all coefficients are zero", field=name)
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         _ = self._reach  # refuses what is unsound
@@ -265,18 +265,18 @@ class Rational(SensorModel):
         for name, shape in shapes.items():
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != shape or not np.isfinite(values).all():
-                raise InputError(f"a model of this family has {shape} finite numbers here", field=name)
+                raise InputError(f"a model of this family needs {shape} finite numbers", field=name)
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if not ((self.ground_scale > 0).all() and (self.image_scale > 0).all()):
-            raise InputError("scales are positive", field="ground_scale, image_scale")
+            raise InputError("scales must be positive", field="ground_scale, image_scale")
         if not (self.box[0] < self.box[1]).all():
-            raise InputError("the lowest is not below the highest", field="box")
+            raise InputError("each minimum must be below its maximum", field="box")
         object.__setattr__(self, "removed", tuple(self.removed))
         unknown = set(self.removed) - set(terms.family.param_names)
         gone = [terms.family.param_names.index(name) for name in self.removed if name not in unknown]
         if unknown or self.coefficients[gone].any():
-            raise InputError("what is removed is a coefficient of the family, and zero", field="removed")
+            raise InputError("only coefficients of the family that are zero can be removed", field="removed")
         object.__setattr__(self, "_table", terms.table(self.coefficients))
 
     @property
@@ -402,5 +402,5 @@ class Rational(SensorModel):
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         if not isinstance(data.get("family"), str):
-            raise InputError("a rational model has the name of its family", field="family")
+            raise InputError("a rational model needs the name of its family", field="family")
         return super().from_dict(data)

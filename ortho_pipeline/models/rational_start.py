@@ -82,7 +82,7 @@ def start_model(
             f"{counted(int(usable.sum()), 'control point does', 'control points do')} not determine the "
             f"{counted(chosen.parameters, 'parameter')} of {family}",
             file=points.source or None,
-            remedy=f"give at least {counted(chosen.minimum_points, 'control point')}, or take a simpler model",
+            remedy=f"give at least {counted(chosen.minimum_points, 'control point')}, or use a simpler model",
         )
     box = _box(ground, points.image, usable, size, heights, moved.crs)
     coordinates = ground[usable]

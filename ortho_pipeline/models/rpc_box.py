@@ -67,7 +67,7 @@ _LARGEST = {
 #: Sides of a pixel on the ground (m): microscopes and whole continents are not scenes.
 _PIXEL = (1e-3, 1e5)
 _METRES_PER_DEGREE = 111_320.0
-_DAMAGED = "the RPC is damaged or belongs to another image: ask for its file again"
+_DAMAGED = "the RPC is damaged or belongs to another image: get its file again"
 _HALF = np.array([[1, 0, 0, 0], [0.5, 0.5, 0, 0], [0.25, 0.5, 0.25, 0], [0.125, 0.375, 0.375, 0.125]])
 _SIDES = (_HALF, _HALF[::-1, ::-1])
 #: Normalised heights at which folds are looked for, and within which of them an RPC has to be sound.
@@ -133,7 +133,7 @@ def check_numbers(values: dict[str, float]) -> None:
         if name.endswith("_scale") and value == 0.0:
             raise InputError("an RPC scale cannot be zero", field=name, remedy=_DAMAGED)
         if abs(value) > _LARGEST[name]:
-            raise InputError(f"{value:g} is more than a scene on Earth can have", field=name, remedy=_DAMAGED)
+            raise InputError(f"{value:g} is too large for a scene on Earth", field=name, remedy=_DAMAGED)
 
 
 def sound_heights(values: dict[str, float], coefficients: Array) -> tuple[float, float]:
@@ -174,9 +174,10 @@ def sound_heights(values: dict[str, float], coefficients: Array) -> tuple[float,
                 ends.append(float(level))
                 break
             if abs(level) <= _LEAST:
-                what = "the denominator of an RPC is zero" if poles else "this RPC folds the ground"
-                field = ", ".join(poles) or "col_num, row_num"
-                raise InputError(f"{what} within its box", field=field, remedy=_DAMAGED)
+                what = "the denominator of this RPC is zero within its box"
+                if not poles:
+                    what = "this RPC maps several places on the ground to one pixel"
+                raise InputError(what, field=", ".join(poles) or "col_num, row_num", remedy=_DAMAGED)
     return ends[0], ends[1]
 
 
@@ -195,7 +196,7 @@ def _check_pixel(values: dict[str, float], jacobian: Array) -> None:
     long, short = np.linalg.svd(pixels, compute_uv=False) if np.isfinite(pixels).all() else (np.nan, np.nan)
     if not (_PIXEL[0] <= 1.0 / long and 1.0 / short <= _PIXEL[1]):
         raise InputError(
-            f"a pixel of this RPC is {1.0 / long:.2g} x {1.0 / short:.2g} m on the ground",
+            f"a pixel of this RPC would be {1.0 / long:.2g} x {1.0 / short:.2g} m on the ground",
             field="col_scale, row_scale, lon_scale, lat_scale",
             remedy=_DAMAGED,
         )

@@ -81,9 +81,8 @@ def uncovered(image: Array, size: tuple[int, int] | None) -> tuple[Notice, ...]:
     if share >= COVERED:
         return ()
     text = (
-        f"control covers {100 * share:.0f} % of the image (its hull and a margin of half the distance between points); "
-        f"empty: {' and '.join(where)}. Points say nothing of where there are none, nor which model is right there: "
-        "measure some there, or rely on the result only where control is"
+        f"control covers {100 * share:.0f} % of the image; empty: {' and '.join(where)}. Accuracy there is untested, "
+        "and models can differ: add points there, or do not use the result there"
     )
     return (Notice("control-covers-part", text, share=share, empty=list(where)),)
 

@@ -62,7 +62,7 @@ _PROJECTED = frozenset(["easting", "east", "northing", "north"])
 _OWN_UNIT = re.compile(r"[\[(](m|metres?|meters?|px|pixels?|deg|degrees?|°)[\])]$")
 #: Status of a point as PCI's programs write it; an inactive one is left out.
 _STATUS = {"g": "control", "c": "check"}
-_UNDERSTOOD = "Name, Pixel, Line, Easting, Northing, Lat, Lon, Elev, alt, xPix, yPix and their like are understood"
+_UNDERSTOOD = "common names such as Name, Pixel, Line, Easting, Northing, Lat, Lon, Elev, xPix, yPix also work"
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> 
     place: dict[str, int] = {}
 
     def refuse(message: str) -> InputError:
-        own = f"name them {','.join(expected.names)}; {_UNDERSTOOD}"
+        own = f"name the columns {','.join(expected.names)}; {_UNDERSTOOD}"
         digits = all(re.fullmatch(r"[+-]?[\d.,]+", name) for name in names[1:])
-        remedy = f"put a header above the numbers: {own}" if digits else own
+        remedy = f"add a header line above the numbers, and {own}" if digits else own
         found = ", ".join(name or "(no name)" for name in names)
         shown = found if len(found) <= 300 else f"{found[:300]}..."
         return InputError(f"{message}; the columns are: {shown}", file=path, field=f"line {line.number}", remedy=remedy)
@@ -163,7 +163,7 @@ def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> 
         if name in CSV_IGNORED or (not name and index in (0, len(names) - 1)):
             continue
         if name not in (*expected.names, "status"):
-            raise refuse(f"the column {short(names[index])} is not known")
+            raise refuse(f"unknown column {short(names[index])}")
         if name in place:
             raise refuse(f"the columns {short(names[place[name]])} and {short(names[index])} both mean {name}")
         place[name] = index
@@ -228,20 +228,20 @@ def _row(
     cells, where = cells_of(path, line, header.delimiter), f"line {line.number}"
     if len(cells) != len(header.names):
         comma = header.delimiter == "," and len(cells) > len(header.names)
-        remedy = "a decimal comma splits numbers: write decimal points, or ; between the columns" if comma else None
+        remedy = "write decimal points instead of commas, or separate the columns with ;" if comma else None
         raise InputError(
-            f"{counted(len(cells), 'cell')} under {counted(len(header.names), 'column name')} "
+            f"this line has {counted(len(cells), 'cell')}, but there are {len(header.names)} columns "
             f"({', '.join(header.names)[:120]})",
             file=path,
             field=where,
             remedy=remedy,
         )
     if not header.names[-1] and cells[-1]:
-        raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
+        raise InputError(f"the column of {short(cells[-1])} has no name", file=path, field=where)
     of = _Cells(path, where, cells, header, expected, marks)
-    for name, what in (("id", "an id"), (CSV_IMAGE, "an image")):
+    for name, what in (("id", "id"), (CSV_IMAGE, "image")):
         if (name in expected.needed or (name == "id" and "id" in header.place)) and not of.text(name):
-            raise InputError(f"a point without {what}", file=path, field=of.column(name))
+            raise InputError(f"this point has no {what}", file=path, field=of.column(name))
     role = role_of(of.text("role"), path, of.column("role")) if of.text("role") else expected.role
     if of.text("status"):
         found = _STATUS.get(of.text("status").lower(), of.text("status").lower())
@@ -277,9 +277,9 @@ def _decimal(cell: str, header: Header, marks: set[str], path: str | os.PathLike
     marks.update(mark for mark, there in ((",", comma), (".", point)) if there)
     if len(marks) > 1:
         raise InputError(
-            f"{short(cell)}: commas and points both stand in the numbers of this file",
+            f"this file mixes decimal commas and decimal points, as in {short(cell)}",
             file=path,
             field=where,
-            remedy="write all decimals alike, and no separators of thousands",
+            remedy="use one of the two in the whole file, and no thousands separators",
         )
     return re.sub(r",(?=\d*(?:[eE][+-]?\d+)?$)", ".", cell, count=1) if comma else cell

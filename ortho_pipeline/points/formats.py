@@ -96,7 +96,7 @@ _FORMATS = (
 _NAMES = ", ".join(one.name for one in _FORMATS)
 
 
-@reads("see docs/formats.md for what stands in a file of points")
+@reads("see docs/formats.md for the formats of point files")
 def read_table(
     path: str | os.PathLike[str],
     image_name: str | None = None,
@@ -120,7 +120,7 @@ def read_table(
     text = load_text(path)
     table = _read(_format_of(path, text), path, text)
     if not table.rows:
-        raise InputError("this file holds no points", file=path, remedy=f"give one of: {_NAMES}")
+        raise InputError("this file has no points", file=path, remedy=f"give one of: {_NAMES}")
     return _of_image(path, table, image_name, pieces or {})
 
 
@@ -136,14 +136,14 @@ def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BL
     kind = _format_of(path, text)
     if expected not in kind.of_block:
         raise InputError(
-            "points of several images do not stand in this format",
+            "this format cannot hold points of several images",
             file=path,
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
         )
     # Only formats whose columns have names can be asked for those of ground alone.
     table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
     if not table.rows:
-        raise InputError("this file holds no points", file=path, remedy="add points to it")
+        raise InputError("this file has no points", file=path, remedy="add points to it")
     return table
 
 
@@ -164,14 +164,14 @@ def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
             return kind
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(
-            f"numbers without names: it is not said what the columns are; the first line is {short(first)}",
+            f"these columns have no names; the first line is {short(first)}",
             file=path,
             field="line 1",
-            remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
+            remedy="add a first line with their names, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
             "from-x from-y to-x to-y)",
         )
     raise InputError(
-        f"the format of this point file is not known; its first line is {short(first)}",
+        f"unknown format of points; the first line is {short(first)}",
         file=path,
         field="line 1",
         remedy=f"give one of: {_NAMES}",
@@ -185,10 +185,10 @@ def _of_image(
     if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"there are points of several images ({some})",
+            f"this file has points of several images ({some})",
             file=path,
             field="image",
-            remedy="say which with image_name, or read them as a block (read_block_points)",
+            remedy="choose one with image_name, or read them as a block (read_block_points)",
         )
     if image_name is None or not named:
         return table
@@ -207,10 +207,10 @@ def _of_image(
     if not kept:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"no point belongs to the image {image_name!r}; there are points of {some}",
+            f"no point was measured in {image_name!r}, only in {some}",
             file=path,
             field="image",
-            remedy="use the name of the image that the points were measured in",
+            remedy="use the name of the image in which the points were measured",
         )
     table.rows = kept
     return table

@@ -107,7 +107,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
 def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -> tuple[float, float, float]:
     place = geometry.get("coordinates")
     if not isinstance(place, list) or len(place) not in (2, 3):
-        raise InputError("not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
+        raise InputError("the coordinates are not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
     ground = [number(value, path, f"{where}.geometry.coordinates[{k}]") for k, value in enumerate(place)]
     return ground[0], ground[1], ground[2] if len(ground) == 3 else math.nan
 
@@ -123,14 +123,19 @@ def _measured(
         pairs = list(ji.items())
     elif expected is OF_BLOCK and not isinstance(file_name, str):
         raise InputError(
-            "it is not said in which image this point was measured",
+            "this point does not name its image",
             file=path,
             field=field,
-            remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",
+            remedy="give 'ji' as {image: [column, row]}, or as [column, row] with 'filename'",
         )
     for image, pair in pairs:
         if not isinstance(pair, list) or len(pair) != 2:
-            raise InputError("no property 'ji' = [column, row]", file=path, field=field, remedy="measure the points")
+            raise InputError(
+                "this point has no property 'ji' = [column, row]",
+                file=path,
+                field=field,
+                remedy="measure it in the image, or delete it",
+            )
         column, row = (number(pair[k], path, f"{field}[{k}]") for k in range(2))
         # From the centre of the first pixel to its corner.
         yield image, (column + 0.5, row + 0.5)

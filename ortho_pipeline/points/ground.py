@@ -58,7 +58,7 @@ def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS
     given = None if option is None else parse_crs(option)
     if stated is None and given is None:
         raise CrsError(
-            "the CRS of these points is not known",
+            "the CRS of these points is unknown",
             file=path,
             field="points.crs",
             remedy=Text("give ", Setting("points.crs", "EPSG:n")),
@@ -67,7 +67,7 @@ def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS
         return given if stated is None else stated  # type: ignore[return-value]
     if not same_crs(_plan(stated), _plan(given)):
         raise CrsError(
-            Text(f"the file says {stated.name!r}, ", Setting("points.crs"), f" says {given.name!r}"),
+            Text(f"the file states {stated.name!r}, but ", Setting("points.crs"), f" states {given.name!r}"),
             file=path,
             field="points.crs",
             remedy="leave the option out",
@@ -95,7 +95,7 @@ def _from_geocentric(
     for said in (given, stated):
         if said is not None and not said.is_ellipsoid:
             raise DatumError(
-                f"{crs.name!r} has X, Y, Z from the centre of the Earth and no heights above {said.label}",
+                f"{crs.name!r} is geocentric (X, Y, Z from the centre of the Earth), so it has no height datum",
                 file=path,
                 field="points.vertical",
                 remedy="leave the height datum out",
@@ -111,7 +111,7 @@ def _from_geocentric(
             file=path,
             field=wheres[first],
             remedy=Text(
-                "geocentric points need x, y and h (Z) in metres; other coordinates another ", Setting("points.crs")
+                "give x, y and h (Z) in metres from the centre of the Earth, or another ", Setting("points.crs")
             ),
         )
     return placed, pyproj.CRS.from_epsg(4326)
@@ -131,18 +131,18 @@ def _vertical_of(
     said = _certain(declared)
     if stated is not None and said is not None and stated != said:
         raise DatumError(
-            f"the file states its heights in {stated.label}, and its CRS {crs.name!r} in {said.label}",
+            f"the file states heights in {stated.label}, but its CRS {crs.name!r} has heights in {said.label}",
             file=path,
             field="vertical",
-            remedy="state the height datum once",
+            remedy="correct one of the two",
         )
     certain = stated or said
     if given is not None and certain is not None and given != certain:
         raise DatumError(
             Text(
-                f"the heights of these points are in {certain.label}, ",
+                f"the file states heights in {certain.label}, but ",
                 Setting("points.vertical"),
-                f" says {given.label}",
+                f" states {given.label}",
             ),
             file=path,
             field="points.vertical",
@@ -155,10 +155,10 @@ def _vertical_of(
         return Vertical("ellipsoid"), unit
     if found is None:
         raise DatumError(
-            "it is not known what the heights of these points are measured above",
+            "the height datum of these points is unknown",
             file=path,
             field="points.vertical",
-            remedy=Text("say it with ", Setting("points.vertical"), f" ({VERTICAL_FORMS})"),
+            remedy=Text("give it with ", Setting("points.vertical"), f" ({VERTICAL_FORMS})"),
         )
     return found, unit
 
@@ -182,7 +182,7 @@ def _ellipsoidal(
     outside = given & ~np.isfinite(undulation)
     if outside.any():
         raise DatumError(
-            f"the geoid of {vertical.label} does not reach this point",
+            f"{vertical.label} does not cover this point",
             file=path,
             field=wheres[int(np.flatnonzero(outside)[0])],
             remedy=Text("check its coordinates and ", Setting("points.crs")),
@@ -197,12 +197,12 @@ def _check_kind(path: str | os.PathLike[str], table: Table, crs: pyproj.CRS) -> 
     kind = "geographic" if crs.is_geographic else "geocentric" if crs.is_geocentric else "projected"
     if table.of_ground in (None, kind):
         return
-    named = "longitude" if table.of_ground == "geographic" else "easting"
+    named = "longitude and latitude" if table.of_ground == "geographic" else "easting and northing"
     raise CrsError(
-        f"the columns are called {named} and so on, but {crs.name!r} is {kind}",
+        f"the columns are named {named}, but {crs.name!r} is {kind}",
         file=path,
         field="points.crs",
-        remedy="give the CRS that these columns are in, or rename them x and y",
+        remedy="give the CRS of these columns, or rename them x and y",
     )
 
 
@@ -216,6 +216,7 @@ def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequenc
                     file=path,
                     field=where,
                     remedy=Text(
-                        "x is longitude and y latitude; projected coordinates need another ", Setting("points.crs")
+                        "give longitude as x and latitude as y; for projected coordinates give another ",
+                        Setting("points.crs"),
                     ),
                 )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, number, short, sigma_of
 
 Array = NDArray[np.float64]
@@ -53,10 +54,9 @@ def reconciled(sigma: Array, covariance: ArrayLike | None) -> tuple[Array, Array
     if wrong.any():
         k = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"sigma_image {sigma[k]:g} of point {k + 1} contradicts covariance_image, whose root mean square per axis "
-            f"is {derived[k]:g}",
+            f"sigma_image of point {k + 1} is {sigma[k]:g}, but its covariance_image gives {derived[k]:g}",
             field="sigma_image",
-            remedy="change both, or give the covariance by with_covariance_image",
+            remedy="change both, or use with_covariance_image",
         )
     return np.where(more, derived, sigma), np.where(more[:, None, None], given, square)
 
@@ -111,7 +111,7 @@ def checked_groups(groups: ArrayLike | None, count: int) -> Index:
     if found.shape != (count,):
         raise InputError(f"groups has the shape {found.shape}, not {(count,)}", field="groups")
     if count and (found.dtype.kind not in "iu" or (found < -1).any()):
-        raise InputError("groups are whole numbers, -1 for a point that errs on its own", field="groups")
+        raise InputError("groups must be integers, -1 for a point that shares no errors", field="groups")
     return found.astype(np.int64)
 
 
@@ -125,7 +125,7 @@ def checked_common(sigma: ArrayLike | None, count: int, name: str = "sigma_commo
     """
     found = np.zeros(count) if sigma is None else np.asarray(sigma, dtype=float)
     if found.shape != (count,) or not ((found >= 0) & np.isfinite(found)).all():
-        raise InputError(f"{name} is {count} numbers, none negative", field=name)
+        raise InputError(f"{name} must have {counted(count, 'number')}, none negative", field=name)
     return found
 
 
@@ -178,7 +178,7 @@ def read_image_errors(
     if not all(there[:3]):
         missing = CSV_ERRORS[there[:3].index(False)]
         raise InputError(
-            f"a covariance without {missing}",
+            f"the covariance has no {missing}",
             file=path,
             field=where[there.index(True)],
             remedy=f"give {', '.join(CSV_ERRORS[:3])}, or sigma_image alone",
@@ -188,18 +188,18 @@ def read_image_errors(
     matrix = np.array([[[column, both], [both, row]]])
     if not _is_positive_definite(matrix)[0]:
         raise InputError(
-            f"{short(values[2])} is too large for the covariance of column and row: it is not positive definite",
+            f"{short(values[2])} is too large: the covariance is not positive definite",
             file=path,
             field=where[2],
-            remedy="its square is below var_col times var_row",
+            remedy="the square of cov_col_row must be less than var_col times var_row",
         )
     derived = float(sigma_of_covariance(matrix)[0])
     if sigma is not None and not abs(sigma - derived) <= _SAME_SIGMA * derived:
         raise InputError(
-            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}",
+            f"sigma_image is {sigma:g}, but the covariance gives {derived:g}",
             file=path,
             field=where[0],
-            remedy="leave sigma_image empty where a covariance is given",
+            remedy="leave sigma_image empty",
         )
     return (column, row, both), group, common, alike
 
@@ -211,7 +211,7 @@ def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
             f"{short(value)} is not a group",
             file=path,
             field=where,
-            remedy="number the groups from 0 on; leave it empty for a point that errs on its own",
+            remedy="number the groups from 0; leave it empty for a point that shares no errors",
         )
     return int(found)
 

@@ -48,7 +48,7 @@ def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells:
     where = f"line {line.number}"
     if len(cells) != len(names):
         raise InputError(
-            f"{counted(len(cells), 'cell')} under {counted(len(names), 'column name')}", file=path, field=where
+            f"this line has {counted(len(cells), 'cell')}, but there are {len(names)} columns", file=path, field=where
         )
     given = dict(zip(names, cells, strict=True))
     if given.get("enable", "1") not in ("0", "1"):
@@ -81,13 +81,15 @@ def read_odm(path: str | os.PathLike[str], text: str) -> Table:
                     f"{short(line.text.strip())} is not a CRS",
                     file=path,
                     field=where,
-                    remedy="the first line of an ODM list is EPSG:n, a PROJ string, or like WGS84 UTM 33N",
+                    remedy="begin the list with EPSG:n, a PROJ string, or a name such as WGS84 UTM 33N",
                 )
             continue
         cells = line.text.strip().split("\t") if "\t" in line.text.strip() else line.text.split()
         cells = [cell.strip() for cell in cells if cell.strip()]
         if len(cells) < 6:
-            raise InputError(f"{counted(len(cells), 'cell')}, not x y z column row image", file=path, field=where)
+            raise InputError(
+                f"this line has {counted(len(cells), 'cell')}; expected: x y z column row image", file=path, field=where
+            )
         unknown_height = cells[2].lower() == "nan"
         x, y, column, row = (
             number(cells[k], path, f"{where}, column {name}")
@@ -132,14 +134,16 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
             continue
         if not layout:
             raise InputError(
-                "this layout of ENVI points is not known",
+                "unknown layout of ENVI points",
                 file=path,
                 field=where,
-                remedy="a comment line must say 'Map (x,y), Image (x,y)' or 'Map (x,y,elev), Image (x,y)'",
+                remedy="add a comment line '; Map (x,y), Image (x,y)' or '; Map (x,y,elev), Image (x,y)'",
             )
         cells = plain.split()
         if len(cells) < len(layout):
-            raise InputError(f"{counted(len(cells), 'cell')}, not {', '.join(layout)}", file=path, field=where)
+            raise InputError(
+                f"this line has {counted(len(cells), 'cell')}; expected: {', '.join(layout)}", file=path, field=where
+            )
         given = dict(zip(layout, cells, strict=False))
         image = given.pop("image file", None)
         if image is not None and image not in images:
@@ -147,7 +151,7 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
                 f"no comment FileName{short(image)[1:-1]}= names the image of this point",
                 file=path,
                 field=where,
-                remedy="name it, for example ; FileName0=scene.tif",
+                remedy="add this comment, for example ; FileName0=scene.tif",
             )
         value = {name: number(cell, path, f"{where}, {name}") for name, cell in given.items()}
         at = (value["image x"] - 1.0, value["image y"] - 1.0)
@@ -198,10 +202,10 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         cells = re.split(r"\s*,\s*|\s+", line.text.strip())
         if len(cells) < 12 or (len(cells) - 7) % 5:
             raise InputError(
-                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image",
+                f"this line has {counted(len(cells), 'cell')}; expected: 7 of the point and 5 of each image",
                 file=path,
                 field=where,
-                remedy="id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
+                remedy="write id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
             )
         lat, lon, height = (
             number(cells[k], path, f"{where}, {name}") for k, name in ((1, "latitude"), (2, "longitude"), (3, "height"))
@@ -233,18 +237,22 @@ def read_links(path: str | os.PathLike[str], text: str) -> Table:
     for line in lines:
         cells, where = line.text.split(), f"line {line.number}"
         if len(cells) not in (4, 5):
-            raise InputError(f"{counted(len(cells), 'cell')}, not [id] from-x from-y to-x to-y", file=path, field=where)
+            raise InputError(
+                f"this line has {counted(len(cells), 'cell')}; expected: [id] from-x from-y to-x to-y",
+                file=path,
+                field=where,
+            )
         x, minus_row, *to = (
             number(cell, path, f"{where}, {name}")
             for cell, name in zip(cells[-4:], ("from-x", "from-y", "to-x", "to-y"), strict=True)
         )
         if minus_row > 1.0:
             raise InputError(
-                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say",
+                f"from-y is {minus_row:g}, but it must be minus the row",
                 file=path,
                 field=f"{where}, from-y",
-                remedy="make the links on the raster without its georeference, where y is "
-                "minus the row, or give the points as CSV with the columns Pixel and Line",
+                remedy="make the links on the raster without its georeference, or give the points as CSV with the "
+                "columns Pixel and Line",
             )
         label = cells[0] if len(cells) == 5 else None
         table.rows.append(PointRow(where, label, (x, -minus_row), (to[0], to[1], math.nan)))

@@ -142,10 +142,10 @@ def numbered_ids(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> tupl
         row.id = row.id if row.id is not None else str(count)
         if row.id in first:
             raise InputError(
-                f"the id {row.id!r} stands twice, first in {first[row.id]}",
+                f"two points have the id {row.id!r}; the first is in {first[row.id]}",
                 file=path,
                 field=row.where,
-                remedy="give each point an id of its own",
+                remedy="give each point a different id",
             )
         first[row.id] = row.where
     return tuple(str(row.id) for row in rows)
@@ -184,11 +184,11 @@ def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> flo
         raise InputError(
             f"{origin!r} is not a pixel origin",
             field="points.pixel_origin",
-            remedy=f"one of {', '.join(PIXEL_ORIGINS)}",
+            remedy=f"use one of {', '.join(PIXEL_ORIGINS)}",
         )
     if origin != "corner" and not table.origin_allowed:
         raise InputError(
-            f"the format {table.format} says itself what its first pixel is called",
+            f"the format {table.format} defines its own pixel origin",
             file=path,
             field="points.pixel_origin",
             remedy="leave the option out",
@@ -208,21 +208,23 @@ def load_text(path: str | os.PathLike[str]) -> str:
     data = read_bounded(path, MAX_FILE, remedy="check the path")
     if len(data) > MAX_FILE:
         raise InputError(
-            f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path, remedy="thin the points out"
+            f"this file is larger than {MAX_FILE // 1_000_000} MB, the limit for point files",
+            file=path,
+            remedy="use fewer points",
         )
     if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
         raise InputError(
-            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published",
+            "cannot read GCP files of ERDAS IMAGINE (.gcc): their format is not published",
             file=path,
-            remedy="export the cell array of the GCP tool as text, and give its columns names such as Name, Pixel, "
-            "Line, Easting, Northing, Elev",
+            remedy="export the cell array of the GCP tool as text, and name its columns Name, Pixel, Line, Easting, "
+            "Northing, Elev",
         )
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
         line = data[: data.index(b"\0")].count(b"\n") + 1
         raise InputError(
-            "a NUL byte: this is not a text file", file=path, field=f"line {line}", remedy="save it as text (UTF-8)"
+            "this is not a text file (NUL byte)", file=path, field=f"line {line}", remedy="save it as text (UTF-8)"
         )
     try:
         return data.decode("utf-8-sig")
@@ -259,7 +261,9 @@ def short(value: Any) -> str:
 def lines_of(path: str | os.PathLike[str], text: str) -> Iterator[Line]:
     for count, line in enumerate(text.splitlines(), start=1):
         if len(line) > MAX_LINE:
-            raise InputError(f"a line of {len(line)} characters", file=path, field=f"line {count}")
+            raise InputError(
+                f"this line has {len(line)} characters; the limit is {MAX_LINE}", file=path, field=f"line {count}"
+            )
         if line.strip():
             yield Line(count, line)
 
@@ -290,4 +294,4 @@ def cells_of(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[s
         text = " ".join(line.text.split()) if delimiter == " " else line.text
         return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter, strict=True))]
     except csv.Error as error:
-        raise InputError(f"the line cannot be split ({error})", file=path, field=f"line {line.number}") from error
+        raise InputError(f"this line is not valid CSV ({error})", file=path, field=f"line {line.number}") from error

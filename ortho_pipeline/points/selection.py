@@ -44,7 +44,7 @@ def select_control(points: Points, spec: str) -> Points:
         count, other = _numbers(rest, spec)
         if count > len(rows):
             raise TooFewPoints(
-                f"{spec!r} asks for {count} of {counted(len(rows), 'control point')}",
+                f"{spec!r} selects {count} points, but the file has {counted(len(rows), 'control point')}",
                 file=points.source or None,
                 field="points.select",
             )
@@ -66,7 +66,7 @@ def select_control(points: Points, spec: str) -> Points:
 
 
 def _unknown(spec: str) -> InputError:
-    return InputError(f"{spec!r} does not select points", field="points.select", remedy=f"give {_FORMS}")
+    return InputError(f"{spec!r} is not a selection of points", field="points.select", remedy=f"give {_FORMS}")
 
 
 def _numbers(text: str, spec: str) -> tuple[int, int | None]:
@@ -84,14 +84,14 @@ def _named(points: Points, text: str) -> list[int]:
     unknown = [name for name in names if name not in points.ids]
     if unknown or not names:
         raise InputError(
-            f"there is no point {', '.join(unknown)}" if unknown else "no point is named",
+            f"there is no point {', '.join(unknown)}" if unknown else "the selection names no point",
             file=points.source or None,
             field="points.select",
             remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points) > 12 else ''}",
         )
     wrong = [name for name in names if points.roles[points.ids.index(name)] != "control"]
     if wrong:
-        raise InputError(f"{', '.join(wrong)}: no control point", file=points.source or None, field="points.select")
+        raise InputError(f"not a control point: {', '.join(wrong)}", file=points.source or None, field="points.select")
     return [points.ids.index(name) for name in names]
 
 
@@ -165,4 +165,6 @@ def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
             )
         roles[np.isin(np.array(points.ids), names)] = "check"
         return points.with_roles(roles)
-    raise InputError(f"{spec!r} does not choose check points", field="points.check", remedy="give every:N or ids:a,b,c")
+    raise InputError(
+        f"{spec!r} is not a selection of check points", field="points.check", remedy="give every:N or ids:a,b,c"
+    )

@@ -60,7 +60,7 @@ def marks_warning(control: HasGround) -> list[Notice]:
         return []
     shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
     text = (
-        f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
-        "and redundancy and sigmas are too good by that; keep one of them"
+        f"control points are within a centimetre of each other ({shown}). A mark that was measured twice counts as "
+        "two points, so redundancy and sigmas look too good: keep one point of each pair"
     )
     return [Notice("one-mark-twice", text, pairs=[list(pair) for pair in pairs])]

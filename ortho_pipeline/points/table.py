@@ -59,7 +59,7 @@ Array = NDArray[np.float64]
 
 #: Standard deviation (px) of an image measurement whose file gives none.
 DEFAULT_SIGMA_IMAGE = 0.5
-_FORMATS = "see docs/formats.md for what stands in a file of points"
+_FORMATS = "see docs/formats.md for the formats of point files"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -131,11 +131,11 @@ class Points:
             object.__setattr__(self, name, checked_common(getattr(self, name), count, name))
         roles = np.asarray(self.roles, dtype="<U7")
         if roles.shape != (count,) or not set(roles.tolist()) <= set(ROLES):
-            raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+            raise InputError(f"each role must be one of {', '.join(ROLES)}", field="roles")
         object.__setattr__(self, "roles", roles)
         if len(set(self.ids)) != count:
             twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
-            raise InputError(f"the id {twice[0]!r} stands twice", file=self.source or None, field="id")
+            raise InputError(f"two points have the id {twice[0]!r}", file=self.source or None, field="id")
 
     @classmethod
     def of(
@@ -345,7 +345,7 @@ def gcps_of_dataset(
     path = dataset.GetDescription()
     gcps = dataset.GetGCPs()
     if not gcps:
-        raise InputError("this raster carries no ground control points", file=path, remedy="give a point file")
+        raise InputError("this raster has no ground control points", file=path, remedy="give a point file")
     names = [plain_id(gcp.Id) for gcp in gcps]
     named = all(names) and len(set(names)) == len(gcps)
     flat = all(gcp.GCPZ == 0 for gcp in gcps)
@@ -360,7 +360,7 @@ def gcps_of_dataset(
     ]
     image, ground = np.array([row.image for row in rows]), np.array([row.ground for row in rows])
     if not (np.isfinite(image).all() and np.isfinite(ground[:, :2]).all()):
-        raise InputError("a ground control point is not finite", file=path, field="GCP")
+        raise InputError("a coordinate of a ground control point is not finite", file=path, field="GCP")
     table = Table("GCPs", rows, crs=dataset.GetGCPProjection() or None)
     placed, plane = ground_of(path, table, crs, vertical)
     refuse_duplicates(path, [row.where for row in rows], image, placed, [row.role for row in rows])
@@ -398,16 +398,18 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
     suffix = Path(path).suffix.lower()
     if suffix not in writers:
-        raise InputError("points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}")
+        raise InputError(
+            "points cannot be written in this format", file=path, remedy=f"use one of {', '.join(writers)}"
+        )
     if images is not None and writers[suffix] is not _csv_text:
-        raise InputError(f"{suffix} does not say in which file a point was measured", file=path, remedy="write .csv")
+        raise InputError(f"{suffix} files cannot name the image of a point", file=path, remedy="write .csv")
     odd = next((name for name in points.ids if not name or name != plain_id(name) or not is_writable(name)), None)
     if odd is not None and writers[suffix] is not _qgis_text:
         raise InputError(
-            f"the id {short(odd)} would be read as another one",
+            f"the id {short(odd)} would be different when it is read again",
             file=path,
             field="id",
-            remedy="give each point a name without line breaks, and no blanks around it or in a row",
+            remedy="use ids without line breaks, without blanks around them, and without several blanks in a row",
         )
     write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 

@@ -572,7 +572,7 @@ def test_poor_fit_warns_or_is_refused(monkeypatch, caplog):
     assert "only to" in poor.warnings[0]
     assert "only to" in caplog.text
     monkeypatch.setattr(Wavy, "amplitude", 1.0)
-    with pytest.raises(InputError, match="stands for this model only to"):
+    with pytest.raises(InputError, match="represents this model only to"):
         export_rpc(Wavy())
     assert export_rpc(Wavy(), force=True).max_error_px > 0.5
 

@@ -58,8 +58,8 @@ PARAMETERS = (*EXTERIOR, *INTERIOR)
 #: Warning for a camera whose `FrameCamera.sees_ground` is false.
 LOOKS_PAST = Notice(
     "only-a-start",
-    "by its exterior orientation the camera looks past the ground: the model only starts an adjustment to ground "
-    "control points",
+    "with this exterior orientation the camera looks past the ground. The model is only a start for an adjustment: "
+    "add control points",
 )
 #: A point that is not seen is NaN, not a warning.
 _quiet = partial(np.errstate, invalid="ignore", divide="ignore", over="ignore")
@@ -104,7 +104,7 @@ class FrameCamera(SensorModel):
     def __post_init__(self) -> None:
         exterior = np.array(self.exterior, dtype=np.float64)
         if exterior.shape != (6,) or not np.isfinite(exterior).all():
-            raise InputError("the exterior orientation has six finite numbers", field="exterior")
+            raise InputError("the exterior orientation needs six finite numbers", field="exterior")
         exterior.setflags(write=False)
         object.__setattr__(self, "exterior", exterior)
         for name, count in (("origin", 3), ("heights", 2)):
@@ -304,7 +304,7 @@ class FrameCamera(SensorModel):
         """Make the model from what `to_dict` returned."""
         interior, exterior = data.get("interior"), data.get("exterior")
         if not isinstance(interior, dict) or not isinstance(exterior, dict) or set(exterior) != set(EXTERIOR):
-            raise InputError("a frame camera has an interior and an exterior orientation", field="interior, exterior")
+            raise InputError("a frame camera needs an interior and an exterior orientation", field="interior, exterior")
         values = np.array([exterior[name] for name in EXTERIOR], dtype=np.float64)
         return super().from_dict({**data, "interior": Interior(**interior), "exterior": values})
 
@@ -312,5 +312,5 @@ class FrameCamera(SensorModel):
 def _finite(values: tuple[float, ...], count: int, field: str) -> tuple[float, ...]:
     values = tuple(float(value) for value in values)
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{values}: not {counted(count, 'finite number')}", field=field)
+        raise InputError(f"{values} is not {counted(count, 'finite number')}", field=field)
     return values

@@ -51,7 +51,7 @@ def heights_below(position: ArrayLike, heights: tuple[float, float]) -> tuple[fl
     low, high = heights
     altitude = float(geodetic(np.asarray(position, dtype=np.float64)[None])[0, 2])
     if not altitude > low:
-        raise InputError(f"a camera {altitude:.0f} m high sees no ground", field="position")
+        raise InputError(f"a camera at a height of {altitude:.0f} m sees no ground", field="position")
     return low, min(high, low + _BELOW * (altitude - low))
 
 

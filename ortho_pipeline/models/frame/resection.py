@@ -78,7 +78,7 @@ def resect(
         starts = _best(list(_solutions(place, bearings)), place, bearings)
     if not starts:
         raise DegeneratePoints(
-            "the control points lie on a line, on the ground or in the image",
+            "the control points are on one line, on the ground or in the image",
             file=points.source or None,
             remedy="spread the points over the image",
         )
@@ -87,8 +87,8 @@ def resect(
     best = int(np.argmin(misses))
     if not math.isfinite(misses[best]) or misses[best] > 0.05 * math.hypot(interior.width, interior.height):
         raise NotConverged(
-            "no orientation brings these points and this camera together",
-            remedy="check focal length and pixel pitch, and the points (column, row; x, y, height)",
+            "no orientation of this camera fits the control points",
+            remedy="check focal length, pixel pitch, and the points (column, row; x, y, height)",
         )
     return refined[best]._replace(heights=heights or _heights(refined[best], control))
 

@@ -148,10 +148,10 @@ class ProjectionFrame:
 def require_frame(frame: str, ground_crs: str) -> None:
     """Raise `InputError` unless there is such a working frame, for ground in such a CRS."""
     if frame not in (TOPOCENTRIC, MAP):
-        raise InputError(f"{frame!r} is not a working frame", field="frame", remedy=f"{TOPOCENTRIC} or {MAP}")
+        raise InputError(f"{frame!r} is not a working frame", field="frame", remedy=f"use {TOPOCENTRIC} or {MAP}")
     if (frame == TOPOCENTRIC) != (ground_crs == GEOGRAPHIC):
         raise InputError(
-            f"a {frame} frame does not go with ground in {ground_crs}",
+            f"a {frame} frame cannot be used with ground in {ground_crs}",
             field="ground_crs",
-            remedy=f"{GEOGRAPHIC} for {TOPOCENTRIC}, a projected CRS for {MAP}",
+            remedy=f"use {GEOGRAPHIC} for {TOPOCENTRIC}, a projected CRS for {MAP}",
         )

@@ -43,7 +43,7 @@ class LightPath:
 
     def __post_init__(self) -> None:
         if not (isinstance(self.aberration, bool) and isinstance(self.refraction, bool)):
-            raise InputError("aberration and refraction are true or false", field="light")
+            raise InputError("aberration and refraction must be true or false", field="light")
 
     @property
     def numbers(self) -> tuple[float, float]:

@@ -55,13 +55,13 @@ class Observations:
         times = np.array(self.times, dtype=np.float64)
         values, sigma = (np.array(value, dtype=np.float64) for value in (self.values, self.sigma))
         if times.ndim != 1 or values.shape != (len(times), 3) or sigma.shape != values.shape:
-            raise InputError("observations have k times and k x 3 values and sigmas", field="observations")
+            raise InputError("observations need k times, and k x 3 values and sigmas", field="observations")
         if not (np.isfinite(times).all() and np.isfinite(values).all() and np.isfinite(sigma).all()):
             raise InputError("an observation is not finite", field="observations")
         if not (sigma > 0).all() or self.derivative not in (0, 1):
-            raise InputError("sigmas are positive, and values or rates are observed", field="observations")
+            raise InputError("sigmas must be positive, and values or rates must be observed", field="observations")
         if not isinstance(self.fictitious, bool):
-            raise InputError(f"fictitious is true or false, not {self.fictitious!r}", field="fictitious")
+            raise InputError(f"fictitious must be true or false, not {self.fictitious!r}", field="fictitious")
         for name, value in (("times", times), ("values", values), ("sigma", sigma)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -107,11 +107,13 @@ class OrbitShape:
     def __post_init__(self) -> None:
         given = [value for value in (self.plane, self.circular, self.radius, self.radius_sigma) if value is not None]
         if not all(np.isfinite(value) and value > 0 for value in given):
-            raise InputError("soft constraints have positive sigmas", field="shape")
+            raise InputError("sigmas of soft constraints must be positive", field="shape")
         if not (isinstance(self.samples, int) and 1 <= self.samples <= MOST_SAMPLES):
-            raise InputError(f"1 to {MOST_SAMPLES} times are asked for, not {self.samples!r}", field="samples")
+            raise InputError(
+                f"the number of samples must be 1 to {MOST_SAMPLES}, not {self.samples!r}", field="samples"
+            )
         if (self.radius is None) != (self.radius_sigma is None):
-            raise InputError("a radius comes with its sigma", field="radius_sigma")
+            raise InputError("a radius needs its sigma", field="radius_sigma")
 
     def of(self, path: Path, span: tuple[float, float]) -> Constraints:
         """Return the pseudo-observations of a path between the times of its first and last row."""

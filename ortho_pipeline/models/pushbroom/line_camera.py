@@ -57,14 +57,14 @@ class LineCamera:
 
     def __post_init__(self) -> None:
         if not all(1 <= size <= MOST_PIXELS and size == int(size) for size in (self.width, self.height)):
-            raise InputError(f"{self.width} x {self.height} is not a size of an image", field="width, height")
+            raise InputError(f"{self.width} x {self.height} is not an image size", field="width, height")
         for name in ("dx", "dy"):
             value = np.array(getattr(self, name), dtype=np.float64).ravel()
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         numbers = [self.principal_column, self.principal_line, self.focal_length, *self.dx, *self.dy]
         if not np.isfinite(numbers).all() or self.focal_length == 0:
-            raise InputError("a camera has finite numbers and a focal length", field="focal_length")
+            raise InputError("a camera needs finite numbers, and a focal length that is not zero", field="focal_length")
 
     @classmethod
     def of_polynomials(cls, width: int, height: int, across: ArrayLike, along: ArrayLike) -> Self:
@@ -83,7 +83,7 @@ class LineCamera:
         """
         u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (across, along))
         if len(u) < 2 or u[1] == 0:
-            raise InputError("a line whose look angle does not change with the column is not an image", field="across")
+            raise InputError("the look angle does not change with the column", field="across")
         focal, half = 1.0 / float(u[1]), width / 2
         # x = half (1 + xi): the polynomials in xi that the terms beyond the linear one make.
         shifted = np.polynomial.Polynomial([half, half])
@@ -117,10 +117,10 @@ class LineCamera:
         x, u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (columns, across, along))
         xi = 2 * x / width - 1
         if len(x) < 2 or not np.isfinite([x, u, v]).all() or not (np.diff(x) > 0).all():
-            raise InputError("look angles are finite numbers at two or more growing columns", field="columns")
+            raise InputError("look angles must be finite numbers at two or more increasing columns", field="columns")
         start, slope = np.polynomial.polynomial.polyfit(xi, u, 1)
         if not abs(slope) > 1e-12:
-            raise InputError("a line whose look angle does not change with the column is not an image", field="across")
+            raise InputError("the look angle does not change with the column", field="across")
         half = width / 2
         focal = half / float(slope)
         x0, y0 = half - focal * float(start), -focal * float(v.mean())
@@ -199,6 +199,7 @@ def _followed(xi: Array, wanted: Array, rounding: float) -> Array:
             return terms
     if not miss <= max(rounding, TABLE_MISS):
         raise InputError(
-            f"the look angles are up to {miss:.3g} px off any smooth line of detectors", field="across, along"
+            f"the look angles are not those of a smooth line of detectors; they differ by up to {miss:.3g} px",
+            field="across, along",
         )
     return terms

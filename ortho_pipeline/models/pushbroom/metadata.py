@@ -154,9 +154,9 @@ def _corner_points(corners: ArrayLike, heights: tuple[float, float]) -> Array:
     if points.shape == (4, 2):
         points = np.column_stack([points, np.full(4, sum(heights) / 2)])
     if points.shape != (4, 3) or not np.isfinite(points).all():
-        raise InputError(f"an image has four corners lon, lat (and height), not {points.shape}", field="corners")
+        raise InputError(f"the corners must be four of lon, lat (and height), not {points.shape}", field="corners")
     if (np.abs(points[:, 1]) > 90).any():
-        raise InputError("a latitude is beyond 90 degrees", field="corners", remedy="give lon, lat")
+        raise InputError("a latitude is larger than 90 degrees", field="corners", remedy="give lon, lat")
     return points
 
 
@@ -182,9 +182,9 @@ def _orbit_over(ground: Array, radius: float, view: Array, yaw: float) -> tuple[
         if np.abs(ends - before).max() < _SETTLED:
             return ends, orbital, 2 * half
     raise InputError(
-        "no orbit at this height sees these corners under these look angles",
+        "no orbit at this height sees these corners with these look angles",
         field="corners, altitude, along_deg, across_deg",
-        remedy="check the corners' order and the units: degrees, metres",
+        remedy="check the order of the corners and the units: degrees, metres",
     )
 
 
@@ -197,12 +197,14 @@ def _focal_length(
     sign = np.sign(rows @ orbital[:, 1])
     if sign[0] * sign[1] <= 0:
         raise InputError(
-            "first and last row do not run the same way", field="corners", remedy="go around: UL, UR, LR, LL"
+            "first and last row have opposite directions",
+            field="corners",
+            remedy="give them in the order UL, UR, LR, LL",
         )
     if length is not None and pixel:
         focal = length / pixel
     elif length is not None or pixel is not None:
-        raise InputError("focal length and pixel size come together", field="focal_length, pixel_size")
+        raise InputError("focal length and pixel size must both be given, or neither", field="focal_length, pixel_size")
     else:
         lines = np.stack([ground[:2].mean(axis=0), ground[2:].mean(axis=0)]) - ends
         distance = np.linalg.norm(lines, axis=1)
@@ -257,7 +259,9 @@ def _met(model: Pushbroom, corners: Array) -> Pushbroom:
         miss = image - turned.ground_to_image(corners)
         slopes = turned.param_partials(corners).reshape(8, 3)
         if not np.isfinite(miss).all():
-            raise InputError("the start does not see the corners", field="corners, altitude, along_deg, across_deg")
+            raise InputError(
+                "the start model does not see the corners", field="corners, altitude, along_deg, across_deg"
+            )
         step = np.linalg.lstsq(slopes, miss.ravel(), rcond=None)[0]
         turned = turned.with_params(turned.params + step)
         if np.abs(step).max() < 1e-9:

@@ -132,7 +132,7 @@ class Pushbroom(SensorModel):
             object.__setattr__(self, name, exact_rotation(getattr(self, name), name))
         object.__setattr__(self, "line_period", float(self.line_period))
         if not (math.isfinite(self.line_period) and self.line_period):
-            raise InputError(f"{self.line_period} s is not a time from row to row", field="line_period")
+            raise InputError(f"{self.line_period} s is not a line period", field="line_period")
         low, high = (float(value) for value in self.heights)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise InputError(f"heights from {low} to {high} are not a range", field="heights")
@@ -332,14 +332,14 @@ def _parts(data: dict[str, Any]) -> dict[str, Any]:
     parts: dict[str, Any] = {}
     for name, make in (("camera", LineCamera), ("path", Spline), ("attitude", Spline), ("shape", OrbitShape)):
         if not isinstance(data.get(name), dict):
-            raise InputError(f"a pushbroom has its {name}", field=name)
+            raise InputError(f"a pushbroom model needs its {name}", field=name)
         parts[name] = make(**data[name])
     for name in ("path_observations", "attitude_observations"):
         if not isinstance(data.get(name), list | tuple):
-            raise InputError("a list of tables belongs here, which may be empty", field=name)
+            raise InputError("this must be a list of tables; it may be empty", field=name)
         parts[name] = tuple(Observations(**table) for table in data[name])
     if not isinstance(light := data.get("light", {}), dict):
-        raise InputError("aberration and refraction belong here", field="light")
+        raise InputError("this must be aberration and refraction", field="light")
     parts["light"] = LightPath(**light)
     return parts
 

@@ -39,14 +39,16 @@ class Spline:
     def __post_init__(self) -> None:
         breaks, coefficients = (np.array(value, dtype=np.float64) for value in (self.breaks, self.coefficients))
         if not (isinstance(self.degree, int) and isinstance(self.beyond, int)):
-            raise InputError(f"degrees {self.degree} and {self.beyond} are not whole numbers", field="degree, beyond")
+            raise InputError(f"degrees {self.degree} and {self.beyond} are not integers", field="degree, beyond")
         if not 1 <= self.degree <= 5 or not 0 <= self.beyond <= self.degree:
-            raise InputError(f"degree {self.degree}, continued with {self.beyond}, is not a spline", field="degree")
+            raise InputError(
+                f"a spline cannot have degree {self.degree} and {self.beyond} beyond its ends", field="degree"
+            )
         if breaks.ndim != 1 or len(breaks) < 2 or not np.isfinite(breaks).all() or not (np.diff(breaks) > 0).all():
-            raise InputError("the knots of a spline are at least two increasing times", field="breaks")
+            raise InputError("the knots of a spline must be at least two increasing times", field="breaks")
         if coefficients.shape != (len(breaks) - 1 + self.degree, 3) or not np.isfinite(coefficients).all():
             raise InputError(
-                f"a spline of degree {self.degree} with {len(breaks)} knots has {len(breaks) - 1 + self.degree} x 3 "
+                f"a spline of degree {self.degree} with {len(breaks)} knots needs {len(breaks) - 1 + self.degree} x 3 "
                 f"finite coefficients, not {coefficients.shape}",
                 field="coefficients",
             )
@@ -72,7 +74,7 @@ class Spline:
         basis = empty.basis(times)
         if not (np.isfinite(basis).all() and np.isfinite(values).all()):
             raise InputError(
-                "times or values of a table are so far apart that no spline follows them",
+                "no spline can follow this table: its times or values are too far apart",
                 field="breaks",
                 remedy="the file is damaged: copy it again",
             )

@@ -81,13 +81,13 @@ def pushbroom_of_tables(
     needed = (first_time, last, abs(line_period))
     times, positions = _table(orbit, (3,), needed, degree, "orbit")
     if not (np.abs(positions) < _FARTHEST).all():
-        raise InputError("a position of this table is no place of a satellite (ECEF metres)", field="orbit")
+        raise InputError("this table has a position where no satellite can be (ECEF metres)", field="orbit")
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     if not (steps <= _FASTEST * np.diff(times) + _ROUNDED).all():
         raise InputError(
-            f"between two positions of this table lie {steps.max():.4g} m: no satellite is so fast",
+            f"two successive positions are {steps.max():.4g} m apart: no satellite is that fast",
             field="orbit",
-            remedy="the file is damaged: copy it again; or give positions in ECEF metres at times in seconds",
+            remedy="give ECEF metres and seconds; if they are, the file is damaged: copy it again",
         )
     turn_times, turns = _table(attitude, (3, 3), needed, degree, "attitude")
     if not are_rotations(turns):
@@ -139,7 +139,7 @@ def rotations_of_quaternions(quaternions: ArrayLike, *, scalar: str = "first") -
     """
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or scalar not in ("first", "last"):
-        raise InputError("quaternions are N x 4 numbers, their scalar first or last", field="quaternions")
+        raise InputError("quaternions must be N x 4 numbers, with the scalar first or last", field="quaternions")
     if not (np.linalg.norm(q, axis=1) > 0).all():
         raise InputError("a quaternion is zero or not finite", field="quaternions")
     from scipy.spatial.transform import Rotation
@@ -179,13 +179,13 @@ def _table(
     if times.ndim != 1 or values.shape != (len(times), *shape) or len(times) <= degree:
         raise InputError(f"more than {degree} times with {shape} values each are needed", field=name)
     if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
-        raise InputError("a table has finite values at increasing times", field=name)
+        raise InputError("a table needs finite values at increasing times", field=name)
     times = times - first
     earliest, latest = sorted((0.0, last))
     # The rim of a row more or less is not a reason to refuse a table: vendors' tables end at centres of rows.
     if times[0] > earliest + slack or times[-1] < latest - slack:
         raise InputError(
-            f"this table is from {times[0]:.6g} to {times[-1]:.6g} s after the first row, the image from"
+            f"this table covers {times[0]:.6g} to {times[-1]:.6g} s after the first row, but the image needs"
             f" {earliest:.6g} to {latest:.6g} s",
             field=name,
             remedy="give a table that covers the image, in the time system of first_time",
