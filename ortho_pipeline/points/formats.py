@@ -1,6 +1,6 @@
-"""Point files as they are written: which reader a file is for, and which of its points belong to an image.
+"""Formats of point files: find the reader of a file, and the points that belong to an image.
 
-A new format is a reader, in `link_lists` if it is a list of another program, and one entry of `_FORMATS`.
+A new format is a reader (in `link_lists` if it is a list of another program) and one entry of `_FORMATS`.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from ortho_pipeline.points.rows import (
 
 
 class _Format(NamedTuple):
-    """A format: its name, its reader, what a file of it has to hold, and how one is known.
+    """A format: its name, its reader, and how to recognise its files.
 
-    `known` takes the suffix, the first characters and the first line. `of_block` says which columns of a block's table
-    it can hold. `wanted` is the remedy of errors whose own place knows no better one.
+    `known` takes the suffix, the first characters and the first line. `of_block` lists the tables of blocks that it can
+    hold. `wanted` is the remedy of errors that have no better one.
     """
 
     name: str
@@ -44,7 +44,7 @@ class _Format(NamedTuple):
     of_block: tuple[ColumnRules, ...] = ()
 
 
-#: In the order in which they are tried: content tells them apart, then the suffix.
+#: In the order in which they are tried: content first, then the suffix.
 _FORMATS = (
     _Format(
         "GeoJSON with 'ji'",
@@ -93,7 +93,7 @@ _FORMATS = (
         lambda suffix, start, first: LINK_TABLE.match(first),
     ),
 )
-_NAMES = ", ".join(one.name for one in _FORMATS)
+_NAMES = ", ".join(kind.name for kind in _FORMATS)
 
 
 @reads("see docs/formats.md for the formats of point files")
@@ -102,20 +102,19 @@ def read_table(
     image_name: str | None = None,
     pieces: Mapping[str, Placement] | None = None,
 ) -> Table:
-    """Read a point file; its format is known by its content, then by its suffix.
+    """Read a point file; its content shows its format, or else its suffix.
 
     Parameters
     ----------
     image_name : str, optional
-        Keep the points of this image, where a file holds points of several.
+        Keep only the points of this image.
     pieces : mapping of str to (float, float, float), optional
-        Further images whose points are kept: column and row of their first corner in this image, and the width of one
-        of their pixels.
+        Further images to keep: column and row of their first corner in this image, and the width of their pixels.
 
     Raises
     ------
     InputError
-        For anything that is not a table of finite numbers; names file, line and column.
+        For anything that is not a table of finite numbers. The message names file, line and column.
     """
     text = load_text(path)
     table = _read(_format_of(path, text), path, text)
@@ -125,12 +124,12 @@ def read_table(
 
 
 def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BLOCK) -> Table:
-    """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
+    """Read the rays of a block (CSV, GeoJSON, ODM, ASP), or ground points (`OF_GROUND`, `OF_HEIGHTS`; CSV, GeoJSON).
 
     Raises
     ------
     InputError
-        As `read_table`; also for a line that does not say which image it is of.
+        As `read_table`; also for a line that does not name its image.
     """
     text = load_text(path)
     kind = _format_of(path, text)
@@ -140,7 +139,7 @@ def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BL
             file=path,
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
         )
-    # Only formats whose columns have names can be asked for those of ground alone.
+    # Only formats with named columns can hold ground points alone.
     table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
     if not table.rows:
         raise InputError("this file has no points", file=path, remedy="add points to it")
@@ -195,14 +194,14 @@ def _of_image(
     kept: list[PointRow] = []
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
-        # A point that was measured in several of the images counts once: where it was measured first, this image ahead.
+        # A point that was measured in several images counts once: in this image, else in the first piece.
         kept += [
             replace(row, piece=piece)
             for row in table.rows
             if row.image_name and Path(row.image_name).stem.lower() == wanted and row.id not in ids
         ]
     if not kept and table.format == "GeoJSON" and len(named) == 1:
-        # The 'filename' of a GeoJSON is a remark; a renamed image still has these points.
+        # The 'filename' of a GeoJSON is only a note; a renamed image still has these points.
         return table
     if not kept:
         some = ", ".join(sorted(map(str, named))[:5])

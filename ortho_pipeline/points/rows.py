@@ -1,7 +1,7 @@
-"""The table of points that every reader of a point file fills, and how text and numbers of strangers are read.
+"""The table of points that every reader of a point file fills, and how text and numbers of a file are checked.
 
-Image points are (column, row) from the outer corner of the first pixel, ground points as the file has them, with what
-it says about their CRS. `ortho_pipeline.points` makes ellipsoidal heights of that.
+Image points are (column, row) from the outer corner of the first pixel. Ground points are as in the file, with the CRS
+that it states; `points.ground` makes ellipsoidal heights.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from ortho_pipeline.options import PIXEL_ORIGINS
 
 Array = NDArray[np.float64]
 
-#: A point file beyond this is not read (bytes), nor a line beyond that (characters).
+#: Limits: bytes of a point file, characters of a line.
 MAX_FILE = 32_000_000
 MAX_LINE = 100_000
-#: A standard deviation beyond this has no square.
+#: The square of a larger standard deviation would overflow.
 MAX_SIGMA = 1e150
 ROLES = ("control", "check", "tie")
 CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_xy", "sigma_h")
-#: Column of a CSV of several images: the file that a point was measured in.
+#: Column of a CSV of several images: the image in which a point was measured.
 CSV_IMAGE = "image"
-#: Columns of points whose errors differ with the direction, or are shared with those of neighbours, or with all.
+#: Columns for errors that differ with the direction, or that points share with neighbours or with all others.
 CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common", "sigma_alike")
 
 
 class ColumnRules(NamedTuple):
-    """Columns that a CSV may have, those that every line fills, and the role of lines that give none."""
+    """Columns that a CSV may have, those that every line needs, and the default role."""
 
     names: tuple[str, ...]
     needed: tuple[str, ...]
     role: str
 
 
-#: Points of one image; rays of a block, whose ground may be known; ground whose heights count; ground alone.
+#: Points of one image; rays of a block, with or without ground; ground points that test heights; ground points.
 OF_IMAGE = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
 OF_BLOCK = ColumnRules(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
 OF_HEIGHTS = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
@@ -53,16 +53,18 @@ OF_GROUND = ColumnRules(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x",
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
-#: Where another image lies in this one: column and row of its first corner, and the width of one of its pixels.
+#: Position of another image in this one: column and row of its first corner, and the width of its pixels.
 Placement = tuple[float, float, float]
 OWN_IMAGE: Placement = (0.0, 0.0, 1.0)
 
 
 class TablePoint(NamedTuple):
-    """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres.
+    """A point of a table: `image` and `sigma_image` in px, `sigma_ground` in metres.
 
-    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`; so are `sigma_common` (m) and
-    `sigma_alike` (px).
+    `covariance_image` (px^2) is the covariance of column and row. Points with the same `group` from 0 on share errors,
+    as matched neighbours do; -1 means no shared errors. `sigma_common` (m, per axis) is an error of the ground that all
+    points with one have in common, such as that of a reference. `sigma_alike` (px, per axis) is such an error of the
+    measurement, for example if the bands of a reference disagree. More points do not reduce common errors.
     """
 
     id: str
@@ -108,11 +110,11 @@ class PointRow:
 
 @dataclass
 class Table:
-    """All points of a file, and what it says about their coordinates.
+    """All points of a file, and what it states about their coordinates.
 
-    `vertical` is stated by the file; `assumed_vertical` is what the format means where nothing is stated. `of_ground`
-    is ``geographic`` or ``projected`` where the columns are called so. With `origin_allowed` the file does not say what
-    (0, 0) is, and the user may. `source` is the file.
+    `vertical` is stated by the file; `assumed_vertical` is the default of the format. `of_ground` is ``geographic`` or
+    ``projected`` if column names say so. With `origin_allowed` the user may state the pixel origin. `source` is the
+    file.
     """
 
     format: str
@@ -126,17 +128,17 @@ class Table:
 
 
 def plain_id(text: str) -> str:
-    """Return an id as it is known by: no blanks around it, single ones within, and so nothing that ends a line."""
+    """Return an id in its plain form: no blanks around it, single blanks within, no line breaks."""
     return " ".join(text.split())
 
 
 def is_writable(text: str) -> bool:
-    """Tell whether text can stand in a UTF-8 file: no NUL and no half of a surrogate pair, which JSON can hold."""
+    """Return whether a UTF-8 file can hold a text: no NUL, and no half of a surrogate pair, which JSON can hold."""
     return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def numbered_ids(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> tuple[str, ...]:
-    """Number the points without an id by their place in the file; refuse an id that stands twice."""
+    """Number the points without an id by their position in the file; refuse an id that appears twice."""
     first: dict[str, str] = {}
     for count, row in enumerate(rows, start=1):
         row.id = row.id if row.id is not None else str(count)
@@ -154,7 +156,7 @@ def numbered_ids(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> tupl
 def refuse_duplicates(
     path: str | os.PathLike[str], wheres: Sequence[str], image: Array, ground: Array, roles: Sequence[str]
 ) -> None:
-    """Refuse points that stand twice: the same ground or the same pixel, to all digits that can matter."""
+    """Refuse points that appear twice: the same ground or the same pixel, to all digits that matter."""
     # A millimetre in degrees and in metres; pixels to a millionth.
     digits = 8 if np.abs(ground[:, :2]).max(initial=0) <= 360 else 3
     for what, keys in (("ground", np.round(ground, digits)), ("image", np.round(image, 6))):
@@ -173,12 +175,12 @@ def refuse_duplicates(
 
 
 def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> float:
-    """Return what is added to image coordinates of a file whose first pixel is called so.
+    """Return the number to add to image coordinates of a file with this pixel origin.
 
     Raises
     ------
     InputError
-        For an unknown name, and for one where the format itself says it.
+        For an unknown origin, or if the format defines its own.
     """
     if origin not in PIXEL_ORIGINS:
         raise InputError(
@@ -236,7 +238,7 @@ def load_text(path: str | os.PathLike[str]) -> str:
 
 
 def number(text: Any, path: str | os.PathLike[str], where: str) -> float:
-    """Return a finite number; `where` (line and column) goes into the error."""
+    """Return a finite number; an error names `where` (line and column)."""
     if isinstance(text, bool) or not isinstance(text, str | int | float):
         raise InputError(f"{short(text)} is not a number", file=path, field=where)
     try:
@@ -287,7 +289,7 @@ def sigma_of(
 
 
 def cells_of(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str]:
-    """Return the cells of a line without blanks around them; a blank as delimiter stands for any white space."""
+    """Return the cells of a line without blanks around them; a blank as delimiter means any white space."""
     if delimiter == " " and '"' not in line.text:
         return line.text.split()
     try:

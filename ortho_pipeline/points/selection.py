@@ -1,6 +1,6 @@
-"""Selection of control points: the rest become check points. This is how the tables of papers are made.
+"""Selection of control points as in the tables of papers: the others become check points.
 
-A few can be made check points instead (`assign_roles`), of one image or of a block.
+`assign_roles` makes check points of some control points, of one image or of a block.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.table import Array, Points
 
 _FORMS = "even:N, cluster:N[:K] (K 1-4: corners clockwise from the upper left, 5: middle), ids:a,b,c or random:N:seed"
-#: Groups of `cluster` as places in the box of the points, (column, row) from 0 to 1.
+#: Centres of the groups of `cluster` in the box of the points, (column, row) from 0 to 1.
 _REGIONS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.5, 0.5)])
 
 
 def select_control(points: Points, spec: str) -> Points:
-    """Keep some of the control points and make check points of the others; what is not a control point stays as it is.
+    """Keep some control points and make check points of the others; all other points keep their roles.
 
     Parameters
     ----------
     spec : str
-        ``even:N`` for N points as far apart in the image as can be; ``cluster:N`` for the N points nearest to the
-        upper left, ``cluster:N:K`` for group K of 1 to 5 (corners clockwise, middle); ``ids:a,b,c`` for these;
-        ``random:N:seed`` for a draw that is the same every time.
+        ``even:N``: N points as far apart in the image as possible. ``cluster:N``: the N points nearest to the upper
+        left; ``cluster:N:K``: group K of 1 to 5 (corners clockwise, middle). ``ids:a,b,c``: these points.
+        ``random:N:seed``: a random choice, the same for the same seed.
 
     Raises
     ------
     InputError, TooFewPoints
-        If the text is none of these, an id does not exist, or there are not so many control points.
+        If the text is none of these, an id does not exist, or there are too few control points.
     """
     kind, _, rest = spec.strip().partition(":")
     # By id, so that the order of the file does not matter.
@@ -96,7 +96,7 @@ def _named(points: Points, text: str) -> list[int]:
 
 
 def _spread(places: Array, count: int) -> list[int]:
-    """Return the point farthest from the middle, then again and again the one farthest from those chosen."""
+    """Return the point farthest from the middle, then each time the point farthest from all chosen ones."""
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
     chosen = [int(np.argmax(((places - middle) ** 2).sum(axis=1)))]
     nearest = ((places - places[chosen[0]]) ** 2).sum(axis=1)

@@ -173,7 +173,7 @@ def test_what_is_no_edge_is_refused():
             analyse_edge(noise, segment)
     with pytest.raises(InputError, match="crosses only 5 lines"):
         analyse_edge(noise, ((20.0, 5.0), (21.0, 10.0)))
-    with pytest.raises(InputError, match="crosses 0 lines"):
+    with pytest.raises(InputError, match="crosses only 0 lines"):
         analyse_edge(noise, ((20.0, 5.0), (20.0, 5.0)))
 
 
