@@ -1,11 +1,11 @@
-"""Images cut out of larger ones: where a crop lies in the image that its model belongs to.
+"""Crops: the position of an image within the larger image to which its model belongs.
 
-A model belongs to the pixels of the image that it came with. GDAL moves an RPC along when it crops; other programs
-leave the RPC as it was and note the place of the crop as a geotransform in pixels (column, 1, 0, row, 0, 1).
+A model belongs to the pixels of the image with which it was delivered. GDAL shifts an RPC when it crops. Other programs
+leave the RPC unchanged and note the offset of the crop as a geotransform in pixels (column, 1, 0, row, 0, 1).
 
-Which of both was done, the numbers of an RPC do not tell: its range may begin before the first pixel of its image. So
-the decision needs evidence: the size of the whole image in the metadata, or a range that excludes one of the two.
-Commands have more (`commands.control.crops`): heights, points, matches. Without evidence opening stops.
+The numbers of an RPC do not show whether it was shifted, because its range may begin before the first pixel of its
+image. So the decision needs evidence: the size of the larger image in the metadata, or a range that excludes one case.
+Commands have more evidence (`commands.control.crops`): heights, points, matches. Without evidence, opening fails.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text
 
-#: Below this part of the size for which an RPC is meant, an image is remarkably small.
+#: An image below this part of the size of its RPC's range is suspiciously small.
 _SMALL = 0.5
-#: An RPC's range covers an image if it begins and ends not later and not earlier than so (in parts of the range).
+#: Tolerance at both ends within which an RPC's range covers an image, in parts of the range.
 _COVERED = 0.05
-#: A hypothesis is right if it leaves at most this part of the distance between the two.
+#: A hypothesis is right if its distance from the evidence is at most this part of the distance between the two.
 _CLOSE = 0.25
-#: The last row and column of the whole image, as Airbus' products name them in the tags of their images.
+#: Last row and column of the larger image, in tags of Airbus' products.
 _GML_SIZE = re.compile(r"<gml:high>\s*(\d{1,7})\s+(\d{1,7})\s*</gml:high>")
 
 
 class UndecidedCrop(InputError):
-    """A crop notes its place, and nothing says whether its RPC has been moved there already.
+    """A crop notes its offset, but it is unknown whether its RPC was shifted to the crop.
 
     Parameters
     ----------
     scene : Scene
         With the models as they were read.
     offset : (float, float)
-        The first pixel of the crop in the whole image, as the image notes it.
+        First pixel of the crop in the larger image, as noted.
     """
 
     def __init__(self, scene: Scene, offset: tuple[float, float]) -> None:
@@ -67,17 +67,17 @@ class UndecidedCrop(InputError):
         self.choices = ((moved, "the RPC belongs to the larger image"), (kept, "the RPC belongs to this crop"))
 
     def __reduce__(self) -> Any:
-        # A scene need not cross the border of a process: what there is to read does.
-        function, (_, *told) = super().__reduce__()
-        return function, (InputError, *told)
+        # The text crosses the border of a process; the scene need not.
+        function, (_, *texts) = super().__reduce__()
+        return function, (InputError, *texts)
 
     @property
     def both(self) -> tuple[Scene, Scene]:
-        """The scene as it is, and with its models moved to the crop."""
+        """The scene as it is, and with its models shifted to the crop."""
         return self.scene, _with_models_moved(self.scene, self.offset)
 
     def settled(self, moved: bool, why: str) -> Scene:
-        """Return the scene as it is by evidence, with a notice."""
+        """Return the scene as the evidence decides, with a notice."""
         return _settled(self.scene, self.offset, moved, why)
 
 
@@ -99,16 +99,16 @@ def checked(offset: Sequence[float]) -> tuple[float, float]:
 
 
 def fits(size: tuple[int, int], whole: tuple[int, int], offset: Sequence[float] | None) -> bool:
-    """Tell whether an image of `size` is the `whole`, or with an offset a crop that lies within it."""
+    """Return whether an image of `size` is the `whole` image, or with an offset a crop within it."""
     if offset is None:
         return size == whole
     return all(0 <= first <= total - side for first, side, total in zip(checked(offset), size, whole, strict=True))
 
 
 def noted_offset(dataset: Any) -> tuple[float, float] | None:
-    """Return column and row of the first pixel of a `gdal.Dataset` whose geotransform counts pixels; None if none is.
+    """Return column and row of the first pixel that the geotransform of a `gdal.Dataset` notes; None if it notes none.
 
-    Such a geotransform has steps of one to the right and down, and no CRS.
+    Such a geotransform has steps of one to the right and down, and there is no CRS.
     """
     transform = dataset.GetGeoTransform(can_return_null=True)
     if transform is None or dataset.GetSpatialRef() is not None:
@@ -120,21 +120,21 @@ def noted_offset(dataset: Any) -> tuple[float, float] | None:
 
 
 def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) -> Scene:
-    """Return the scene with models in the pixels of the image, where that is a crop and its models are of the whole.
+    """Return the scene with models shifted to the image, if that is a crop and the models belong to the larger image.
 
     Parameters
     ----------
     dataset : gdal.Dataset
-        The image, whose geotransform may note its place.
+        The image; its geotransform may note its offset.
     offset : (float, float), optional
-        Column and row of its first pixel in the whole; it counts more than what the image notes.
+        Column and row of its first pixel in the larger image. Overrides a noted offset.
 
     Raises
     ------
     InputError
-        If the offset is none.
+        If the offset is not two finite numbers.
     UndecidedCrop
-        If the image notes an offset, and nothing shows whether its RPC is of the whole.
+        If the image notes an offset, and there is no evidence to which image the RPC belongs.
     """
     if offset is not None:
         stated = checked(offset)
@@ -169,21 +169,21 @@ def moved(model: SensorModel, offset: tuple[float, float]) -> SensorModel:
 
 
 def nearer(kept: float, moved: float, offset: tuple[float, float]) -> bool | None:
-    """Tell whether a model is to be moved, of its distance (px) from the evidence as it is and if it is moved.
+    """Return whether to shift a model, given its distance (px) from the evidence without (`kept`) and with the shift.
 
-    None where the better of both leaves more than a quarter of the distance between them.
+    None if the smaller distance is more than a quarter of the offset.
     """
     if not min(kept, moved) <= _CLOSE * math.hypot(*offset):
         return None
     return moved < kept
 
 
-def _moved(scene: Scene, offset: tuple[float, float], said: Notice) -> Scene:
+def _moved(scene: Scene, offset: tuple[float, float], notice: Notice) -> Scene:
     if offset == (0.0, 0.0):
         return scene
-    found = _with_models_moved(scene, offset)
-    remark = _elsewhere(found)
-    return replace(found, warnings=(*scene.warnings, said, *([] if remark is None else [remark])))
+    shifted = _with_models_moved(scene, offset)
+    remark = _elsewhere(shifted)
+    return replace(shifted, warnings=(*scene.warnings, notice, *([] if remark is None else [remark])))
 
 
 def _with_models_moved(scene: Scene, offset: tuple[float, float]) -> Scene:
@@ -217,7 +217,7 @@ def _settled(scene: Scene, offset: tuple[float, float], is_moved: bool, why: str
 
 
 def _by_size(scene: Scene, dataset: Any, ranges: Array, offset: tuple[float, float]) -> tuple[bool, str] | None:
-    """Return whether the RPC is of the whole image, of whose size metadata tell; None where they do not."""
+    """Return whether the RPC belongs to the larger image, by the size in the metadata; None if they have no size."""
     size = scene.width, scene.height
     own = size_of_image(place(scene.model_source))
     if own is not None and (own == size or fits(size, own, offset)):
@@ -225,14 +225,14 @@ def _by_size(scene: Scene, dataset: Any, ranges: Array, offset: tuple[float, flo
     whole = _size_of_whole(dataset)
     if whole is None or not fits(size, whole, offset):
         return None
-    # The middle of the range is that of the image, however far the range reaches beyond it on both sides.
+    # The middle of the range is the middle of the image, however far the range extends on both sides.
     middle = ranges.mean(axis=1) - np.array(whole) / 2
     decided = nearer(float(np.hypot(*(middle + offset))), float(np.hypot(*middle)), offset)
     return None if decided is None else (decided, f"the larger image has {whole[0]} x {whole[1]} pixels")
 
 
 def _size_of_whole(dataset: Any) -> tuple[int, int] | None:
-    """Return columns and rows of the vendor's image, where the metadata of a crop still tell them."""
+    """Return columns and rows of the vendor's image, if the metadata of a crop still have them."""
     described, delivered = dataset.GetMetadata() or {}, dataset.GetMetadata("IMD") or {}
     if match := _GML_SIZE.search(str(described.get("gml.root-instance", ""))[:20_000]):
         return int(match[2]), int(match[1])
@@ -241,10 +241,10 @@ def _size_of_whole(dataset: Any) -> tuple[int, int] | None:
 
 
 def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple[bool, str] | None:
-    """Return whether the RPC is of the whole image, where its range is possible for one of the two alone.
+    """Return whether the RPC belongs to the larger image; None if its range is possible for both.
 
-    The range of an RPC covers its image, and may reach far beyond it. Of one that was moved along it covers what of the
-    whole image lies before the crop; of one that was made for the crop it lies evenly about that.
+    The range of an RPC covers its image, and may extend far beyond it. The range of a shifted RPC also covers the part
+    of the larger image before the crop. The range of an RPC made for the crop is centred on the crop.
     """
     size, first_of_crop = np.array((scene.width, scene.height)), np.array(offset)
     slack = _COVERED * np.ptp(ranges, axis=1)
@@ -255,7 +255,7 @@ def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple
     evenly = bool((np.abs(ranges.mean(axis=1) - size / 2) <= slack).all())
     of_whole = covers(np.minimum(0.0, first_of_crop), first_of_crop + size)
     of_crop = covers(np.minimum(0.0, -first_of_crop), size) or (covers(np.zeros(2), size) and evenly)
-    # A program that moved the RPC wrote it into the crop; a range that begins elsewhere tells nothing of either.
+    # A program that shifted the RPC wrote it into the crop; a range that begins elsewhere is no evidence.
     in_the_crop = not place(scene.model_source).is_file()
     if of_crop and of_whole and in_the_crop and (np.abs(ranges[:, 0] + first_of_crop) <= 1.0).all():
         return False, "the range of the RPC begins at the first pixel of the larger image"
@@ -267,8 +267,8 @@ def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple
 def _ranges(model: RPC) -> Array:
     """Return the first and last column, and the first and last row, for which an RPC is meant ``(2, 2)``.
 
-    Some programs write new offsets and scales of pixels with coefficients that undo them: then it is the image of the
-    ground for which the RPC is meant.
+    Some programs write new pixel offsets and scales, with coefficients that cancel them. Then the range is the image of
+    the ground box of the RPC.
     """
     middle, half = np.array([model.col_off, model.row_off]), np.abs([model.col_scale, model.row_scale])
     stated = np.stack([middle - half, middle + half], axis=1)
@@ -281,7 +281,7 @@ def _ranges(model: RPC) -> Array:
 
 
 def _elsewhere(scene: Scene) -> Notice | None:
-    """Return a warning where the RPC is meant for other ground than that of the image."""
+    """Return a warning if the RPC is meant for other ground than that of the image."""
     model, size = scene.model, (scene.width, scene.height)
     if not isinstance(model, RPC):
         return None
@@ -298,7 +298,7 @@ def _elsewhere(scene: Scene) -> Notice | None:
 
 
 def _small(scene: Scene) -> Notice | None:
-    """Return a notice where the image is much smaller than what its RPC is meant for, and may be a crop of that."""
+    """Return a notice if the image is much smaller than the range of its RPC, so it may be a crop."""
     if not isinstance(scene.model, RPC):
         return None
     ranges = _ranges(scene.model)

@@ -276,7 +276,7 @@ def test_stale_side_car_is_an_error_with_a_choice(tmp_path):
 
 def test_choice_that_is_not_there_is_an_error(tmp_path):
     dataset = gdal.Open(str(make_image(tmp_path / "a.tif", make_rpc())))
-    with pytest.raises(InputError, match="no RPC side-car"):
+    with pytest.raises(InputError, match="no RPC sidecar"):
         rpc_of_dataset(dataset, "sidecar")
     with pytest.raises(InputError, match="cannot be read"):
         rpc_of_dataset(dataset, "nowhere.txt")
