@@ -21,12 +21,12 @@ KINDS.update(
 
 
 def require_view(model: SensorModel) -> None:
-    """Refuse a model whose numbers are each possible, but which maps nothing of the ground that it is meant for.
+    """Refuse a model that maps no ground of its domain into an image, although each of its numbers is possible.
 
     Raises
     ------
     InputError
-        If its domain is not finite, or of 125 points of it none has a finite place in the image.
+        If the domain is not finite, or none of 125 points in it has a finite image.
     """
     centre, half = model.domain
     if not (np.isfinite(centre).all() and np.isfinite(half).all()):

@@ -44,7 +44,7 @@ def select_control(points: Points, spec: str) -> Points:
         count, other = _numbers(rest, spec)
         if count > len(rows):
             raise TooFewPoints(
-                f"{spec!r} selects {count} points, but the file has {counted(len(rows), 'control point')}",
+                f"{spec!r} selects {counted(count, 'point')}, but the file has {counted(len(rows), 'control point')}",
                 file=points.source or None,
                 field="points.select",
             )
