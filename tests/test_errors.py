@@ -84,7 +84,7 @@ def test_one_point_is_no_plural(tmp_path: Path) -> None:
     ]
     assert not [text for text in said if ONE_OF_MANY.search(text)]
     assert any("1 control point does not determine" in text for text in said)
-    assert any("1 cell under 5 column names" in text for text in said)
+    assert any("this line has 1 cell, but there are 5 columns" in text for text in said)
     with pytest.raises(TooFewPoints, match="1 tie point does not"):
         Transform.fit("affine", np.zeros((1, 2)), np.zeros((1, 2)))
 

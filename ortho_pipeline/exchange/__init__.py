@@ -1,4 +1,4 @@
 """Models in and out: RPC files and tags, model files, GCPs and geolocation arrays, crops.
 
-Imports `surface` and what is below.
+Imports `surface` and the rooms below.
 """

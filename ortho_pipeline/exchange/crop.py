@@ -1,11 +1,11 @@
-"""Images cut out of larger ones: where a crop lies in the image that its model belongs to.
+"""Crops: the position of an image within the larger image to which its model belongs.
 
-A model belongs to the pixels of the image that it came with. GDAL moves an RPC along when it crops; other programs
-leave the RPC as it was and note the place of the crop as a geotransform in pixels (column, 1, 0, row, 0, 1).
+A model belongs to the pixels of the image with which it was delivered. GDAL shifts an RPC when it crops. Other programs
+leave the RPC unchanged and note the offset of the crop as a geotransform in pixels (column, 1, 0, row, 0, 1).
 
-Which of both was done, the numbers of an RPC do not tell: its range may begin before the first pixel of its image. So
-the decision needs evidence: the size of the whole image in the metadata, or a range that excludes one of the two.
-Commands have more (`commands.control.crops`): heights, points, matches. Without evidence opening stops.
+The numbers of an RPC do not show whether it was shifted, because its range may begin before the first pixel of its
+image. So the decision needs evidence: the size of the larger image in the metadata, or a range that excludes one case.
+Commands have more evidence (`commands.control.crops`): heights, points, matches. Without evidence, opening fails.
 """
 
 from __future__ import annotations
@@ -28,33 +28,32 @@ from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text
 
-#: Below this part of the size for which an RPC is meant, an image is remarkably small.
+#: An image below this part of the size of its RPC's range is suspiciously small.
 _SMALL = 0.5
-#: An RPC's range covers an image if it begins and ends not later and not earlier than so (in parts of the range).
+#: Tolerance at both ends within which an RPC's range covers an image, in parts of the range.
 _COVERED = 0.05
-#: A hypothesis is right if it leaves at most this part of the distance between the two.
+#: A hypothesis is right if its distance from the evidence is at most this part of the distance between the two.
 _CLOSE = 0.25
-#: The last row and column of the whole image, as Airbus' products name them in the tags of their images.
+#: Last row and column of the larger image, in tags of Airbus' products.
 _GML_SIZE = re.compile(r"<gml:high>\s*(\d{1,7})\s+(\d{1,7})\s*</gml:high>")
 
 
 class UndecidedCrop(InputError):
-    """A crop notes its place, and nothing says whether its RPC has been moved there already.
+    """A crop notes its offset, but it is unknown whether its RPC was shifted to the crop.
 
     Parameters
     ----------
     scene : Scene
         With the models as they were read.
     offset : (float, float)
-        The first pixel of the crop in the whole image, as the image notes it.
+        First pixel of the crop in the larger image, as noted.
     """
 
     def __init__(self, scene: Scene, offset: tuple[float, float]) -> None:
         self.scene, self.offset = scene, offset
         moved, kept = (Setting("scene.crop_offset", f"{column:g},{row:g}") for column, row in (offset, (0, 0)))
         super().__init__(
-            f"this image is a crop that begins at {_text(offset)} of a larger image, and nothing shows whether its RPC "
-            "belongs to the crop or to the larger image",
+            f"this image is a crop that begins at {_text(offset)} of a larger image; its RPC can belong to either",
             file=scene.path,
             field="scene.crop_offset",
             remedy=Text(
@@ -62,23 +61,23 @@ class UndecidedCrop(InputError):
                 moved,
                 " if the RPC belongs to the larger image, or ",
                 kept,
-                " if it belongs to this crop; control points, a DEM of the crop alone, or a reference decide it too",
+                " if it belongs to this crop; control points, a reference, or a DEM of the crop alone also decide this",
             ),
         )
         self.choices = ((moved, "the RPC belongs to the larger image"), (kept, "the RPC belongs to this crop"))
 
     def __reduce__(self) -> Any:
-        # A scene need not cross the border of a process: what there is to read does.
-        function, (_, *told) = super().__reduce__()
-        return function, (InputError, *told)
+        # The text crosses the border of a process; the scene need not.
+        function, (_, *texts) = super().__reduce__()
+        return function, (InputError, *texts)
 
     @property
     def both(self) -> tuple[Scene, Scene]:
-        """The scene as it is, and with its models moved to the crop."""
+        """The scene as it is, and with its models shifted to the crop."""
         return self.scene, _with_models_moved(self.scene, self.offset)
 
     def settled(self, moved: bool, why: str) -> Scene:
-        """Return the scene as it is by evidence, with a notice."""
+        """Return the scene as the evidence decides, with a notice."""
         return _settled(self.scene, self.offset, moved, why)
 
 
@@ -92,24 +91,24 @@ def checked(offset: Sequence[float]) -> tuple[float, float]:
     """
     if len(offset) != 2 or not all(math.isfinite(value) for value in offset):
         raise InputError(
-            f"{', '.join(f'{value:g}' for value in offset)} is not the place of a crop",
+            f"{', '.join(f'{value:g}' for value in offset)} is not the offset of a crop",
             field="scene.crop_offset",
-            remedy="give the column and row of its first pixel in the whole image: COL,ROW",
+            remedy="give the column and row of its first pixel in the larger image: COL,ROW",
         )
     return float(offset[0]), float(offset[1])
 
 
 def fits(size: tuple[int, int], whole: tuple[int, int], offset: Sequence[float] | None) -> bool:
-    """Tell whether an image of `size` is the `whole`, or with an offset a crop that lies within it."""
+    """Return whether an image of `size` is the `whole` image, or with an offset a crop within it."""
     if offset is None:
         return size == whole
     return all(0 <= first <= total - side for first, side, total in zip(checked(offset), size, whole, strict=True))
 
 
 def noted_offset(dataset: Any) -> tuple[float, float] | None:
-    """Return column and row of the first pixel of a `gdal.Dataset` whose geotransform counts pixels; None if none is.
+    """Return column and row of the first pixel that the geotransform of a `gdal.Dataset` notes; None if it notes none.
 
-    Such a geotransform has steps of one to the right and down, and no CRS.
+    Such a geotransform has steps of one to the right and down, and there is no CRS.
     """
     transform = dataset.GetGeoTransform(can_return_null=True)
     if transform is None or dataset.GetSpatialRef() is not None:
@@ -121,32 +120,32 @@ def noted_offset(dataset: Any) -> tuple[float, float] | None:
 
 
 def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) -> Scene:
-    """Return the scene with models in the pixels of the image, where that is a crop and its models are of the whole.
+    """Return the scene with models shifted to the image, if that is a crop and the models belong to the larger image.
 
     Parameters
     ----------
     dataset : gdal.Dataset
-        The image, whose geotransform may note its place.
+        The image; its geotransform may note its offset.
     offset : (float, float), optional
-        Column and row of its first pixel in the whole; it counts more than what the image notes.
+        Column and row of its first pixel in the larger image. Overrides a noted offset.
 
     Raises
     ------
     InputError
-        If the offset is none.
+        If the offset is not two finite numbers.
     UndecidedCrop
-        If the image notes an offset, and nothing shows whether its RPC is of the whole.
+        If the image notes an offset, and there is no evidence to which image the RPC belongs.
     """
     if offset is not None:
         stated = checked(offset)
-        text = f"the image is taken for a crop whose first pixel is {_text(stated)} of the whole"
+        text = f"the image is a crop that begins at {_text(stated)} of a larger image, as stated"
         return _moved(scene, stated, Notice("crop-stated", text, offset=stated))
     noted = noted_offset(dataset)
     if noted is None:
         remark = _elsewhere(scene) or _small(scene)
         return scene if remark is None else replace(scene, warnings=(*scene.warnings, remark))
     if not isinstance(scene.model, RPC):
-        return _settled(scene, noted, True, "other models than RPCs are of the whole image")
+        return _settled(scene, noted, True, "models other than RPCs always belong to the larger image")
     ranges = _ranges(scene.model)
     decided = _by_size(scene, dataset, ranges, noted) or _by_range(scene, ranges, noted)
     if decided is None:
@@ -170,21 +169,21 @@ def moved(model: SensorModel, offset: tuple[float, float]) -> SensorModel:
 
 
 def nearer(kept: float, moved: float, offset: tuple[float, float]) -> bool | None:
-    """Tell whether a model is to be moved, of its distance (px) from the evidence as it is and if it is moved.
+    """Return whether to shift a model, given its distance (px) from the evidence without (`kept`) and with the shift.
 
-    None where the better of both leaves more than a quarter of the distance between them.
+    None if the smaller distance is more than a quarter of the offset.
     """
     if not min(kept, moved) <= _CLOSE * math.hypot(*offset):
         return None
     return moved < kept
 
 
-def _moved(scene: Scene, offset: tuple[float, float], said: Notice) -> Scene:
+def _moved(scene: Scene, offset: tuple[float, float], notice: Notice) -> Scene:
     if offset == (0.0, 0.0):
         return scene
-    found = _with_models_moved(scene, offset)
-    remark = _elsewhere(found)
-    return replace(found, warnings=(*scene.warnings, said, *([] if remark is None else [remark])))
+    shifted = _with_models_moved(scene, offset)
+    remark = _elsewhere(shifted)
+    return replace(shifted, warnings=(*scene.warnings, notice, *([] if remark is None else [remark])))
 
 
 def _with_models_moved(scene: Scene, offset: tuple[float, float]) -> Scene:
@@ -203,12 +202,12 @@ def _settled(scene: Scene, offset: tuple[float, float], is_moved: bool, why: str
     where = f"this image is a crop that begins at {_text(offset)} of a larger image"
     if is_moved:
         text = Text(
-            f"{where}, and its model was moved there ({why}); if it belongs to the crop: ",
+            f"{where}. The model was shifted to the crop ({why}). If it already belongs to the crop, give ",
             Setting("scene.crop_offset", "0,0"),
         )
         return _moved(scene, offset, Notice("crop-noted", text, offset=offset))
     text = Text(
-        f"{where}, and its model belongs to the crop ({why}); if it belongs to the larger image: ",
+        f"{where}. The model already belongs to the crop ({why}). If it belongs to the larger image, give ",
         Setting("scene.crop_offset", f"{offset[0]:g},{offset[1]:g}"),
     )
     return replace(scene, warnings=(*scene.warnings, Notice("crop-kept", text, offset=offset)))
@@ -218,22 +217,22 @@ def _settled(scene: Scene, offset: tuple[float, float], is_moved: bool, why: str
 
 
 def _by_size(scene: Scene, dataset: Any, ranges: Array, offset: tuple[float, float]) -> tuple[bool, str] | None:
-    """Return whether the RPC is of the whole image, of whose size metadata tell; None where they do not."""
+    """Return whether the RPC belongs to the larger image, by the size in the metadata; None if they have no size."""
     size = scene.width, scene.height
     own = size_of_image(place(scene.model_source))
     if own is not None and (own == size or fits(size, own, offset)):
-        return own != size, f"the file of the RPC is of an image of {own[0]} x {own[1]} pixels"
+        return own != size, f"the RPC file is for an image of {own[0]} x {own[1]} pixels"
     whole = _size_of_whole(dataset)
     if whole is None or not fits(size, whole, offset):
         return None
-    # The middle of the range is that of the image, however far the range reaches beyond it on both sides.
+    # The middle of the range is the middle of the image, however far the range extends on both sides.
     middle = ranges.mean(axis=1) - np.array(whole) / 2
     decided = nearer(float(np.hypot(*(middle + offset))), float(np.hypot(*middle)), offset)
-    return None if decided is None else (decided, f"by the size of the whole, {whole[0]} x {whole[1]} pixels")
+    return None if decided is None else (decided, f"the larger image has {whole[0]} x {whole[1]} pixels")
 
 
 def _size_of_whole(dataset: Any) -> tuple[int, int] | None:
-    """Return columns and rows of the vendor's image, where the metadata of a crop still tell them."""
+    """Return columns and rows of the vendor's image, if the metadata of a crop still have them."""
     described, delivered = dataset.GetMetadata() or {}, dataset.GetMetadata("IMD") or {}
     if match := _GML_SIZE.search(str(described.get("gml.root-instance", ""))[:20_000]):
         return int(match[2]), int(match[1])
@@ -242,10 +241,10 @@ def _size_of_whole(dataset: Any) -> tuple[int, int] | None:
 
 
 def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple[bool, str] | None:
-    """Return whether the RPC is of the whole image, where its range is possible for one of the two alone.
+    """Return whether the RPC belongs to the larger image; None if its range is possible for both.
 
-    The range of an RPC covers its image, and may reach far beyond it. Of one that was moved along it covers what of the
-    whole image lies before the crop; of one that was made for the crop it lies evenly about that.
+    The range of an RPC covers its image, and may extend far beyond it. The range of a shifted RPC also covers the part
+    of the larger image before the crop. The range of an RPC made for the crop is centred on the crop.
     """
     size, first_of_crop = np.array((scene.width, scene.height)), np.array(offset)
     slack = _COVERED * np.ptp(ranges, axis=1)
@@ -256,20 +255,20 @@ def _by_range(scene: Scene, ranges: Array, offset: tuple[float, float]) -> tuple
     evenly = bool((np.abs(ranges.mean(axis=1) - size / 2) <= slack).all())
     of_whole = covers(np.minimum(0.0, first_of_crop), first_of_crop + size)
     of_crop = covers(np.minimum(0.0, -first_of_crop), size) or (covers(np.zeros(2), size) and evenly)
-    # A program that moved the RPC wrote it into the crop; a range that begins elsewhere tells nothing of either.
+    # A program that shifted the RPC wrote it into the crop; a range that begins elsewhere is no evidence.
     in_the_crop = not place(scene.model_source).is_file()
     if of_crop and of_whole and in_the_crop and (np.abs(ranges[:, 0] + first_of_crop) <= 1.0).all():
-        return False, "the range of the RPC in the crop begins at the first pixel of the larger image"
+        return False, "the range of the RPC begins at the first pixel of the larger image"
     if of_crop == of_whole:
         return None
-    return of_whole, f"for the {'crop' if of_whole else 'larger image'} its range would be too small"
+    return of_whole, f"its range is too small for the {'crop' if of_whole else 'larger image'}"
 
 
 def _ranges(model: RPC) -> Array:
     """Return the first and last column, and the first and last row, for which an RPC is meant ``(2, 2)``.
 
-    Some programs write new offsets and scales of pixels with coefficients that undo them: then it is the image of the
-    ground for which the RPC is meant.
+    Some programs write new pixel offsets and scales, with coefficients that cancel them. Then the range is the image of
+    the ground box of the RPC.
     """
     middle, half = np.array([model.col_off, model.row_off]), np.abs([model.col_scale, model.row_scale])
     stated = np.stack([middle - half, middle + half], axis=1)
@@ -282,7 +281,7 @@ def _ranges(model: RPC) -> Array:
 
 
 def _elsewhere(scene: Scene) -> Notice | None:
-    """Return a warning where the RPC is meant for other ground than that of the image."""
+    """Return a warning if the RPC is meant for other ground than that of the image."""
     model, size = scene.model, (scene.width, scene.height)
     if not isinstance(model, RPC):
         return None
@@ -291,16 +290,15 @@ def _elsewhere(scene: Scene) -> Notice | None:
         return None
     (left, right), (top, bottom) = ranges
     text = Text(
-        f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, which does not meet "
-        f"this image of {scene.width} x {scene.height} pixels: is it a crop with the RPC of the whole? Say where "
-        "it lies with ",
+        f"the RPC is for columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, but this image has "
+        f"{scene.width} x {scene.height} pixels. If it is a crop with the RPC of a larger image, give ",
         Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("rpc-elsewhere", text, **dict(zip(("columns", "rows"), ranges.tolist(), strict=True)))
 
 
 def _small(scene: Scene) -> Notice | None:
-    """Return a notice where the image is much smaller than what its RPC is meant for, and may be a crop of that."""
+    """Return a notice if the image is much smaller than the range of its RPC, so it may be a crop."""
     if not isinstance(scene.model, RPC):
         return None
     ranges = _ranges(scene.model)
@@ -310,9 +308,8 @@ def _small(scene: Scene) -> Notice | None:
     if not (begins and small):
         return None
     text = Text(
-        f"the image has {scene.width} x {scene.height} pixels, its RPC is for about {sizes[0]:.0f} x {sizes[1]:.0f}: "
-        "if it was cut out of that image, the RPC is right for it only if both begin at the same corner; say where it "
-        "lies with ",
+        f"the image has {scene.width} x {scene.height} pixels, but its RPC is for about {sizes[0]:.0f} x "
+        f"{sizes[1]:.0f}. If it is a crop that begins elsewhere than the larger image, give ",
         Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("maybe-a-crop", text, rpc_size=sizes)

@@ -1,4 +1,4 @@
-"""The formats that a model is exported in: those of the host, and what each is given to write."""
+"""The formats in which the host exports a model, and the `Export` that each of them receives."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ortho_pipeline.surface.flat import FlatSurface
 
 
 def check_formats(names: Sequence[str], known: Mapping[str, Format]) -> tuple[Format, ...]:
-    """Return the formats of these names, each once.
+    """Return the formats with these names, each once.
 
     Raises
     ------
@@ -39,16 +39,16 @@ def check_formats(names: Sequence[str], known: Mapping[str, Format]) -> tuple[Fo
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise InputError(
-            f"no format is called {', '.join(unknown) or 'nothing'}",
+            f"unknown format {', '.join(unknown)}" if unknown else "no format is given",
             field="formats",
-            remedy=f"one or more of {', '.join(known)}",
+            remedy=f"use one or more of {', '.join(known)}",
         )
     return tuple(known[name] for name in dict.fromkeys(names))
 
 
 @dataclass(frozen=True)
 class Export:
-    """A model that is exported, with its image: what the function `write` of a `Format` receives.
+    """A model to export, with its image; the function `write` of a `Format` receives it.
 
     Parameters
     ----------
@@ -59,16 +59,16 @@ class Export:
     size : (int, int)
         Columns and rows of the image.
     surface : Surface, optional
-        Where grids of points get their heights from.
+        Heights for grids of points.
     control : Points
-        The measured points that the model was adjusted to, gross errors not among them; where there are any, they are
-        the control points of the formats ``gcp``.
+        The measured points to which the model was adjusted, without gross errors. If there are any, the formats
+        ``gcp`` write them.
     left_out : sequence of (str, str)
-        Measured control points that are not, with the reason.
+        The other measured control points, with the reason.
     force : bool
-        The user accepts a file that is more than 0.1 px off the model.
+        The user accepts a file that differs from the model by more than 0.1 px.
     document : dict
-        What is said of the files, as JSON values; the host writes it.
+        Facts about the files as JSON values; the host writes it.
     """
 
     dataset: gdal.Dataset
@@ -97,22 +97,22 @@ class Export:
             self.document[kind.name] = {"max_error_px": worst}
 
     def summary(self, model: str, source: str, written: Sequence[Format]) -> str:
-        """Say in a line each what was written and how well it stands for the model."""
+        """Return a line for each file: what it is, and how well it represents the model."""
         lines = [f"Model {model} of {source}"]
         if self.document["exact"] is not None:
             worst = self.document["max_error_px"]
             lines.append("RPC: exact" if self.document["exact"] else f"RPC: refitted, at most {worst:.2g} px off")
         if "gcps" in self.document:
             lines.append("Control points: {n}, {source}".format(**self.document["gcps"]))
-            lines += ["Left out: {id} ({reason})".format(**one) for one in self.document["gcps"]["left_out"]]
+            lines += ["Left out: {id} ({reason})".format(**point) for point in self.document["gcps"]["left_out"]]
         lines += [
-            f"{one.title}: at most {self.document[one.name]['max_error_px']:.2g} px off"
-            for one in written
-            if one.name not in FORMATS
+            f"{kind.title}: at most {self.document[kind.name]['max_error_px']:.2g} px off"
+            for kind in written
+            if kind.name not in FORMATS
         ]
         if "geolocation" in self.document:
-            found = self.document["geolocation"]
-            lines.append(f"Geolocation: {found['heights']}, {found['max_error_px']:.2g} px off between its samples")
+            arrays = self.document["geolocation"]
+            lines.append(f"Geolocation: {arrays['heights']}, {arrays['max_error_px']:.2g} px off between its samples")
         return "\n".join([*lines, *(f"Warning: {text}" for text in self.document["warnings"])])
 
 
@@ -138,7 +138,7 @@ def _where(export: Export) -> str:
     return f" {surface.describe()}"
 
 
-#: The formats of the host; the first four are written where nobody chooses. They say in the document how good they are.
+#: The formats of the host. The first four are the default. Each writes its largest error into the document.
 FORMATS: Mapping[str, Format] = {
     name: Format(name, title, ending, write)
     for name, title, ending, write in (
@@ -156,5 +156,5 @@ FORMATS: Mapping[str, Format] = {
         ("geolocation", "geolocation arrays", "_geolocation.vrt", _write_geolocation),
     )
 }
-#: Names that no plugin's format has: those of the formats above, and other keys of the document.
+#: Names that a format of a plugin cannot have: those of the formats above, and other keys of the document.
 RESERVED = {*FORMATS, "exact", "files", "gcps", "model", "notices", "warnings"}

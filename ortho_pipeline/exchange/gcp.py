@@ -1,4 +1,4 @@
-"""A sensor model sampled on a grid, as GDAL reads it: ground control points, geolocation arrays."""
+"""A sensor model sampled on a grid for GDAL: ground control points, geolocation arrays."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ import numpy as np
 from osgeo import gdal, osr
 
 from ortho_pipeline.errors import InputError, ModelError
-from ortho_pipeline.exchange.rpc import (
-    name_sources_relatively,
-)
+from ortho_pipeline.exchange.rpc import name_sources_relatively
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
@@ -23,7 +21,7 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import image_grid
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Points per side of a grid of control points that stands for a model.
+#: Points per side of a grid of control points that represents a model.
 GCP_SIDE = 11
 #: Samples per side of geolocation arrays; GDAL interpolates between them.
 _GEOLOCATION_SIDE = 257
@@ -56,11 +54,9 @@ def gcps_of_model(
     gcps = gcps[np.isfinite(gcps).all(axis=1)]
     if len(gcps) < 4:
         raise InputError(
-            "the rays of the image do not meet the ground: there is no grid of control points",
+            "the rays of the image do not meet the ground, so no control points can be made",
             field="model",
-            remedy=Text(
-                "give the metadata of this very image, and a DEM or ", Setting("surface.height"), " that lies under it"
-            ),
+            remedy=Text("give the metadata of this image, and a DEM of this place or ", Setting("surface.height")),
         )
     return gcps
 
@@ -76,14 +72,14 @@ def _lonlat(model: SensorModel, image: Array, surface: Surface | None) -> Array:
 def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> None:
     """Write the image with control points in WGS 84: a ``.vrt`` that refers to it, or a GeoTIFF copy.
 
-    An RPC and a geotransform of the image are left out, so that no program can take them instead.
+    The file has no RPC and no geotransform, so that no program uses them instead.
 
     Raises
     ------
     InputError
         If the folder cannot be written.
     ModelError
-        If the file does not give the same points again.
+        If the points differ when they are read again.
     """
     path = Path(path)
     points = [gdal.GCP(x, y, h, column, row, "", str(k + 1)) for k, (column, row, x, y, h) in enumerate(gcps.tolist())]
@@ -101,12 +97,12 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
         # A VRT keeps four decimals of pixels and twelve of degrees.
         other = copy.GetMetadata("RPC") or copy.GetGeoTransform(can_return_null=True)
         if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or other:
-            raise ModelError("the control points that were written are others when they are read again", file=path)
+            raise ModelError("the written control points differ when they are read again", file=path)
 
 
 def _without_georeferencing(dataset: gdal.Dataset) -> gdal.Dataset:
     """Return a view of an image without RPC, points and geotransform, which programs would prefer to ours."""
-    # A geotransform cannot be taken away again; points keep Translate from copying it.
+    # A geotransform cannot be removed; with points, Translate does not copy it.
     view = gdal.Translate("", dataset, format="VRT", GCPs=[gdal.GCP()])
     view.SetGCPs([], "")
     view.SetMetadata({}, "RPC")
@@ -128,20 +124,18 @@ def write_geolocation(
 ) -> float:
     """Write a VRT of the image with GDAL's geolocation arrays, and the arrays as GeoTIFF beside it.
 
-    Longitude and latitude (WGS 84) of image points on the surface, or at the model's reference height. GDAL has no
-    relative names here: the arrays stay where they are written.
+    The arrays have longitude and latitude (WGS 84) of image points on the surface, or at the model's reference height.
+    GDAL allows no relative names here, so the arrays must not be moved.
 
     Returns
     -------
     float
-        Largest error (px) of interpolating between the samples, in the middle of their meshes.
+        Largest error (px) of the interpolation, in the middle between samples.
 
     Raises
     ------
     InputError
-        If the folder cannot be written.
-    InputError
-        If some rays of the image do not meet the surface.
+        If the folder cannot be written, or some rays of the image do not meet the surface.
     """
     path = Path(path)
     columns, rows = size
@@ -151,19 +145,19 @@ def write_geolocation(
     lonlat = _lonlat(model, image.reshape(-1, 2), surface)[:, :2].reshape(*image.shape[:2], 2)
     if not np.isfinite(lonlat).all():
         raise InputError(
-            "some rays of the image do not meet the ground: geolocation arrays would have holes",
+            "some rays of the image do not meet the ground, so geolocation arrays would have gaps",
             field="model" if surface is None else "surface.dem",
             remedy=Text(
-                "give the metadata of this very image, and a DEM that covers the whole scene, or ",
+                "give the metadata of this image, and a DEM that covers the whole scene or ",
                 Setting("surface.height"),
             ),
         )
     arrays = path.parent.resolve() / f"{path.stem}.tif"
     with raster_output(arrays) as temporary:
-        made = gdal.GetDriverByName("GTiff").Create(
+        created = gdal.GetDriverByName("GTiff").Create(
             os.fspath(temporary), len(across), len(down), 2, gdal.GDT_Float64, options=["COMPRESS=DEFLATE"]
         )
-        with written(made) as raster:
+        with written(created) as raster:
             for k in (0, 1):
                 raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
     view = _without_georeferencing(dataset)
@@ -189,15 +183,15 @@ def write_geolocation(
 
 
 def _mesh_error(model: SensorModel, image: Array, lonlat: Array, surface: Surface | None) -> float:
-    """Return the largest error (px) in the middle of the meshes, on a spread of at most some thousand of them."""
+    """Return the largest error (px) in the middle of cells of the grid, of which some thousand are sampled."""
     rows, columns = (np.unique(np.linspace(0, side - 2, 65).astype(int)) for side in image.shape[:2])
     i, j = (index.ravel() for index in np.meshgrid(rows, columns, indexing="ij"))
     around = ((0, 0), (0, 1), (1, 0), (1, 1))
     middle = sum(image[i + a, j + b] for a, b in around) / 4
-    meant = sum(lonlat[i + a, j + b] for a, b in around) / 4
+    interpolated = sum(lonlat[i + a, j + b] for a, b in around) / 4
     exact = _lonlat(model, middle, surface)
-    # Both at the height of the exact point, so that only the shift in plan is measured.
-    both = [np.column_stack([place[:, :2], exact[:, 2]]) for place in (meant, exact)]
+    # Both at the height of the exact point, to measure only the horizontal shift.
+    both = [np.column_stack([place[:, :2], exact[:, 2]]) for place in (interpolated, exact)]
     inverse = ground_transform("EPSG:4979", model.crs)
     difference = model.ground_to_image(inverse(both[0])) - model.ground_to_image(inverse(both[1]))
     return float(np.nanmax(np.abs(difference)))

@@ -18,23 +18,29 @@ from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, Table, number, role
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
 
-#: What errors call a frame that does not say where its points come from.
+#: Name of a frame in errors, if it does not state the source of its points.
 _FRAME = "GeoDataFrame"
 _SIGMAS = ("sigma_image", "sigma_x", "sigma_y", "sigma_h")
 _COLUMNS = ("id", "role", "col", "row", "h", *_SIGMAS, "sigma_xy", *CSV_ERRORS)
 
 
 def to_geodataframe(points: Points) -> GeoDataFrame:
-    """Return points as a GeoDataFrame, from which `from_geodataframe` makes them again, to the last bit.
+    """Return points as a GeoDataFrame; `from_geodataframe` restores them to the last bit.
 
     Columns are those of CSV files: `col` and `row` (px, from the outer corner of the first pixel), `h` (metres above
-    the ellipsoid, NaN where it is not given), role and standard deviations, those in plan one by one. The geometry is
-    x, y in the CRS of the points. It needs GeoPandas (``pip install 'ortho-pipeline[geopandas]'``).
+    the ellipsoid, NaN if not given), `role`, and standard deviations. The geometry is x, y in the CRS of the points.
+    GeoPandas is needed (``pip install 'ortho-pipeline[geopandas]'``).
 
     Raises
     ------
     InputError
         If GeoPandas is not installed.
+
+    Examples
+    --------
+    >>> import ortho_pipeline as op
+    >>> to_geodataframe(op.read_points("sample_data/gcps.geojson")).shape
+    (18, 10)
     """
     try:
         import geopandas
@@ -65,40 +71,43 @@ def _places(points: Points) -> list[Any]:
 
 
 def _error_columns(points: Points) -> dict[str, Any]:
-    """Return the columns `CSV_ERRORS` that say more than `sigma_image` does."""
-    found: dict[str, Any] = {}
+    """Return those columns of `CSV_ERRORS` that add information to `sigma_image`."""
+    columns: dict[str, Any] = {}
     more = says_more(points.covariance_image)
     if more.any():
         for name, i, j in zip(CSV_ERRORS[:3], (0, 1, 0), (0, 1, 1), strict=True):
-            found[name] = np.where(more, points.covariance_image[:, i, j], np.nan)
+            columns[name] = np.where(more, points.covariance_image[:, i, j], np.nan)
     if (points.groups >= 0).any():
-        found[CSV_ERRORS[3]] = np.where(points.groups >= 0, points.groups, np.nan)
+        columns[CSV_ERRORS[3]] = np.where(points.groups >= 0, points.groups, np.nan)
     for name in CSV_ERRORS[4:]:
         if getattr(points, name).any():
-            found[name] = getattr(points, name)
-    return found
+            columns[name] = getattr(points, name)
+    return columns
 
 
 def from_geodataframe(
     frame: GeoDataFrame, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
 ) -> Points:
-    """Make points of a GeoDataFrame with the columns `col` and `row`; all others of `to_geodataframe` may be there.
+    """Make points from a GeoDataFrame with the columns `col` and `row`; the others of `to_geodataframe` are optional.
 
-    Heights are column `h`, or those of the geometry. `crs` and `vertical` say what places and heights are in where the
-    frame does not: its CRS, or ``frame.attrs["vertical"]`` as `to_geodataframe` leaves it.
+    Heights are the column `h`, or else those of the geometry.
+
+    Parameters
+    ----------
+    crs, vertical : optional
+        CRS and height datum, if the frame does not state them with its CRS and ``frame.attrs["vertical"]``.
 
     Raises
     ------
     InputError, CrsError, DatumError
-        Names the row and the column, and what to do.
+        The message names the row and the column.
     """
     table, sigmas = _table_of(frame)
-    found = points_of(table, crs, vertical, "corner")
-    return replace(found, sigma_ground=sigmas)
+    return replace(points_of(table, crs, vertical, "corner"), sigma_ground=sigmas)
 
 
 def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
-    """Return the rows of a GeoDataFrame, and standard deviations ``(N, 3)`` m of their ground (0 where not given)."""
+    """Return the rows of a GeoDataFrame, and standard deviations ``(N, 3)`` m of their ground (0 if not given)."""
     if not hasattr(frame, "geometry") or not hasattr(frame, "columns"):
         raise InputError(
             f"{type(frame).__name__} has no geometry", file=_FRAME, field="frame", remedy="give a GeoDataFrame"
@@ -110,17 +119,17 @@ def _table_of(frame: GeoDataFrame) -> tuple[Table, np.ndarray]:
             f"no column {' and '.join(missing)}",
             file=source,
             field="columns",
-            remedy="name the columns of the place in the image (px from the outer corner of the first pixel) so",
+            remedy="add the image position as columns col and row (px from the outer corner of the first pixel)",
         )
     if not frame.columns.is_unique:
-        raise InputError("two columns of one name", file=source, field="columns", remedy="rename one of them")
+        raise InputError("two columns have the same name", file=source, field="columns", remedy="rename one of them")
     table = Table(
         _FRAME,
         crs=None if frame.crs is None else frame.crs.to_wkt(),
         vertical=frame.attrs.get("vertical"),
         source=source,
     )
-    # As objects, for the missing values of pandas are neither numbers nor None.
+    # As objects, because the missing values of pandas are neither numbers nor None.
     cells = {name: frame[name].astype(object).where(frame[name].notna(), None) for name in _COLUMNS if name in frame}
     records = [dict(zip(cells, values, strict=True)) for values in zip(*cells.values(), strict=True)]
     sigmas = np.zeros((len(records), 3))
@@ -136,7 +145,7 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> PointRo
         return number(_plain(record[name]), source, f"{where}, {name}")
 
     if place is not None and (place.geom_type != "Point" or place.is_empty):
-        raise InputError(f"{place.geom_type} is not the place of a point", file=source, field=f"{where}, geometry")
+        raise InputError(f"{place.geom_type} is not a point", file=source, field=f"{where}, geometry")
     x, y = (math.nan, math.nan) if place is None else (place.x, place.y)
     if record.get("h") is not None:
         height = cell("h")
@@ -165,7 +174,7 @@ def _row(source: str, where: str, record: dict[str, Any], place: Any) -> PointRo
 
 
 def _sigma(source: str, where: str, record: dict[str, Any], name: str, *, zero: bool) -> float | None:
-    """Return a standard deviation; ``sigma_xy`` of CSV files stands for both components in plan."""
+    """Return a standard deviation; ``sigma_xy`` of CSV files is that of both horizontal components."""
     value = record.get(name)
     if value is None and name in ("sigma_x", "sigma_y"):
         name = "sigma_xy"

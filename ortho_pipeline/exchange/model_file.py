@@ -1,4 +1,4 @@
-"""The model file ``<stem>_model.json``: a sensor model that opens again, and where it came from."""
+"""The model file ``<stem>_model.json``: a sensor model and its origin."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ DOCUMENT = "ortho-pipeline model"
 _MAX_BYTES = 50_000_000
 
 
-#: What is done about a damaged file.
-_REMEDY = "give a <stem>_model.json as it was written, or write it again"
+#: Remedy for a damaged file.
+_REMEDY = "give an unchanged <stem>_model.json, or write it again"
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class SavedModel:
     ----------
     model : SensorModel
     sensor : str
-        Name of the sensor that opened the scene; empty if no scene was involved.
+        Name of the sensor that opened the scene; empty without a scene.
     model_source : str
-        The file or tag that the model as delivered was read from.
+        File or tag of the delivered model.
     size : (int, int) or None
         Columns and rows of the image that the model belongs to.
     provenance : mapping
@@ -48,30 +48,30 @@ class SavedModel:
 
     @property
     def adjusted(self) -> Mapping[str, Any] | None:
-        """The adjustment of the model, of a scene or in a block; None where it is as delivered."""
-        found = self.provenance.get("adjustment")
-        if not isinstance(found, dict) or not (found.get("gauge") or found.get("points")):
+        """The adjustment of the model, of a scene or in a block; None for a delivered model."""
+        adjustment = self.provenance.get("adjustment")
+        if not isinstance(adjustment, dict) or not (adjustment.get("gauge") or adjustment.get("points")):
             return None
-        # Points alone, as checks, adjust nothing.
-        return found if found.get("parameters") else None
+        # Check points alone adjust nothing.
+        return adjustment if adjustment.get("parameters") else None
 
 
 def write_model_file(saved: SavedModel, path: str | os.PathLike[str]) -> None:
-    """Write a model file, whole or not at all; numbers are kept to the last bit.
+    """Write a model file, whole or not at all, with numbers to the last bit.
 
     Raises
     ------
     PluginError
-        If the file could not be read again: its model is of a kind that nobody registered.
+        If the file could not be read again, because the kind of its model is not registered.
     """
     model = saved.model.to_dict()
     try:
         model_from_dict(model)
     except InputError as error:
         raise PluginError(
-            f"this model could not be read again: {error.message}",
+            f"the written model cannot be read again: {error.message}",
             file=path,
-            remedy="its plugin must offer the class in the hook ortho_models; a script: register it in models.KINDS",
+            remedy="return its class from the hook ortho_models of the plugin; in a script, add it to models.KINDS",
         ) from error
     document = {
         "document": DOCUMENT,
@@ -93,10 +93,10 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
     Raises
     ------
     InputError
-        If it is not a model file, of a later schema, its model does not fit its kind, or maps no ground.
+        If it is not a model file, has a later schema, or its model does not fit its kind or maps no ground.
     """
-    found = read_json(path, _MAX_BYTES, _REMEDY)
-    document: dict[str, Any] = found if isinstance(found, dict) else {}
+    content = read_json(path, _MAX_BYTES, _REMEDY)
+    document: dict[str, Any] = content if isinstance(content, dict) else {}
     version = document.get("schema_version")
     if document.get("document") != DOCUMENT or not isinstance(document.get("model"), dict):
         raise InputError(
@@ -106,7 +106,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         )
     if version != SCHEMA_VERSION:
         raise InputError(
-            f"schema version {version!r} is not known here (this version reads {SCHEMA_VERSION})",
+            f"unknown schema version {version!r}; this version reads {SCHEMA_VERSION}",
             file=path,
             field="schema_version",
             remedy="update ortho-pipeline",
@@ -116,7 +116,7 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
         isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)
     ):
         raise InputError(
-            f"{size!r} is not an image size", file=path, field="size", remedy="two positive integers, or null"
+            f"{size!r} is not an image size", file=path, field="size", remedy="give two positive integers, or null"
         )
     try:
         model = model_from_dict(document["model"])
@@ -137,13 +137,18 @@ def read_model_file(path: str | os.PathLike[str]) -> SavedModel:
 def save_model(
     model: SensorModel, path: str | os.PathLike[str], *, adjustment: Mapping[str, Any] | None = None
 ) -> None:
-    """Write `model` as a model file; `load_model` returns it again.
+    """Write `model` as a model file; `load_model` reads it.
 
     Parameters
     ----------
     adjustment : mapping, optional
-        What it was adjusted by, as JSON values: ``Fit.to_json()``, or the image's part of ``BlockFit.to_json()`` with
-        its `gauge` and `sigma0`. Reports of this model then say how accurate it is.
+        Its adjustment as JSON values: ``Fit.to_json()``, or the image's part of ``BlockFit.to_json()`` with `gauge` and
+        `sigma0`. Reports then show the accuracy of this model.
+
+    Raises
+    ------
+    PluginError
+        If the kind of the model is not registered, so that the file could not be read again.
     """
     write_model_file(SavedModel(model, provenance={} if adjustment is None else {"adjustment": dict(adjustment)}), path)
 
@@ -154,6 +159,15 @@ def load_model(path: str | os.PathLike[str]) -> SensorModel:
     Raises
     ------
     InputError
-        As for `read_model_file`.
+        As `read_model_file`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import ortho_pipeline as op
+    >>> path = f"{tempfile.mkdtemp()}/scene_model.json"
+    >>> op.save_model(op.open_scene("sample_data/scene.tif").model, path)
+    >>> op.load_model(path).kind
+    'rpc'
     """
     return read_model_file(path).model

@@ -1,4 +1,4 @@
-"""RPC in and out: side-cars, tags, GDAL's metadata domain, and RPC fitted to any model.
+"""RPC in and out: sidecar files, tags, GDAL's metadata domain, and RPCs fitted to any model.
 
 GDAL's transformer and this package agree to rounding: an RPC at its own offsets gives (SAMP_OFF + 0.5, LINE_OFF + 0.5).
 The text formats are in `ortho_pipeline.exchange.rpc_files`.
@@ -50,7 +50,7 @@ __all__ = [
     "write_vrt",
 ]
 
-#: Tag and side-car that differ by more than this at the centre (pixels) are not the same model.
+#: Tag and sidecar that differ by more than this at the centre (px) are different models.
 DISAGREEMENT = 1.0
 
 
@@ -63,7 +63,13 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
     Raises
     ------
     InputError
-        If there is none in it, or a field is missing or wrong.
+        If the file has no RPC, or a field is missing or wrong.
+
+    Examples
+    --------
+    >>> rpc = read_rpc("sample_data/scene_RPC.TXT")
+    >>> rpc.ground_to_image([[33.35, 37.25, 800.0]]).round(1)
+    array([[501.9, 504.2]])
     """
     path = path if isinstance(path, VsiPath) else Path(path)
     if path.suffix.lower() in TEXT_SUFFIXES or _begins_like_rpc(path):
@@ -72,7 +78,7 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
 
 
 def has_rpc(dataset: gdal.Dataset) -> bool:
-    """Tell whether GDAL found an RPC for this dataset, in it or beside it, readable or not."""
+    """Return whether GDAL finds an RPC for this dataset, in it or beside it, readable or not."""
     try:
         _refuse_unread_sidecar(dataset)
         return bool(dataset.GetMetadata("RPC"))
@@ -81,19 +87,19 @@ def has_rpc(dataset: gdal.Dataset) -> bool:
 
 
 def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = None) -> tuple[RPC, str]:
-    """Return the RPC of an open dataset and the name of the file or tag that it comes from.
+    """Return the RPC of an open dataset, and the name of its file or tag.
 
     Parameters
     ----------
     dataset : gdal.Dataset
     choice : {None, 'tag', 'sidecar'} or path
-        Which RPC to take where there are several. GDAL takes a side-car before a tag without a word; here that is so
-        only if they agree within a pixel at the centre of the scene.
+        Which RPC to use. GDAL silently prefers a sidecar to a tag; by default this is accepted only if both agree
+        within a pixel at the centre of the scene.
 
     Raises
     ------
     InputError
-        If there is no RPC, it is damaged or cannot be read, the chosen one is absent, or tag and side-car disagree.
+        If there is no RPC, it is damaged or unreadable, the chosen one is missing, or tag and sidecar disagree.
     """
     name = dataset.GetDescription()
     if choice is not None and str(choice) not in ("tag", "sidecar"):
@@ -115,7 +121,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
         return rpc_of_fields(*sidecar), sidecar[1]
     if tag:
         return rpc_of_fields(tag, name), f"{name} ({_own_kind(dataset)})"
-    what = "RPC" if choice is None else {"tag": "RPC tag", "sidecar": "RPC side-car file"}[str(choice)]
+    what = "RPC" if choice is None else {"tag": "RPC tag", "sidecar": "RPC sidecar file"}[str(choice)]
     damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
     raise InputError(
         f"there is no {what}" + (f" that can be read: {damaged} is damaged or encrypted" if damaged else ""),
@@ -131,7 +137,7 @@ def _begins_like_rpc(path: Path | VsiPath) -> bool:
 
 
 def _fields_beside(dataset: gdal.Dataset) -> dict[str, str]:
-    """Return the RPC domain as GDAL has it, which prefers side-cars; nothing where one is damaged or encrypted."""
+    """Return GDAL's RPC domain, which prefers sidecars; empty if one is damaged or encrypted."""
     try:
         return dict(dataset.GetMetadata("RPC") or {})
     except RuntimeError:
@@ -139,7 +145,7 @@ def _fields_beside(dataset: gdal.Dataset) -> dict[str, str]:
 
 
 def _refuse_unread_sidecar(dataset: gdal.Dataset) -> None:
-    """Refuse an RPC side-car that the disk does not give: GDAL goes on without, or with a tag."""
+    """Refuse an RPC sidecar that cannot be read: GDAL would continue without it, or with a tag."""
     path = place(dataset.GetDescription())
     for file in _sidecar_names(path) if isinstance(path, Path) else []:
         if file.is_file():
@@ -157,7 +163,7 @@ def _refuse_unread_sidecar(dataset: gdal.Dataset) -> None:
 
 
 def _unreadable_beside(path: Path) -> list[str]:
-    """Return the names of files that ought to hold the RPC of an image, by their names."""
+    """Return the names of files beside an image that look like its RPC."""
     if not path.parent.is_dir():
         return []
     beside = (path.parent / name for name in listing(path.parent).beginning(path.stem))
@@ -165,7 +171,7 @@ def _unreadable_beside(path: Path) -> list[str]:
 
 
 def _own_fields(dataset: gdal.Dataset) -> dict[str, str]:
-    """Return the RPC domain of the file itself, without what lies beside it."""
+    """Return the RPC domain of the file itself, without sidecars."""
     name = dataset.GetDescription()
     if not place(name).is_file() or dataset.GetDriver().ShortName == "VRT":
         return dict(dataset.GetMetadata("RPC") or {})
@@ -178,7 +184,7 @@ def _own_kind(dataset: gdal.Dataset) -> str:
 
 
 def files_of(dataset: gdal.Dataset) -> list[str]:
-    """Return the files that GDAL takes a dataset to consist of: itself alone where a side-car cannot be read."""
+    """Return the files of a dataset by GDAL; only the file itself if a sidecar cannot be read."""
     try:
         return list(dataset.GetFileList() or [])
     except RuntimeError:
@@ -200,11 +206,11 @@ def _sidecar_source(fields: dict[str, str], beside: list[Path], name: str) -> st
     for path in sorted(beside, key=lambda path: not _is_rpc_file(path)):
         if path.suffix.lower() in TEXT_SUFFIXES:
             try:
-                found, used = read_rpc_text(path), rpc_of_fields(fields, name)
+                delivered, used = read_rpc_text(path), rpc_of_fields(fields, name)
             except InputError:
                 continue
-            # GDAL moves the RPC of a tile of a mosaic, so only what it leaves alone is compared.
-            if np.allclose(found.row_num, used.row_num, rtol=1e-12, atol=0.0):
+            # GDAL shifts the RPC of a tile of a mosaic, so compare only what it never changes.
+            if np.allclose(delivered.row_num, used.row_num, rtol=1e-12, atol=0.0):
                 return os.fspath(path)
     likely = [path for path in beside if _is_rpc_file(path) or path.name.endswith(".aux.xml")] or beside
     return ", ".join(map(os.fspath, likely)) or f"{name} (metadata)"
@@ -216,7 +222,7 @@ def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> No
     if not difference <= DISAGREEMENT:
         apart = f"by {difference:.1f} px" if np.isfinite(difference) else "completely"
         raise InputError(
-            f"the RPC of the file and that of {sidecar_name} differ {apart} at the centre of the scene",
+            f"the RPC in the file and the RPC in {sidecar_name} differ {apart} at the centre of the scene",
             file=name,
             field="scene.rpc",
             remedy=Text(
@@ -234,16 +240,16 @@ def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> No
 
 
 def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
-    """Write a VRT of `dataset` that carries `rpc`, so that any GDAL program uses it.
+    """Write a VRT of `dataset` with `rpc`, for any GDAL program.
 
-    GCPs are left out, because GDAL prefers them to an RPC. The source is named relative to the VRT.
+    It has no GCPs, because GDAL prefers them to an RPC. The path of its source is relative to the VRT.
 
     Raises
     ------
     InputError
         If the folder cannot be written.
     ModelError
-        If the file does not give the same RPC again.
+        If the RPC differs when it is read again.
     """
     with raster_output(path) as temporary:
         with written(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)) as copy:
@@ -254,7 +260,7 @@ def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> Non
 
 
 def name_sources_relatively(vrt: Path, final: Path) -> None:
-    """Let a VRT, whose final place is `final`, name its sources relative to itself."""
+    """Make the source paths of a VRT relative to `final`, its final path."""
     from defusedxml import ElementTree
 
     root = ElementTree.fromstring(vrt.read_bytes())
@@ -269,15 +275,15 @@ def name_sources_relatively(vrt: Path, final: Path) -> None:
 def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
     """Write a lossless GeoTIFF copy of `dataset` with `rpc` in its TIFF tag.
 
-    Bands, nodata, mask, palette and colour interpretation are kept; GCPs are left out, because GDAL prefers them to
-    an RPC.
+    It keeps bands, nodata, mask, palette and colour interpretation. It has no GCPs, because GDAL prefers them to an
+    RPC.
 
     Raises
     ------
     InputError
-        If the folder cannot be written, or an RPC side-car lies there that would override the tag.
+        If the folder cannot be written, or has an RPC sidecar that would override the tag.
     ModelError
-        If the copy does not give the same RPC again.
+        If the RPC differs when it is read again.
     """
     stale = [file for file in _sidecar_names(Path(path)) if file.exists()]
     if stale:
@@ -292,7 +298,7 @@ def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]
 
 
 def _sidecar_names(path: Path) -> list[Path]:
-    # A raster in memory has no name, and nothing beside it.
+    # A raster in memory has no name and no sidecars.
     if not path.name:
         return []
     return [path.with_name(path.stem + end) for end in ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", ".RPC", ".rpc")]
@@ -303,7 +309,7 @@ def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -
     ground = box_grid(*domain_box(rpc), (5, 5, 3))
     worst = np.nanmax(np.abs(written.ground_to_image(ground) - rpc.ground_to_image(ground)))
     if not worst < 1e-6 or dataset.GetGCPCount():
-        raise ModelError(f"the RPC that was written is off by {worst:g} px when it is read again", file=path)
+        raise ModelError(f"the written RPC is off by {worst:g} px when it is read again", file=path)
 
 
 # -- RPC of any model ------------------------------------------------------------------------------------------------
@@ -316,18 +322,18 @@ def export_rpc(
     height_range: tuple[float, float] | None = None,
     force: bool = False,
 ) -> RpcExport:
-    """Return `model` as an RPC: exactly where that can be, fitted where not.
+    """Return `model` as an RPC, exact if possible, else fitted (`fit_rpc`).
 
-    A shift and a scale per axis enter the offsets and scales of an RPC exactly. A cross term (column into row) enters
-    the numerators exactly where both denominators are equal. Everything else is fitted (`fit_rpc`).
+    An RPC holds a shift and a scale of each axis exactly, in its offsets and scales. It holds a cross term (column into
+    row) exactly if both denominators are equal.
 
     Parameters
     ----------
     model : SensorModel
     box : (xmin, ymin, xmax, ymax), optional
-        Longitudes and latitudes (degrees) of the region to fit; the domain of the model if not given.
+        Region to fit, in longitude and latitude (degrees). Default: the domain of the model.
     height_range : (lo, hi), optional
-        Ellipsoidal heights (m) of the same.
+        Ellipsoidal heights (m) to fit. Default: those of the domain.
     force : bool
         Accept a fit that is off by more than 0.1 px.
 
@@ -335,6 +341,11 @@ def export_rpc(
     ------
     InputError, ModelError
         As `fit_rpc`.
+
+    Examples
+    --------
+    >>> export_rpc(read_rpc("sample_data/scene_RPC.TXT")).exact
+    True
     """
     exact = _folded(model)
     if exact is not None:
@@ -344,7 +355,7 @@ def export_rpc(
 
 
 def _folded(model: SensorModel) -> RPC | None:
-    """Return the RPC that equals `model`, None if there is none."""
+    """Return the RPC that equals `model`, or None."""
     if isinstance(model, RPC):
         return model
     inner = _folded(model.model) if isinstance(model, ImageCorrection) else None

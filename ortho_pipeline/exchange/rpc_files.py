@@ -1,4 +1,4 @@
-"""RPC as text: the formats of vendors, read and written without GDAL.
+"""RPC text formats of vendors, read and written without GDAL.
 
 =====================  ============================================  =======================================
 format                 pixel origin in the file                      written by
@@ -10,8 +10,8 @@ DIMAP RPC XML          centre (1, 1); Pleiades Neo (0, 0)            Pleiades, S
 OTB keyword list       centre (0, 0)                                 Orfeo Toolbox (``.geom``), shareloc
 =====================  ============================================  =======================================
 
-All of them become an `RPC` in this package's convention: the centre of the first pixel is (0.5, 0.5). Every number has
-to be finite and every coefficient present; what is not is an `InputError` that names file and field.
+All of them become an `RPC` in this package's convention: the centre of the first pixel is (0.5, 0.5). A number that is
+not finite, or a missing coefficient, is an `InputError` that names file and field.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.options.texts import Setting, Text
 
-#: Files of more bytes are refused unread: XML, and the other formats, of which 20 kB are usual.
+#: Limits in bytes of XML, and of the other formats, which usually have 20 kB.
 MAX_SIZE, MAX_PLAIN = 5_000_000, 1_000_000
 TEXT_SUFFIXES = frozenset({".txt", ".rpb", ".rpc", ".xml", ".geom"})
-#: Field of `RPC` by GDAL's name of it, with the unit that RPC text gives.
+#: Field of `RPC` by its name in GDAL, with its unit in RPC text.
 SCALARS = {
     "LINE_OFF": ("row_off", "pixels"),
     "SAMP_OFF": ("col_off", "pixels"),
@@ -73,7 +73,7 @@ _RPB_NAMES = {
 }
 _FROM_RPB = {name.upper(): key for key, name in _RPB_NAMES.items()}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
-# Bounded, so that no hostile file makes it slow.
+# Bounded repeats: no malicious file makes it slow.
 _RPB_ITEM = re.compile(r"(\w{1,40})[ \t]*=[ \t]*(?:\(([^()]{0,8000})\)|\"([^\"\n]{0,200})\"|([^;\n(\"]{0,200}))\s*;")
 _CENTRE = 0.5
 _REMEDY = Text("give the RPC file as the vendor delivers it, or another one (", Setting("scene.rpc", "FILE"), ")")
@@ -89,15 +89,14 @@ def read_rpc_text(path: str | PathLike[str]) -> RPC:
     Raises
     ------
     InputError
-        If the file cannot be read, holds no RPC, or one with a field that is missing, not a finite number, or zero
-        where it cannot be.
+        If the file cannot be read, has no RPC, or a field is missing, not finite, or zero where it must not be.
     """
     text = _text_of(path)
     lowered = text[:100_000].lower()
     if text.lstrip()[:1] == "<":
         fields, origin = _fields_of_xml(text, path)
     elif len(text) > MAX_PLAIN:
-        raise InputError("this file has more than 1 MB, which no RPC text has", file=path)
+        raise InputError("this file is larger than 1 MB, so it is not an RPC text", file=path)
     elif "linenumcoef" in lowered:
         fields, origin = _fields_of_rpb(text, path), 0.0
     elif "line_num_coeff_00" in lowered:
@@ -108,24 +107,24 @@ def read_rpc_text(path: str | PathLike[str]) -> RPC:
 
 
 def size_of_image(path: Path | VsiPath) -> tuple[int, int] | None:
-    """Return columns and rows of the image that a file of an RPC says it is of; None where it does not say."""
+    """Return columns and rows of the image for which an RPC file was made; None if the file does not state them."""
     if path.suffix.lower() != ".geom" or not path.is_file():
         return None
-    found = dict(re.findall(r"^\s*number_(samples|lines):\s*(\d{1,9})\s*$", _text_of(path), re.MULTILINE | re.ASCII))
-    return (int(found["samples"]), int(found["lines"])) if len(found) == 2 else None
+    sizes = dict(re.findall(r"^\s*number_(samples|lines):\s*(\d{1,9})\s*$", _text_of(path), re.MULTILINE | re.ASCII))
+    return (int(sizes["samples"]), int(sizes["lines"])) if len(sizes) == 2 else None
 
 
 def rpc_of_fields(fields: Mapping[str, str], file: str | PathLike[str] | None = None, *, origin: float = 0.0) -> RPC:
-    """Make an RPC of texts under GDAL's names.
+    """Make an RPC from texts under GDAL's names.
 
     Parameters
     ----------
     fields : mapping of str to str
-        Numbers, units after them are ignored; coefficients as one text of 20 or as ``LINE_NUM_COEFF_1`` to ``_20``.
+        Numbers; units after them are ignored. Coefficients are one text of 20, or ``LINE_NUM_COEFF_1`` to ``_20``.
     file : path, optional
         For messages.
     origin : float
-        Coordinates that the file gives to the centre of the first pixel.
+        Coordinate of the centre of the first pixel in the file.
 
     Raises
     ------
@@ -164,7 +163,7 @@ def _rpc(fields: Mapping[str, str], file: str | PathLike[str] | None, origin: fl
 def _text_of(path: str | PathLike[str]) -> str:
     data = files.read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
-        raise InputError("this file has more than 5 MB, which no RPC file has", file=path)
+        raise InputError("this file is larger than 5 MB, so it is not an RPC file", file=path)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError("this file is UTF-16 text", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
@@ -185,7 +184,7 @@ def _number(text: str | None, file: str | PathLike[str] | None, field: str) -> f
 
 
 def _error(text: str | None, file: str | PathLike[str] | None, field: str) -> float | None:
-    # Negative is how GDAL and the TIFF tag say "unknown"; it is not a reason to refuse a model.
+    # GDAL and the TIFF tag write "unknown" as a negative number; this is no reason to refuse a model.
     if text is None or not text.strip() or text.split()[0].lower().lstrip("+-") == "nan":
         return None
     value = _number(text, file, field)
@@ -203,7 +202,7 @@ def _coefficients(fields: Mapping[str, str], key: str, file: str | PathLike[str]
 
 def _put(fields: dict[str, str], key: str, value: str, file: str | PathLike[str]) -> None:
     if fields.setdefault(key, value) != value:
-        raise InputError("this field is there twice, with two values", file=file, field=key)
+        raise InputError("this field appears twice, with different values", file=file, field=key)
 
 
 def _is_rpc_key(key: str) -> bool:
@@ -227,17 +226,17 @@ def _fields_of_geom(text: str, path: str | PathLike[str]) -> dict[str, str]:
         key, _, value = line[:500].partition(":")
         key, value = key.strip(), value.strip()
         if key.startswith("adjustment_") and key.endswith((".parameter", ".center")) and _number(value, path, key):
-            raise InputError("this file has an adjustment of its own, which is not applied", file=path, field=key)
+            raise InputError("this file contains an adjustment, which cannot be applied", file=path, field=key)
         key = key.rpartition(".")[2].upper().replace("LON_", "LONG_")
         if key == "POLYNOMIAL_FORMAT" and value != "B":
-            raise InputError(f"polynomials of format {value!r} are not read, only B (RPC00B)", file=path, field=key)
+            raise InputError(f"polynomials of format {value!r} cannot be read, only B (RPC00B)", file=path, field=key)
         term = re.fullmatch(r"(\w+_COEFF)_(\d\d)", key, re.ASCII)
         if term:
             key = f"{term[1]}_{int(term[2]) + 1}"
         key = renamed.get(key, key)
         if _is_rpc_key(key):
             _put(fields, key, value, path)
-    # The toolbox writes 0 for an accuracy that it does not know.
+    # The toolbox writes 0 for an unknown accuracy.
     return {key: value for key, value in fields.items() if key not in ERRORS or value != "0"}
 
 
@@ -255,7 +254,7 @@ def _fields_of_rpb(text: str, path: str | PathLike[str]) -> dict[str, str]:
 
 def _check_spec(text: str, path: str | PathLike[str]) -> None:
     if text.strip().upper() != "RPC00B":
-        raise InputError(f"{text[:40]!r} is not read, only RPC00B", file=path, field="SpecId")
+        raise InputError(f"{text[:40]!r} cannot be read, only RPC00B", file=path, field="SpecId")
 
 
 def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str], float]:
@@ -263,7 +262,7 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
     from defusedxml.common import DefusedXmlException
 
     try:
-        # As bytes: the declaration may name another encoding than the text has by now.
+        # Without the declaration: it may name another encoding than that of the decoded text.
         root = ElementTree.fromstring(re.sub(r"^\s*<\?xml[^>]{0,300}\?>", "", text, count=1), forbid_dtd=True)
     except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
         raise InputError(f"this is not well-formed XML ({error})", file=path) from error
@@ -276,7 +275,7 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
         # Pleiades Neo counts pixels from 0, its predecessors and SPOT from 1.
         origin = 0.0 if "PNEO" in profile.upper() else 1.0
         fields: dict[str, str] = {}
-        # Version 3, of Pleiades Neo, has another name for the model from ground to image.
+        # Version 3 (Pleiades Neo) has another name for the model from ground to image.
         for tag in ("RFM_Validity", "Inverse_Model", "GroundtoImage_Values"):
             for child in parts.get(tag, [[]])[0]:
                 key = str(child.tag).rpartition("}")[2]
@@ -289,8 +288,8 @@ def _fields_of_xml(text: str, path: str | PathLike[str]) -> tuple[dict[str, str]
 
 
 def _first_text(parts: Mapping[str, list[Any]], tag: str) -> str:
-    found = parts.get(tag)
-    return (found[0].text or "").strip() if found else ""
+    elements = parts.get(tag)
+    return (elements[0].text or "").strip() if elements else ""
 
 
 # -- writing ---------------------------------------------------------------------------------------------------------
@@ -315,7 +314,7 @@ def rpc_metadata(rpc: RPC) -> dict[str, str]:
 
 
 def write_rpc_txt(rpc: RPC, path: str | PathLike[str]) -> None:
-    """Write RPC text (``<image>_RPC.TXT`` or ``_rpc.txt``), as GDAL reads it beside an image.
+    """Write RPC text. GDAL reads it beside an image if it is named ``<image>_RPC.TXT`` or ``<image>_rpc.txt``.
 
     Raises
     ------
@@ -331,7 +330,7 @@ def write_rpc_txt(rpc: RPC, path: str | PathLike[str]) -> None:
 
 
 def write_rpb(rpc: RPC, path: str | PathLike[str]) -> None:
-    """Write an ``.RPB`` file, as GDAL reads it beside an image.
+    """Write an ``.RPB`` file, which GDAL reads beside an image.
 
     Raises
     ------

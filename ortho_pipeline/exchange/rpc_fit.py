@@ -1,4 +1,4 @@
-"""An RPC fitted to another model over its box: iterated ratios of cubics, regularised."""
+"""An RPC fitted to another model over its box: iterated, regularised ratios of cubics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ortho_pipeline.models.polynomials import terms_of
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.models.rpc_box import RPC_TERMS, has_pole
 
-#: A fitted RPC that is off by more than the first is reported, by more than the second refused (pixels).
+#: Errors (px) of a fitted RPC: above the first it is reported, above the second refused.
 WARN_ERROR, REFUSE_ERROR = 0.02, 0.1
 #: Weight of the penalty on the size of the normalised coefficients in `fit_rpc`, relative to one observation.
 TIKHONOV = 1e-7
@@ -25,15 +25,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RpcExport:
-    """An RPC that stands for another model.
+    """An RPC that represents another model.
 
     Parameters
     ----------
     rpc : RPC
     exact : bool
-        Whether it is the same function of the ground, up to rounding.
+        Whether both are the same function of the ground, up to rounding.
     max_error_px : float
-        Largest difference of the two on an independent grid; 0 where exact.
+        Largest difference on an independent grid; 0 if exact.
     warnings : tuple of Notice
     """
 
@@ -80,7 +80,7 @@ def fit_rpc(
     terms = terms_of(RPC_TERMS, (ground - centre) / half).T
     names = ("col_off", "row_off", "lon_off", "lat_off", "h_off", "col_scale", "row_scale", "lon_scale", "lat_scale")
     numbers = dict(zip((*names, "h_scale"), map(float, (*middle, *centre, *scale, *half)), strict=True))
-    # A box across the antimeridian may be given beyond 180 degrees; readers of RPCs want the offset within.
+    # A box across the antimeridian may extend beyond 180 degrees; readers of RPCs need an offset within.
     numbers["lon_off"] = math.remainder(numbers["lon_off"], 360.0)
     (col_num, col_den), (row_num, row_den) = (_fit_ratio(terms, (image - middle)[:, k] / scale[k]) for k in (0, 1))
     rpc = RPC(**numbers, col_num=col_num, col_den=col_den, row_num=row_num, row_den=row_den)
@@ -89,10 +89,10 @@ def fit_rpc(
     worst = float(np.abs(rpc.ground_to_image(ground) - image).max())
     if not worst <= REFUSE_ERROR and not force:
         raise InputError(
-            f"an RPC stands for this model only to {worst:.3g} px",
+            f"an RPC represents this model only to {worst:.3g} px",
             remedy="fit it over a smaller box or height range, or accept the error (force)",
         )
-    message = Notice("rpc-approximate", f"the RPC stands for the model only to {worst:.3g} px", max_error_px=worst)
+    message = Notice("rpc-approximate", f"the RPC represents the model only to {worst:.3g} px", max_error_px=worst)
     if worst > WARN_ERROR:
         log.warning("%s", message)
     return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())
@@ -101,8 +101,8 @@ def fit_rpc(
 def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
     """Fit numerator and denominator ``(20,)`` of ``values (N,)`` on ``terms (N, 20)``.
 
-    Where the denominator gets a pole within the points, its coefficients are penalised more, in the end to a plain
-    polynomial: what a ratio cannot follow should not be followed by a ratio with a pole.
+    If the denominator gets a pole within the points, its coefficients are penalised more; the last resort is a plain
+    polynomial.
     """
     for damping in (TIKHONOV, 1e-4, 1e-2):
         fitted = _iterate_ratio(terms, values, damping)
@@ -114,14 +114,14 @@ def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int = 5) -> tuple[Array, Array] | None:
-    """Return the best of some iterations, None if the first of them has a pole in the box of the terms."""
+    """Return the best of some iterations; None if the first one has a pole in the box of the terms."""
     system = np.column_stack([terms, -values[:, None] * terms[:, 1:], values])
     penalty = np.sqrt(len(terms)) * np.repeat([TIKHONOV, damping], [20, 19])
     denominator = np.ones(len(terms))
     best: tuple[float, Array, Array] | None = None
     for _ in range(iterations):
-        # The right side is the last column, so that R alone holds all that is needed. The penalty enters through the
-        # singular values of R: as more rows of the system it would fill the reflections with denormal numbers.
+        # The right side is the last column, so R is enough. The penalty is applied to the singular values of R: as
+        # further rows of the system it would fill the reflections with denormal numbers.
         r: Array = np.asarray(np.linalg.qr(system / denominator[:, None], mode="r"))
         u, size, vt = np.linalg.svd(r[:39, :39] / penalty)
         solution: Array = vt.T @ (size / (size**2 + 1.0) * (u.T @ r[:39, 39])) / penalty
@@ -147,7 +147,7 @@ def _samples(
     good = np.isfinite(image).all(axis=1)
     if good.mean() < 0.5:
         raise InputError(
-            f"the model maps only {good.mean():.0%} of the box to be fitted into the image",
+            f"the model maps only {good.mean():.0%} of the box into the image",
             field="box",
             remedy="give a box within the scene",
         )

@@ -38,11 +38,15 @@ def stack_bands(
         If an image cannot be read or has several bands, the sizes or types differ, or nothing matches.
     """
     if reference not in bands or len(bands) < 2:
-        raise InputError(f"there is no band {reference!r} to register onto", field="reference", remedy=", ".join(bands))
+        raise InputError(
+            f"there is no band {reference!r} to register onto",
+            field="reference",
+            remedy=f"use one of {', '.join(bands)}",
+        )
     images = {name: _read(path) for name, path in bands.items()}
     types = {image.dtype for image in images.values()}
     if len(types) != 1 or next(iter(types)).kind != "u":
-        raise InputError("the bands are unsigned integers of one type", field="bands")
+        raise InputError("the bands must be unsigned integers of one type", field="bands")
     names = list(images)
     stack, registrations = register(list(images.values()), names, reference=names.index(reference), transform=transform)
     dtype = next(iter(types))
@@ -56,7 +60,7 @@ def stack_bands(
 def _read(path: str | PathLike[str]) -> np.ndarray[Any, Any]:
     dataset = open_pixels(path)[0]
     if dataset.RasterCount != 1:
-        raise InputError(f"this image has {counted(dataset.RasterCount, 'band')}, one is expected", file=path)
+        raise InputError(f"this image has {counted(dataset.RasterCount, 'band')} instead of one", file=path)
     return np.asarray(dataset.ReadAsArray())
 
 

@@ -108,11 +108,11 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
     """
     (x1, y1), (x2, y2) = segment
     if not all(map(math.isfinite, (x1, y1, x2, y2))):
-        raise InputError("an edge has four finite numbers", field="edge", remedy=_NO_EDGE_REMEDY)
+        raise InputError("an edge needs four finite numbers", field="edge", remedy=_NO_EDGE_REMEDY)
     height, width = pixels.shape
     if min(x1, x2) < 0 or min(y1, y2) < 0 or max(x1, x2) > width or max(y1, y2) > height:
         raise InputError(
-            f"the edge {said(segment)} leaves the image of {width} x {height} pixels",
+            f"the edge {said(segment)} is outside the image of {width} x {height} pixels",
             field="edge",
             remedy="give columns and rows within the image",
         )
@@ -166,7 +166,7 @@ class _Area:
         rows = np.arange(max(0, math.ceil(y1 - 0.5)), min(height, math.floor(y2 - 0.5) + 1))
         if len(rows) < SHORTEST:
             raise InputError(
-                f"the edge crosses {counted(len(rows), 'line')} of pixels; it takes {SHORTEST}",
+                f"the edge crosses only {counted(len(rows), 'line')} of pixels; {SHORTEST} are needed",
                 field="edge",
                 remedy="give a longer edge",
             )
@@ -177,9 +177,9 @@ class _Area:
         values = np.where(inside, pixels[rows[:, None], np.clip(columns, 0, width - 1)], np.nan)
         if np.isfinite(values).mean() < 0.5:
             raise InputError(
-                "most pixels beside the edge have no value (nodata, or beyond the border)",
+                "most pixels beside the edge have no value (nodata, or outside the image)",
                 field="edge",
-                remedy="give an edge with pixels to both sides",
+                remedy="give an edge with valid pixels on both sides",
             )
         return cls(np.asarray(rows + 0.5), np.asarray(columns + 0.5), values.astype(np.float64), np.asarray(middle))
 
@@ -193,7 +193,7 @@ class _Area:
         total = weight.sum(axis=1)
         known = total > 0
         if known.sum() < 3:
-            raise InputError("there is no step of brightness", field="edge", remedy=_NO_EDGE_REMEDY)
+            raise InputError("there is no step in brightness", field="edge", remedy=_NO_EDGE_REMEDY)
         # The square favours the steepest place over the noise beside it.
         at = (x * weight**2).sum(axis=1)[known] / (weight**2).sum(axis=1)[known]
         rows = self.rows[known]
@@ -204,7 +204,7 @@ class _Area:
             off = np.abs(at - a - b * rows)
             keep = off <= max(3 * 1.4826 * float(np.median(off)), 0.1)
         if abs(b) > 1.5 or np.abs(a + b * self.rows - self.middle).max() > HALF_WIDTH:
-            raise InputError("there is no straight step of brightness", field="edge", remedy=_NO_EDGE_REMEDY)
+            raise InputError("the step in brightness is not straight", field="edge", remedy=_NO_EDGE_REMEDY)
         return float(a), float(b)
 
 
@@ -327,7 +327,7 @@ def _require_step(fitted: _Fitted) -> None:
         raise _faint(step, fitted.noise)
     if fitted.sigma > HALF_WIDTH / 2.5 or fitted.sigma_error > 0.25 * math.hypot(fitted.sigma, APERTURE):
         raise InputError(
-            f"the width of the edge cannot be told: {fitted.sigma:.2g} ± {fitted.sigma_error:.2g} px",
+            f"the width of the edge is too uncertain: {fitted.sigma:.2g} ± {fitted.sigma_error:.2g} px",
             field="edge",
             remedy="give a longer or a sharper edge, between even areas",
         )
@@ -335,7 +335,7 @@ def _require_step(fitted: _Fitted) -> None:
 
 def _faint(step: float, noise: float) -> InputError:
     return InputError(
-        f"no edge of enough contrast: the step is {step:.3g}, the pixels beside it scatter by {noise:.3g}",
+        f"the edge has too little contrast: its step is {step:.3g}, the noise beside it {noise:.3g}",
         field="edge",
         remedy=_NO_EDGE_REMEDY,
     )
@@ -361,9 +361,9 @@ def _binned(fitted: _Fitted) -> tuple[Array, Array, Array]:
     if not counts[core].all():
         angle = abs(math.degrees(math.atan(fitted.b)))
         raise InputError(
-            f"the edge lies at {angle:.1f} degrees to the pixel axis: the pixels sample it at a few distances only",
+            f"the edge is too parallel to a pixel axis: {angle:.1f} degrees",
             field="edge",
-            remedy="give an edge that is turned against the pixel axes by some 3 to 40 degrees, or a longer one",
+            remedy="give an edge at 3 to 40 degrees to the pixel axes, or a longer one",
         )
     # What the model leaves, so that it does not matter where in a bin its pixels lie.
     left = fitted.values[inside] - fitted.model(fitted.distance[inside])

@@ -73,7 +73,9 @@ class Transform:
             If there is no such transformation, or there are too few points for it.
         """
         if kind not in TRANSFORMS:
-            raise InputError(f"{kind!r} is not a transformation", field="transform", remedy=", ".join(TRANSFORMS))
+            raise InputError(
+                f"{kind!r} is not a transformation", field="transform", remedy=f"use one of {', '.join(TRANSFORMS)}"
+            )
         source, target = as_image(reference), as_image(moving)
         if 2 * len(source) < TRANSFORMS[kind]:
             raise TooFewPoints(
@@ -145,7 +147,7 @@ def register(
     """
     arrays = [np.asarray(band, dtype=np.float64) for band in bands]
     if len(arrays) != len(names) or len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 2:
-        raise InputError("bands are images of one size, each with a name", field="bands")
+        raise InputError("bands must be images of one size, each with a name", field="bands")
     fixed = arrays[reference]
     stack, registrations = np.empty((len(arrays), *fixed.shape)), []
     for index, (array, name) in enumerate(zip(arrays, names, strict=True)):
@@ -257,10 +259,10 @@ def _fit_robust(kind: str, reference: Array, moving: Array, name: str) -> tuple[
     for _ in range(10):
         if 2 * used.sum() < TRANSFORMS[kind] + 4 or used.sum() < 0.3 * len(used):
             raise TooFewPoints(
-                f"{int(used.sum())} of {counted(len(used), 'tie point')} of the band {name}: too few agree for "
-                "a transformation",
+                f"only {int(used.sum())} of {counted(len(used), 'tie point')} of the band {name} agree, too few for a "
+                "transformation",
                 field=name,
-                remedy="check that the bands are of one scene, or take larger patches",
+                remedy="check that the bands are of one scene, or use larger patches",
             )
         transform = Transform.fit(kind, reference[used], moving[used])
         miss = np.hypot(*(moving - transform(reference)).T)

@@ -143,10 +143,10 @@ def measure(
     source = RasterSource(image, allow_network=allow_network)
     if not 1 <= band <= source.count:
         raise InputError(
-            f"the image has {counted(source.count, 'band')}, not {band}",
+            f"there is no band {band}: the image has {counted(source.count, 'band')}",
             file=source.path,
             field="band",
-            remedy=f"1 to {source.count}",
+            remedy=f"give one from 1 to {source.count}",
         )
     if edge is not None:
         return [_given(source, edge, band)]
@@ -156,7 +156,7 @@ def measure(
         found += [_moved(one, left, top) for one in inside]
     if not found:
         raise InputError(
-            "no straight edge between even areas, turned against the pixel axes, was found",
+            "no suitable edge found: it must be straight, between even areas, and oblique to the pixel axes",
             file=source.path,
             remedy=Text("give one with ", Setting("edge", "x1,y1,x2,y2")),
         )
@@ -170,14 +170,14 @@ def _given(source: RasterSource, edge: Segment, band: int) -> Edge:
     inside = np.isfinite(numbers).all() and (numbers >= 0).all()
     if not (inside and max(x1, x2) <= source.width and max(y1, y2) <= source.height):
         raise InputError(
-            f"the edge {said(edge)} leaves the image of {source.width} x {source.height} pixels",
+            f"the edge {said(edge)} is outside the image of {source.width} x {source.height} pixels",
             file=source.path,
             field="edge",
             remedy="give columns and rows within the image",
         )
     if math.hypot(x2 - x1, y2 - y1) > _LONGEST:
         raise InputError(
-            f"an edge of more than {_LONGEST} pixels is not measured",
+            f"the edge is longer than the limit of {_LONGEST} pixels",
             file=source.path,
             field="edge",
             remedy="give a part of it",

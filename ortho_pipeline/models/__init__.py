@@ -21,21 +21,21 @@ KINDS.update(
 
 
 def require_view(model: SensorModel) -> None:
-    """Refuse a model whose numbers are each possible, but which maps nothing of the ground that it is meant for.
+    """Refuse a model that maps no ground of its domain into an image, although each of its numbers is possible.
 
     Raises
     ------
     InputError
-        If its domain is not finite, or of 125 points of it none has a finite place in the image.
+        If the domain is not finite, or none of 125 points in it has a finite image.
     """
     centre, half = model.domain
     if not (np.isfinite(centre).all() and np.isfinite(half).all()):
-        raise InputError("the ground that this model is meant for has no finite bounds", field="model")
+        raise InputError("the domain of this model is not finite", field="model")
     parts = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 3), axis=-1).reshape(-1, 3)
     with np.errstate(all="ignore"):
         image = model.ground_to_image(centre + parts * half)
     if np.isinf(image).any() or not np.isfinite(image).all(axis=1).any():
-        raise InputError("this model maps none of the ground that it is meant for into an image", field="model")
+        raise InputError("this model maps no ground of its domain into an image", field="model")
 
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""SensorModel: what maps ground to image. A new geometry writes one method and inherits the rest."""
+"""The base of all sensor models. A new model implements `ground_to_image` and inherits the rest."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from ortho_pipeline.errors import InputError
 #: The type of all arrays of coordinates and parameters.
 Array = NDArray[np.float64]
 
-#: Newton's method ends when the image point is met this closely (pixels) ...
+#: Newton's method stops at this distance (px) from the image point.
 INVERSE_TOLERANCE = 1e-9
-#: ... and a point is only returned if its re-projection closes within this (pixels).
+#: A point is NaN if its projection differs from the image point by more than this (px).
 INVERSE_VERIFIED = 1e-5
 _INVERSE_STEPS = 25
 
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """Pseudo-observations that a model brings with it: what is known of its parameters beyond image measurements.
+    """Pseudo-observations of a model: knowledge of its parameters beyond image measurements.
 
-    An adjustment weights them by their sigma like any other observation. Those that somebody measured count in the
-    redundancy; fictitious ones, soft constraints with a sigma that somebody chose, do not: their residuals say nothing
-    of how good the measurements are.
+    An adjustment weights them by their sigma like any other observation. Measured ones count in the redundancy.
+    Fictitious ones (soft constraints with a chosen sigma) do not, because their residuals do not test measurements.
 
     Parameters
     ----------
@@ -41,7 +40,7 @@ class Constraints:
     sigma : (k,)
         Standard deviations, positive, in the unit of the residuals.
     fictitious : (k,) of bool, optional
-        All are measured if it is not given.
+        Default: all are measured.
     """
 
     residuals: Array
@@ -59,13 +58,20 @@ class Constraints:
 
 @dataclass(frozen=True, eq=False)
 class SensorModel(ABC):
-    """Map from ground to image, steered by a named parameter vector.
+    """Map from ground to image, with a named parameter vector.
 
-    Subclasses are frozen dataclasses and implement `ground_to_image`. A closed form may override any of the other
-    methods; `ortho_pipeline.testing.check_sensor_model` then compares it with the numeric default.
+    Subclasses are frozen dataclasses and implement `ground_to_image`. A closed form may override any other method;
+    `ortho_pipeline.testing.check_sensor_model` then compares it with the numeric default.
 
-    Ground points are ``(N, 3)`` x, y, ellipsoidal height in `crs`; image points ``(N, 2)`` column, row in pixels with
-    the outer corner of the first pixel at (0, 0). A point that cannot be mapped is a row of NaN.
+    Ground points are ``(N, 3)``: x, y, ellipsoidal height in `crs`. Image points are ``(N, 2)``: column, row in pixels,
+    with the outer corner of the first pixel at (0, 0). A point that cannot be mapped is a row of NaN.
+
+    Examples
+    --------
+    >>> import ortho_pipeline as op
+    >>> model = op.open_scene("sample_data/scene.tif").model
+    >>> model.image_to_ground([[500.0, 500.0]], height=800.0).round(4)
+    array([[ 33.35  ,  37.2501, 800.    ]])
     """
 
     kind: ClassVar[str]
@@ -92,7 +98,7 @@ class SensorModel(ABC):
 
     @property
     def height_limits(self) -> tuple[float, float]:
-        """Ellipsoidal heights (m) beyond which the model does not project: it would extrapolate."""
+        """Lowest and highest ellipsoidal height (m) that the model projects; others would be extrapolation."""
         return -math.inf, math.inf
 
     @property
@@ -101,26 +107,26 @@ class SensorModel(ABC):
         return float(self.domain[0][2])
 
     def with_heights(self, low: float, high: float) -> Self:
-        """Return this model, meant for ground between two ellipsoidal heights (m).
+        """Return this model for ground between two ellipsoidal heights (m).
 
-        The model itself where the range is part of its numbers, as the scale of an RPC is.
+        A model whose numbers contain the range, such as an RPC, returns itself.
         """
         return self
 
     @property
     def corners(self) -> Array:
-        """Ground points ``(N, 3)`` at the rim of what the model is meant for, at its lowest and highest height.
+        """Ground points ``(N, 3)`` at the corners of the model's area, at its lowest and highest height.
 
-        Here the corners of `domain`; a model that knows the frame of its image gives the corners of that.
+        By default the corners of `domain`. A model that knows its image returns the corners of the image.
         """
         centre, half = self.domain
         return np.asarray(centre + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3))))
 
     @property
     def detail(self) -> float:
-        """Length (px) of the finest detail of the map: half of its shortest wave, or the distance of knots.
+        """Length (px) of the finest detail of the map: half its shortest wave, or the distance between knots.
 
-        Infinite, as here, for a model that is smooth all over its image. The warp never interpolates over more.
+        Infinite (the default) for a model that is smooth all over its image. The warp never interpolates over more.
         """
         return math.inf
 
@@ -144,21 +150,21 @@ class SensorModel(ABC):
 
     @property
     def minimum_points(self) -> int:
-        """Least number of control points that determine all parameters: each gives two equations."""
+        """Least number of control points that determine all parameters; each gives two equations."""
         return -(-len(self.param_names) // 2)
 
     @property
     def uses_height(self) -> bool:
-        """False for a model of the plane, which maps points of any height alike."""
+        """False for a model of the plane, which maps all heights to the same point."""
         return True
 
     @property
     def removable(self) -> tuple[str, ...]:
-        """Names of the parameters that `without` may take out next: those on which no higher term builds."""
+        """Names of the parameters that `without` may remove next: those that no higher term needs."""
         return ()
 
     def without(self, names: Iterable[str]) -> Self:
-        """Return this model with these parameters removed: zero, and no parameters any more."""
+        """Return this model without these parameters: they are zero, and no longer adjustable."""
         raise InputError(f"parameters of a model {self.kind!r} cannot be removed", field=", ".join(names))
 
     def constraints(self) -> Constraints:
@@ -206,9 +212,9 @@ class SensorModel(ABC):
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         """Intersect the rays of image points ``(N, 2)`` with ellipsoidal heights ``(N,)`` or one height.
 
-        Newton's method with `ground_partials`, started in the middle of the domain. The result is projected again and
-        is NaN unless it closes within 1e-5 px and lies within 1.5 half-sizes of the domain, because a ratio of
-        polynomials has false roots outside of it.
+        Newton's method with `ground_partials` starts in the middle of the domain. A point is NaN if its projection
+        differs by more than 1e-5 px, or if it is beyond 1.5 half-sizes of the domain, where a ratio of polynomials has
+        false roots.
 
         Returns
         -------
@@ -225,14 +231,14 @@ class SensorModel(ABC):
         for _ in range(_INVERSE_STEPS):
             if not len(left):
                 break
-            found, partials = self.projected(ground[left])
-            miss = image[left] - found
+            projected, partials = self.projected(ground[left])
+            miss = image[left] - projected
             step = solve_2x2(partials[:, :, :2], miss)
-            # A step beyond the domain comes from a bad linearisation far from the solution: go half-way there.
+            # A step beyond the domain comes from a bad linearisation far from the solution: shorten it.
             longest = np.abs(step / half[:2]).max(axis=1, initial=0.0)
             step /= np.maximum(longest, 1.0)[:, None]
             ground[left, :2] += step
-            # Outside of the domain there may be no projection to come back by.
+            # Outside the domain there may be no projection, and so no way back.
             ground[left, :2] = np.clip(ground[left, :2], centre[:2] - reach, centre[:2] + reach)
             with np.errstate(invalid="ignore"):
                 left = left[(np.abs(miss).max(axis=1) > INVERSE_TOLERANCE) & (longest > 1e-15)]
@@ -245,7 +251,7 @@ class SensorModel(ABC):
     # -- files -------------------------------------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the model as plain data that JSON holds without loss; `models.model_from_dict` reads it."""
+        """Return the model as plain data for JSON, without loss; `models.model_from_dict` reads it."""
         data: dict[str, Any] = {"kind": self.kind}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -254,13 +260,15 @@ class SensorModel(ABC):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Make the model from what `to_dict` returned."""
+        """Make the model from the result of `to_dict`."""
         names = {field.name for field in fields(cls)}
-        given = {key: value for key, value in data.items() if key != "kind"}
-        if set(given) != names:
-            wrong = sorted(set(given) ^ names)
-            raise InputError(f"a model of kind {cls.kind!r} has the fields {sorted(names)}", field=", ".join(wrong))
-        return cls(**given)
+        values = {key: value for key, value in data.items() if key != "kind"}
+        if set(values) != names:
+            wrong = sorted(set(values) ^ names)
+            raise InputError(
+                f"a model of kind {cls.kind!r} must have the fields {sorted(names)}", field=", ".join(wrong)
+            )
+        return cls(**values)
 
     def _replace(self, **changes: Any) -> Self:
         return replace(self, **changes)
@@ -278,33 +286,33 @@ def _plain(value: Any) -> Any:
     return value
 
 
-#: Model classes by the `kind` under which files name them: those of `models`, and what the hook `ortho_models` adds.
+#: Model classes by their `kind` in files: those of `models`, and those that the hook `ortho_models` adds.
 KINDS: dict[str, type[SensorModel]] = {}
 
 
 def model_from_dict(data: dict[str, Any]) -> SensorModel:
-    """Make a model from what its `to_dict` returned.
+    """Make a model from the result of its `to_dict`.
 
     Raises
     ------
     InputError
-        If its kind is unknown (the plugin that has it is not installed) or its fields do not fit.
+        If its kind is unknown (its plugin is not installed), or its fields are wrong.
     """
     kind = data.get("kind")
     if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(
-            f"no installed sensor model is of kind {kind!r}",
+            f"unknown kind of sensor model {kind!r}",
             field="kind",
-            remedy=f"known kinds are {', '.join(sorted(KINDS))}; install the plugin that offers it in ortho_models",
+            remedy=f"use one of {', '.join(sorted(KINDS))}, or install the plugin that has this kind in ortho_models",
         )
     try:
         return KINDS[kind].from_dict(data)
     except (TypeError, ValueError, AttributeError, ArithmeticError, LookupError, RecursionError) as error:
-        # Constructors check what numbers mean; that a value is a number or a list at all is found out by using it.
+        # Constructors check the values of numbers; a value that is no number or list at all fails when it is used.
         raise InputError(
             f"this is not a model of kind {kind!r} ({str(error)[:200]})",
             field=kind,
-            remedy="leave what was written as it is, or write the model again",
+            remedy="write the model again, and do not edit the file",
         ) from error
 
 
@@ -321,21 +329,21 @@ def as_image(image: ArrayLike) -> Array:
 def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != columns:
-        raise InputError(f"{what} points have the shape (N, {columns}), not {array.shape}")
+        raise InputError(f"{what} points must have the shape (N, {columns}), not {array.shape}")
     return array
 
 
 def checked_names(free: Iterable[str], known: Iterable[str], where: str) -> tuple[str, ...]:
-    """Return the names of free parameters, which must be different ones of those that are known."""
+    """Return the names of free parameters, which must be known and different."""
     names = tuple(free)
     unknown = sorted(set(names) - set(known))
     if unknown or len(set(names)) != len(names):
-        raise InputError(f"free parameters are different names {where}", field=", ".join(unknown) or "free")
+        raise InputError(f"free parameters must be different names {where}", field=", ".join(unknown) or "free")
     return names
 
 
 def ground_of_grid(model: SensorModel, size: tuple[int, int], count: int, heights: tuple[float, float]) -> Array:
-    """Return ground points ``(2 count^2, 3)`` of `count` x `count` pixels, rim included, at two ellipsoidal heights."""
+    """Return ground points ``(2 count^2, 3)`` of `count` x `count` image points, edges included, at two heights (m)."""
     fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, count)] * 2), axis=-1).reshape(-1, 2)
     image = fractions * size
     return np.concatenate([model.image_to_ground(image, height) for height in heights])

@@ -1,14 +1,14 @@
 r"""Bias correction in image space over any sensor model.
 
-The image point of the model, :math:`(c, r)`, is moved to
+The image point of the model, :math:`(c, r)`, becomes
 
 .. math::
     c' &= c + a_0 + a_1 (c - c_0) + a_2 (r - r_0) \\
     r' &= r + b_0 + b_1 (c - c_0) + b_2 (r - r_0)
 
-``shift`` has :math:`a_0, b_0`; ``shift-drift`` adds :math:`a_2, b_2` (the row is time for a line scanner); ``affine``
-has all six. Being increments to the identity, all parameters are zero where nothing has to be corrected, which is what
-a significance test asks. The origin (the middle of the image) makes the shift the correction there.
+``shift`` has :math:`a_0, b_0`; ``shift-drift`` adds :math:`a_2, b_2` (for a line scanner the row is time); ``affine``
+has all six. The parameters are increments to the identity: zero means no correction, so significance tests apply.
+The shift is the correction at the origin, the middle of the image.
 
 Source: formula 2 of Willneff et al. (CARTOSAT-1), formula 7 of Bueyueksalih et al. (OrbView-3); Fraser and Hanley 2003.
 Symbols (formula 7): a1, a4 = shifts + origin terms; a2 - 1, a3 = col_per_col, col_per_row; a5, a6 - 1 = row_per_col,
@@ -39,12 +39,12 @@ FREE = {
 
 @dataclass(frozen=True, eq=False)
 class OverAnother(SensorModel):
-    """A model that moves the image points of another one: meant for the same ground, with the same detail.
+    """A model that changes the image points of another model, with the same ground and detail.
 
     Parameters
     ----------
     model : SensorModel
-        The other one.
+        The other model.
     """
 
     model: SensorModel
@@ -84,26 +84,33 @@ class OverAnother(SensorModel):
     def from_dict(cls, data: dict[str, Any]) -> Self:
         inner = data.get("model")
         if not isinstance(inner, dict):
-            raise InputError(f"a model of kind {cls.kind!r} needs the model that it moves", field="model")
+            raise InputError(f"a model of kind {cls.kind!r} needs the model that it corrects", field="model")
         return super().from_dict({**data, "model": model_from_dict(inner)})
 
 
 @dataclass(frozen=True, eq=False)
 class ImageCorrection(OverAnother):
-    """A sensor model whose image points are moved by a shift, shift and drift, or affine transformation.
+    """A sensor model with a bias correction in the image: a shift, shift and drift, or affine transformation.
 
     Parameters
     ----------
     model : SensorModel
-        What is corrected.
+        The model to correct.
     correction : {'none', 'shift', 'shift-drift', 'affine'}
         Which coefficients are parameters; the others are zero.
     origin : (float, float)
-        Column and row (px) about which the linear terms turn.
+        Column and row (px) at which the linear terms are zero.
     coefficients : (6,)
-        In the order of `COEFFICIENTS`; shifts in pixels, the others in pixels per pixel.
+        In the order of `COEFFICIENTS`; shifts in px, the others in px per px.
     removed : tuple of str
-        Coefficients that are not parameters although the correction has them: found unjustified, and zero.
+        Coefficients of this correction that are zero and no parameters, because they were not significant.
+
+    Examples
+    --------
+    >>> import ortho_pipeline as op
+    >>> rpc = op.read_rpc("sample_data/scene_RPC.TXT")
+    >>> ImageCorrection.identity(rpc, "shift", (500.0, 500.0)).param_names
+    ('col_shift', 'row_shift')
     """
 
     kind: ClassVar[str] = "image_correction"
@@ -115,10 +122,10 @@ class ImageCorrection(OverAnother):
 
     def __post_init__(self) -> None:
         if self.correction not in FREE:
-            raise InputError(f"no correction is called {self.correction!r}", remedy=f"one of {', '.join(FREE)}")
+            raise InputError(f"unknown correction {self.correction!r}", remedy=f"use one of {', '.join(FREE)}")
         coefficients = np.array(self.coefficients, dtype=np.float64)
         if coefficients.shape != (6,) or not np.isfinite(coefficients).all():
-            raise InputError("a correction has 6 finite coefficients", field="coefficients")
+            raise InputError("a correction needs 6 finite coefficients", field="coefficients")
         (a, b), (c, d) = _matrix(coefficients).tolist()
         if abs(a * d - b * c) < 1e-6:
             raise InputError("this correction cannot be inverted", field="coefficients")
@@ -131,7 +138,7 @@ class ImageCorrection(OverAnother):
 
     @classmethod
     def identity(cls, model: SensorModel, correction: str, origin: tuple[float, float]) -> Self:
-        """Return the correction that changes nothing, to start an adjustment from."""
+        """Return the correction that changes nothing: the start of an adjustment."""
         return cls(model, correction, origin, np.zeros(6))
 
     @property
@@ -142,7 +149,7 @@ class ImageCorrection(OverAnother):
     @property
     def removable(self) -> tuple[str, ...]:
         left = self.param_names
-        # The origin is a convention: a slope without a shift would depend on it.
+        # A slope without a shift would depend on the origin, which is only a convention.
         slopes = tuple(name for name in left if not name.endswith("_shift"))
         return slopes + tuple(
             f"{axis}_shift"
@@ -197,7 +204,7 @@ class ImageCorrection(OverAnother):
         return self._turned(self.model.ground_partials(ground))
 
     def _turned(self, partials: Array) -> Array:
-        # Written out: products of stacks of such small matrices take ten times as long.
+        # Written out: a product of stacks of such small matrices takes ten times as long.
         return partials[:, :1] * self.matrix[:, :1] + partials[:, 1:] * self.matrix[:, 1:]
 
     def param_partials(self, ground: ArrayLike) -> Array:
@@ -217,13 +224,13 @@ class ImageCorrection(OverAnother):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        # Files of versions before parameters could be removed do not have this field.
+        # Older files do not have this field.
         return super().from_dict({"removed": (), **data})
 
 
 @functools.cache
 def _places(names: tuple[str, ...]) -> list[int]:
-    """Return the places of some of the coefficients."""
+    """Return the indices of some coefficients."""
     return [COEFFICIENTS.index(name) for name in names]
 
 

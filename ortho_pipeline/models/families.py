@@ -1,12 +1,12 @@
-r"""The table of classical models: all are ratios of polynomials, and differ by the terms of numerator and denominator.
+r"""The table of classical models: ratios of polynomials that differ in the terms of numerator and denominator.
 
 With ground X, Y, Z and image x (column), y (row), all normalised,
 
 .. math:: x = \frac{\sum a_t\, t(X, Y, Z)}{1 + \sum c_t\, t(X, Y, Z)}, \qquad
           y = \frac{\sum b_t\, t(X, Y, Z)}{1 + \sum d_t\, t(X, Y, Z)}
 
-Parameters are named after image axis, part, term: ``col_XZ`` is the coefficient of XZ in the numerator of the column,
-``row_den_X`` one of the denominator of the row, ``den_X`` one of a denominator that column and row have in common.
+Names of parameters are image axis, part, term: ``col_XZ`` is the coefficient of XZ in the numerator of the column,
+``row_den_X`` is in the denominator of the row, ``den_X`` in a denominator that column and row share.
 
 Source: Ok and Turker (BILSAT-1), eqs. 8-11; Amini and Hashemi (IKONOS), eqs. 2-9; Bueyueksalih et al. (OrbView-3),
 formulas 2-5.
@@ -32,7 +32,7 @@ class Family:
     Parameters
     ----------
     name, description, suits, formula : str
-        For people: what it is, what it is good for, which equation of which paper.
+        For people: what it is, what it suits, and its equation in the papers.
     col, row : tuple of str
         Terms of the numerators, such as ``1``, ``X``, ``XZ``, ``X2``.
     den : tuple of str
@@ -40,9 +40,9 @@ class Family:
     common : bool
         One denominator for column and row, or one for each.
     simpler : tuple of str
-        Families to fall back to where the points do not determine this one, the next simpler first.
+        Simpler families to use if the points do not determine this one, the next simpler first.
     variants : tuple of str
-        Families of which the better one is taken under this name.
+        Families of which the better one is used under this name.
     """
 
     name: str
@@ -75,12 +75,12 @@ class Family:
 
     @property
     def dimensions(self) -> int:
-        """2 where heights play no part, else 3."""
+        """2 if heights are not used, else 3."""
         return 3 if any("Z" in term for term in (*self.col, *self.row, *self.den)) else 2
 
     @property
     def regularised(self) -> bool:
-        """True for families that need regularisation: their denominators go beyond the first order or are separate."""
+        """True for families that need regularisation: with separate denominators, or ones beyond the first order."""
         return bool(self.den) and (not self.common or len(self.den) > 3)
 
     def to_json(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Family:
 
 
 def points_needed(names: tuple[str, ...]) -> int:
-    """Return how many points determine the parameters of these names: each gives one equation to each image axis."""
+    """Return the number of points that determine these parameters; each gives one equation for each image axis."""
     col = sum(name.startswith("col_") for name in names)
     row = sum(name.startswith("row_") for name in names)
     return max(col, row, -(-len(names) // 2))
@@ -111,11 +111,11 @@ def exponents(term: str) -> NDArray[np.int64]:
 
 def complete(order: int, axes: str = "XYZ") -> tuple[str, ...]:
     """Return all terms up to a total order, ordered by it: ``1, X, Y, X2, XY, Y2`` for order 2 in X and Y."""
-    found = [powers for powers in product(range(order + 1), repeat=len(axes)) if sum(powers) <= order]
-    found.sort(key=lambda powers: (sum(powers), [-power for power in powers]))
+    terms = [powers for powers in product(range(order + 1), repeat=len(axes)) if sum(powers) <= order]
+    terms.sort(key=lambda powers: (sum(powers), [-power for power in powers]))
     return tuple(
         "".join(f"{axis}{power if power > 1 else ''}" for axis, power in zip(axes, powers, strict=True) if power) or "1"
-        for powers in found
+        for powers in terms
     )
 
 
@@ -128,7 +128,7 @@ def _polynomial(order: int) -> Family:
     return Family(
         f"poly{order}",
         f"2D polynomial of the {name} order",
-        "flat terrain" + (", small distortions" if order < 3 else "; many well spread points, swings between them"),
+        "flat terrain" + (", small distortions" if order < 3 else "; many well spread points; oscillates between them"),
         "BILSAT-1 eq. 8" + (f", IKONOS eq. {order + 1}" if order <= 3 else ""),
         complete(order, "XY"),
         complete(order, "XY"),
@@ -163,7 +163,7 @@ def _rational(order: int, common: bool) -> Family:
     )
 
 
-_AFFINE14 = "affine12 with the column's X2 and the row's XY, or the other way about: the better by leave-one-out"
+_AFFINE14 = "affine12 with X2 for the column and XY for the row, or the reverse, by leave-one-out"
 _FAMILIES = (
     Family("affine2d", "2D affine", "flat terrain, images projected to a plane", "IKONOS eqs. 2 and 9", _PLANE, _PLANE),
     *(_polynomial(order) for order in (1, 2, 3, 4, 5)),
@@ -248,17 +248,17 @@ def families() -> tuple[Family, ...]:
 
 
 def family_of(name: str) -> Family:
-    """Return a family by its name, the axis assignments ``affine14-col`` and ``affine14-row`` included.
+    """Return a family by its name, including ``affine14-col`` and ``affine14-row``.
 
     Raises
     ------
     InputError
-        If there is none of this name.
+        For an unknown name.
     """
     if name not in _BY_NAME:
         raise InputError(
-            f"no model family is called {name!r}",
+            f"unknown model family {name!r}",
             field="points.model",
-            remedy=f"one of {', '.join(family.name for family in _FAMILIES)}",
+            remedy=f"use one of {', '.join(family.name for family in _FAMILIES)}",
         )
     return _BY_NAME[name]

@@ -1,15 +1,15 @@
 r"""Interior orientation of a frame camera: from directions in the camera to pixels, and back.
 
-A direction is :math:`(u, v)`, the tangents to the right and downwards of the ray from the optical axis. The lens moves
-it (Brown's model as OpenCV, OpenSfM and Metashape write it, dimensionless, :math:`r^2 = u^2 + v^2`)
+A direction is :math:`(u, v)`, the tangents (right, down) of the angle between ray and optical axis. The lens distorts
+it (Brown's model as in OpenCV, OpenSfM and Metashape, dimensionless, :math:`r^2 = u^2 + v^2`)
 
 .. math::
     u' &= u (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + 2 p_1 u v + p_2 (r^2 + 2 u^2) \\
     v' &= v (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + p_1 (r^2 + 2 v^2) + 2 p_2 u v
 
-and the image plane has the paper's coordinates, metres from the middle of the frame, x to the right and **y upwards**:
-:math:`x = x_0 + f u'`, :math:`y = y_0 - f v'`. Pixels are counted from the outer corner of the first one, rows
-**downwards**: column = width/2 + x / pitch_x, row = height/2 - y / pitch_y.
+and the image plane has the paper's coordinates: metres from the middle of the frame, x right and **y up**,
+:math:`x = x_0 + f u'`, :math:`y = y_0 - f v'`. Pixels count from the outer corner of the first one, rows **down**:
+column = width/2 + x / pitch_x, row = height/2 - y / pitch_y.
 """
 
 from __future__ import annotations
@@ -36,20 +36,26 @@ class Interior:
     Parameters
     ----------
     width, height : int
-        Size of the frame in pixels.
+        Size of the frame (px).
     focal_length : float
-        Principal distance f, metres.
+        Principal distance f (m).
     pitch_x, pitch_y : float
-        Distance of neighbouring pixels along a row and along a column, metres.
+        Distance (m) between neighbouring pixels along a row and along a column.
     x0, y0 : float
-        Principal point in the image plane (x right, y up), metres from the middle of the frame.
+        Principal point in the image plane (x right, y up), in metres from the middle of the frame.
     k1, k2, k3, p1, p2 : float
-        Brown's distortion on tangents, v downwards (see the module).
+        Brown's distortion of tangents, v down (see the module).
 
     Raises
     ------
     InputError
         For a number that is not finite, or a size that is not positive.
+
+    Examples
+    --------
+    >>> camera = Interior(4000, 3000, focal_length=0.05, pitch_x=5e-6, pitch_y=5e-6)
+    >>> round(math.degrees(camera.field_of_view), 2)
+    14.04
     """
 
     width: int
@@ -69,13 +75,13 @@ class Interior:
         for name in INTERIOR:
             value = float(getattr(self, name))
             if not math.isfinite(value):
-                raise InputError(f"{value} is not a number for a camera", field=name)
+                raise InputError(f"{value} is not a finite number", field=name)
             object.__setattr__(self, name, value)
         for name in ("width", "height", "focal_length", "pitch_x", "pitch_y"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{getattr(self, name)} is not positive", field=name)
         if self.width != int(self.width) or self.height != int(self.height):
-            raise InputError("a frame has whole numbers of columns and rows", field="width, height")
+            raise InputError("the numbers of columns and rows must be integers", field="width, height")
 
     @property
     def field_of_view(self) -> float:
@@ -88,7 +94,7 @@ class Interior:
 
     @cached_property
     def _farthest(self) -> float:
-        """Square of the radius r up to which the distortion is monotonic; beyond it the image would fold over."""
+        """Square of the radius r up to which the distortion is monotonic; beyond it a pixel has two directions."""
         if not (self.k1 or self.k2 or self.k3):
             return math.inf
         # 1 + 3 k1 u + 5 k2 u^2 + 7 k3 u^3 with u = 1 / (scale v): coefficients of at most 1, and a leading one of 1.
@@ -105,37 +111,37 @@ class Interior:
         return bool(self.k1 or self.k2 or self.k3 or self.p1 or self.p2)
 
     def image_of(self, directions: Array) -> Array:
-        """Return the image points ``(N, 2)`` of directions ``(N, 2)``; NaN where the lens model folds over."""
+        """Return the image points ``(N, 2)`` of directions ``(N, 2)``; NaN where the lens model is not unique."""
         image = self._pixels(self._distort(directions))
         if math.isfinite(self._farthest):
             image[(directions**2).sum(axis=1) >= self._farthest] = np.nan
         return image
 
     def directions_of(self, image: Array) -> Array:
-        """Return the directions ``(N, 2)`` that are seen at image points ``(N, 2)``; NaN where there is none.
+        """Return the directions ``(N, 2)`` of image points ``(N, 2)``; NaN where there is none.
 
-        Newton's method on the distortion, verified.
+        Newton's method inverts the distortion, and the result is verified.
         """
         x = (image[:, 0] - self.width / 2) * self.pitch_x - self.x0
         y = (self.height / 2 - image[:, 1]) * self.pitch_y - self.y0
         seen = np.stack([x, -y], axis=1) / self.focal_length
         if not self._distorts:
             return seen
-        found = seen.copy()
+        directions = seen.copy()
         reach = math.sqrt(self._farthest)
         for _ in range(_UNDISTORT_STEPS):
-            miss = seen - self._distort(found)
-            found = found + solve_2x2(self._slopes(found), miss)
-            # A step across the fold would end on the wrong branch.
-            radius = np.hypot(found[:, 0], found[:, 1])
+            miss = seen - self._distort(directions)
+            directions = directions + solve_2x2(self._slopes(directions), miss)
+            # A step beyond the limit would end on the wrong branch.
+            radius = np.hypot(directions[:, 0], directions[:, 1])
             with np.errstate(invalid="ignore"):
-                found[radius > reach] *= (0.99 * reach / radius[radius > reach])[:, None]
+                directions[radius > reach] *= (0.99 * reach / radius[radius > reach])[:, None]
                 if not (np.abs(miss) > 1e-15).any():
                     break
         with np.errstate(invalid="ignore"):
-            closed = np.abs(self._distort(found) - seen).max(axis=1, initial=0.0) < 1e-12
-        found[~closed] = np.nan
-        return found
+            closed = np.abs(self._distort(directions) - seen).max(axis=1, initial=0.0) < 1e-12
+        directions[~closed] = np.nan
+        return directions
 
     def partials_of_direction(self, directions: Array) -> Array:
         """Return d(image)/d(direction) as ``(N, 2, 2)``."""

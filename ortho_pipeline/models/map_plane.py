@@ -1,4 +1,4 @@
-r"""Scenes that the vendor projected onto a plane of one height, in a map projection: IKONOS Geo and its like.
+r"""Scenes that the vendor projected onto a plane of one height, in a map projection, such as IKONOS Geo.
 
 A line of sight that meets the plane at height :math:`h_0` passes through all ground points :math:`(X, Y, h)` whose
 
@@ -6,10 +6,10 @@ A line of sight that meets the plane at height :math:`h_0` passes through all gr
     X_0 &= X + r_x (h - h_0) + s_x \\
     Y_0 &= Y + r_y (h - h_0) + s_y
 
-are the map coordinates of the pixel: relief is displaced along one direction by so much per metre of height. With the
-azimuth :math:`\alpha` (in which the satellite stands, from true north) and its elevation :math:`\epsilon`,
-:math:`(r_x, r_y) = -(\sin\alpha', \cos\alpha') / \tan\epsilon` in the map: away from the satellite, with
-:math:`\alpha'` reckoned from the north of the grid. All four parameters are linear.
+are the map coordinates of the pixel: relief displacement has one direction, and is proportional to the height. With
+azimuth :math:`\alpha` (from true north) and elevation :math:`\epsilon` of the satellite,
+:math:`(r_x, r_y) = -(\sin\alpha', \cos\alpha') / \tan\epsilon` in the map: away from the satellite, where
+:math:`\alpha'` counts from the north of the grid. All four parameters are linear.
 
 Source: Grodecki and Dial 2003 (the product); Fraser and Yamakawa 2004 (parallel projection of narrow scenes).
 """
@@ -29,16 +29,16 @@ from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
 
 PARAMETERS = ("shift_x", "shift_y", "relief_x", "relief_y")
-#: Length (m) over which a direction on the ellipsoid is carried into the map.
+#: Length (m) over which a direction on the ellipsoid is converted to the map.
 _STEP = 1000.0
 _EARTH_RADIUS = 6371000.0
-#: A line of sight lower than this above the horizon is a wrong angle.
+#: A lower line of sight above the horizon is a wrong angle.
 LOWEST_ELEVATION = math.radians(5.0)
 
 
 @dataclass(frozen=True, eq=False)
 class MapPlane(SensorModel):
-    """An image that is a map of the lines of sight where they meet a plane of constant height.
+    """An image whose pixels are where lines of sight meet a plane of constant height, in a map projection.
 
     Parameters
     ----------
@@ -55,9 +55,9 @@ class MapPlane(SensorModel):
     relief : (float, float)
         Displacement in x and y of the map for one metre of height above the plane.
     heights : (float, float)
-        Lowest and highest ground that the model is meant for.
+        Lowest and highest ellipsoidal height (m) of the ground.
     shift : (float, float)
-        Displacement of all points in metres of the map.
+        Displacement (m) of all points in the map.
     """
 
     kind: ClassVar[str] = "geo"
@@ -80,11 +80,11 @@ class MapPlane(SensorModel):
         object.__setattr__(self, "size", tuple(int(value) for value in self.size))
         object.__setattr__(self, "plane", float(self.plane))
         if not (self.pixel[0] > 0 and self.pixel[1] > 0 and len(self.size) == 2 and min(self.size) > 0):
-            raise InputError("pixels and images have a positive size", field="pixel, size")
+            raise InputError("sizes of pixels and images must be positive", field="pixel, size")
         if not self.heights[0] < self.heights[1]:
-            raise InputError("the lower height comes first", field="heights", remedy="give low,high in metres")
+            raise InputError("the lower height must come first", field="heights", remedy="give low,high in metres")
         if not self.heights[0] <= self.plane <= self.heights[1]:
-            raise InputError(f"the plane at {self.plane} m does not lie within the heights", field="heights")
+            raise InputError(f"the plane at {self.plane} m is outside the heights", field="heights")
         _check_map(self.map_crs)
 
     @classmethod
@@ -99,24 +99,24 @@ class MapPlane(SensorModel):
         elevation: float,
         heights: tuple[float, float],
     ) -> Self:
-        """Return the model of a scene of which only the direction to the satellite is known.
+        """Return the model of a scene from the direction to the satellite.
 
         Parameters
         ----------
         azimuth, elevation : float
-            Of the satellite as seen from the middle of the scene, radians; from true north clockwise, and above the
+            Direction (rad) of the satellite from the middle of the scene: clockwise from true north, and above the
             tangent plane of the ellipsoid.
 
         Raises
         ------
         InputError
-            If the line of sight does not come from above.
+            If the elevation is not 5 to 90 degrees.
         """
         if not (math.isfinite(azimuth) and LOWEST_ELEVATION < elevation <= math.pi / 2):
             raise InputError(
-                f"a satellite {math.degrees(elevation):.3g} degrees above the horizon takes no such image",
+                f"an elevation of {math.degrees(elevation):.3g} degrees is not possible for such an image",
                 field="elevation",
-                remedy="it is an angle from 5 to 90 degrees",
+                remedy="give an angle from 5 to 90 degrees",
             )
         middle = np.array([[corner[0] + pixel[0] * size[0] / 2, corner[1] - pixel[1] * size[1] / 2, plane]])
         away = _along(map_crs, middle, azimuth) / -math.tan(elevation)
@@ -172,7 +172,7 @@ class MapPlane(SensorModel):
     def ground_to_image(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
         at = ground[:, :2] + np.outer(ground[:, 2] - self.plane, self.relief) + self.shift
-        # A height that is not a number would leave the other axis alone where the relief is zero.
+        # Where the relief is zero, a height of NaN would not make that axis NaN.
         at[~np.isfinite(ground).all(axis=1)] = np.nan
         return (at - self.corner) / self._steps
 
@@ -186,8 +186,8 @@ class MapPlane(SensorModel):
 
     def ground_partials(self, ground: ArrayLike) -> Array:
         across, down = self._steps
-        one = np.array([[1.0 / across, 0.0, self.relief[0] / across], [0.0, 1.0 / down, self.relief[1] / down]])
-        return np.tile(one, (len(as_ground(ground)), 1, 1))
+        slopes = np.array([[1.0 / across, 0.0, self.relief[0] / across], [0.0, 1.0 / down, self.relief[1] / down]])
+        return np.tile(slopes, (len(as_ground(ground)), 1, 1))
 
     def param_partials(self, ground: ArrayLike) -> Array:
         above = as_ground(ground)[:, 2] - self.plane
@@ -212,14 +212,14 @@ class MapPlane(SensorModel):
 
 
 def _along(map_crs: str, place: Array, azimuth: float) -> Array:
-    """Return how far ``(2,)`` the map moves for one metre at the height of a place, in a direction from true north."""
+    """Return the map's step ``(2,)`` for one metre at the height of a place, in a direction from true north."""
     to_geographic = ground_transform(map_crs, "EPSG:4979")
     lon, lat, height = to_geographic(place)[0]
     if not math.isfinite(lon):
-        raise InputError("the scene does not lie in the domain of its map projection", field="corner")
+        raise InputError("the scene is outside the area of its map projection", field="corner")
     lon2, lat2, _ = pyproj.Geod(ellps="WGS84").fwd(lon, lat, math.degrees(azimuth), _STEP)
     there = ground_transform("EPSG:4979", map_crs)(np.array([[lon2, lat2, height]]))[0]
-    # A metre up there is shorter on the ellipsoid, to which maps belong.
+    # A metre at this height is shorter on the ellipsoid, and maps show the ellipsoid.
     step = _STEP * (1.0 + height / _EARTH_RADIUS)
     return np.asarray((there - place[0])[:2] / step, dtype=np.float64)
 
@@ -228,5 +228,5 @@ def _check_map(text: str) -> None:
     crs = parse_crs(text)
     if not crs.is_projected or any(abs(axis.unit_conversion_factor - 1.0) > 1e-12 for axis in crs.axis_info[:2]):
         raise InputError(
-            f"{crs.name!r} is not a map projection in metres", field="map_crs", remedy="for example a UTM zone"
+            f"{crs.name!r} is not a map projection in metres", field="map_crs", remedy="use for example a UTM zone"
         )

@@ -1,4 +1,4 @@
-"""Parts of images: one delivered in pieces, each with a model in its own pixels, and one cut out of another."""
+"""Parts of images: an image delivered in pieces, each with its own model, and a crop of an image."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from ortho_pipeline.models.correction import OverAnother
 class Pieces(SensorModel):
     """The models of the pieces of one image as one model, in the pixels of the first piece.
 
-    A ground point belongs to the piece in which, or the least far outside of which, it is seen. The seams are as good
-    as the models agree there, so this is for adjusting a correction that all pieces share, not for resampling.
+    A ground point belongs to the piece that shows it, or to the nearest one. At seams the models may disagree, so use
+    this to adjust a correction that all pieces share, not for resampling.
 
     Parameters
     ----------
     models : tuple of SensorModel
-        Of one CRS; each in the pixels of its piece.
+        With one CRS, each in the pixels of its piece.
     offsets : tuple of (float, float)
         Column and row of the first corner of each piece in the pixels of the first.
     sizes : tuple of (int, int)
@@ -43,9 +43,9 @@ class Pieces(SensorModel):
         for name in ("models", "offsets", "sizes"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if not self.models or not len(self.models) == len(self.offsets) == len(self.sizes):
-            raise InputError("each piece has a model, an offset and a size", field="models, offsets, sizes")
+            raise InputError("each piece needs a model, an offset and a size", field="models, offsets, sizes")
         if len({model.crs for model in self.models}) != 1:
-            raise InputError("the models of the pieces are in different systems", field="models")
+            raise InputError("the models of the pieces have different CRSs", field="models")
 
     @property
     def first(self) -> SensorModel:
@@ -60,7 +60,7 @@ class Pieces(SensorModel):
     def domain(self) -> tuple[Array, Array]:
         boxes = [model.domain for model in self.models]
         if parse_crs(self.crs).is_geographic:
-            # Beside the antimeridian a piece may count its longitudes from the other side.
+            # Near the antimeridian a piece may count its longitudes from the other side.
             turn = np.array([360.0, 0.0, 0.0])
             boxes = [(at - turn * np.round((at - boxes[0][0])[0] / 360.0), half) for at, half in boxes]
         low = np.min([centre - half for centre, half in boxes], axis=0)
@@ -79,7 +79,7 @@ class Pieces(SensorModel):
 
     def ground_partials(self, ground: ArrayLike) -> Array:
         ground = as_ground(ground)
-        # Of the piece that each point belongs to: differences across a seam are not a slope.
+        # Each point has the slope of its own piece: a difference across a seam is no slope.
         owner = self._seen(ground)[1]
         partials = np.full((len(ground), 2, 3), np.nan)
         for k, model in enumerate(self.models):
@@ -87,14 +87,14 @@ class Pieces(SensorModel):
         return partials
 
     def _seen(self, ground: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Return image points ``(N, 2)`` and the number of the piece ``(N,)``, -1 where none sees the point."""
+        """Return image points ``(N, 2)`` and the numbers of their pieces ``(N,)``, -1 if no piece sees the point."""
         image = np.full((len(ground), 2), np.nan)
         owner = np.full(len(ground), -1)
         nearest = np.full(len(ground), np.inf)
         for k, (model, offset, size) in enumerate(zip(self.models, self.offsets, self.sizes, strict=True)):
             seen = model.ground_to_image(ground)
             outside = np.maximum(-seen, seen - size).max(axis=1, initial=0.0)
-            better = outside < nearest  # NaN is not a number, and not less than any
+            better = outside < nearest  # False for NaN
             image[better] = seen[better] + offset
             nearest[better], owner[better] = outside[better], k
         return image, owner
@@ -108,14 +108,14 @@ class Pieces(SensorModel):
 
 @dataclass(frozen=True, eq=False)
 class Cropped(OverAnother):
-    """A model in pixels that count from another corner; its parameters are those of the whole image's model.
+    """The model of a crop; its parameters are those of the larger image's model.
 
     Parameters
     ----------
     model : SensorModel
-        Of the whole image.
+        Model of the larger image.
     offset : (float, float)
-        Column and row of the crop's first corner in the whole image.
+        Column and row of the crop's first corner in the larger image.
     """
 
     kind: ClassVar[str] = "cropped"
@@ -125,7 +125,7 @@ class Cropped(OverAnother):
     def __post_init__(self) -> None:
         offset = np.asarray(self.offset, dtype=np.float64)
         if offset.shape != (2,) or not np.isfinite(offset).all():
-            raise InputError("a crop has a column and a row where it begins", field="offset")
+            raise InputError("the offset of a crop must be a column and a row", field="offset")
         object.__setattr__(self, "offset", (float(offset[0]), float(offset[1])))
 
     # -- parameters --------------------------------------------------------------------------------------------------
@@ -179,12 +179,12 @@ class Cropped(OverAnother):
 
 
 def relative_scale(model: SensorModel, other: SensorModel, size: tuple[int, int]) -> float | None:
-    """Return the width of a pixel of another model in those of `model`; None where they see different ground.
+    """Return the pixel size of another model in pixels of `model`; None if they see different ground.
 
     Parameters
     ----------
     other : SensorModel
-        Of the same CRS.
+        With the same CRS.
     size : (int, int)
         Columns and rows of the image of `other`.
     """

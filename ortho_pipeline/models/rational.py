@@ -1,8 +1,8 @@
 r"""Rational functions: image coordinates as ratios of polynomials of the ground.
 
-`Rational` is every classical model: which one, says the table in `ortho_pipeline.models.families`.
+`Rational` is any classical model of the table in `ortho_pipeline.models.families`.
 
-The RPC model of vendors (RPC00B) is the cubic case with its coefficients given. With ground coordinates normalised to
+The RPC model of vendors (RPC00B) is the cubic case with given coefficients. With ground coordinates normalised to
 :math:`L, P, H` (longitude, latitude, ellipsoidal height; minus offset, over scale),
 
 .. math:: c_n = \frac{a \cdot t(L, P, H)}{b \cdot t(L, P, H)}, \qquad
@@ -39,14 +39,14 @@ from ortho_pipeline.models.polynomials import term_partials, term_table, terms_o
 from ortho_pipeline.models.rpc_box import check_numbers, sound_heights
 from ortho_pipeline.runtime.compiled import is_loaded
 
-#: From this many points on the compiled kernels are used: loading a compiler takes longer than few points do.
+#: Compiled kernels are used from this number of points: for fewer, NumPy is faster than loading a compiler.
 COMPILED_FROM = 20_000
-#: The same where the compiler is loaded: there are only kernels to be found.
+#: The same if the compiler is already loaded.
 LOADED_FROM = 500
 _NUMBERS = tuple(f"{name}_{part}" for part in ("off", "scale") for name in ("col", "row", "lon", "lat", "h"))
-#: Points that NumPy takes at a time: their arrays stay in the second cache.
+#: Points that NumPy processes at once: their arrays stay in the second-level cache.
 _PART = 1024
-#: Beyond this many scales from its centre an RPC is extrapolation without meaning, and has false roots.
+#: Beyond this many scales from its centre an RPC is meaningless extrapolation, and has false roots.
 DOMAIN_LIMIT = 1.5
 
 
@@ -56,17 +56,24 @@ def _is_for_numpy(count: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class RPC(SensorModel):
-    """Rational polynomial coefficients as delivered by vendors, in WGS84 longitude, latitude, ellipsoidal height.
+    """Rational polynomial coefficients of a vendor, for WGS84 longitude, latitude and ellipsoidal height.
 
-    `col_off` and `row_off` are in this package's image convention, that is SAMP_OFF + 0.5 and LINE_OFF + 0.5.
-    Coefficients are ``(20,)`` in the order of RPC00B. Longitudes are unwrapped about `lon_off`, so scenes across the
-    antimeridian work. Ground beyond 1.5 scales in longitude, latitude or height projects to NaN, and so does ground
-    beyond the heights at which the RPC has a pole or a fold (`rpc_box.sound_heights`), and beyond a pole.
+    `col_off` and `row_off` follow this package's image convention: SAMP_OFF + 0.5 and LINE_OFF + 0.5. Coefficients are
+    ``(20,)`` in the order of RPC00B. Longitudes are unwrapped about `lon_off`, so scenes across the antimeridian work.
+    A ground point is NaN beyond 1.5 scales from the centre, beyond a pole, and outside the heights at which the RPC has
+    no pole and no fold (`rpc_box.sound_heights`).
 
     Raises
     ------
     InputError
-        For numbers that no RPC of a scene on Earth can have: not finite, a scale of zero, a pole about its middle.
+        For numbers that no RPC of a scene on Earth has: not finite, a scale of zero, a pole near the centre.
+
+    Examples
+    --------
+    >>> import ortho_pipeline as op
+    >>> rpc = op.read_rpc("sample_data/scene_RPC.TXT")
+    >>> round(rpc.lon_off, 2), round(rpc.lat_off, 2), rpc.h_off
+    (33.35, 37.25, 1000.0)
     """
 
     kind: ClassVar[str] = "rpc"
@@ -96,21 +103,21 @@ class RPC(SensorModel):
         for name in ("col_num", "col_den", "row_num", "row_den"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (20,):
-                raise InputError(f"an RPC has 20 coefficients here, not {values.size}", field=name)
+                raise InputError(f"an RPC needs 20 coefficients, not {values.size}", field=name)
             if not np.isfinite(values).all():
                 raise InputError("an RPC needs finite coefficients", field=name)
             if not values.any():
-                raise InputError("all coefficients of an RPC are zero here", field=name)
+                raise InputError("all coefficients are zero", field=name)
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        _ = self._reach  # refuses what is unsound
+        _ = self._reach  # refuses an unsound RPC
 
     @cached_property
     def _reach(self) -> tuple[float, float]:
         """Normalised heights up to which the model projects."""
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         low, high = sound_heights(numbers, self._polynomials)
-        # Sound up to the end of the box: beyond it as far as in plan.
+        # If it is sound up to the end of the box, then beyond it as far as horizontally.
         return low if low > -1.0 else -DOMAIN_LIMIT, high if high < 1.0 else DOMAIN_LIMIT
 
     @property
@@ -153,7 +160,7 @@ class RPC(SensorModel):
         return image, partials
 
     def _project(self, ground: Array, image: Array, partials: Array | None = None) -> None:
-        """Do in NumPy what `rpc_kernel.project` and `projected` do, with the same result in every bit."""
+        """Project in NumPy as `rpc_kernel.project` and `projected` do, with the same result in every bit."""
         offsets, scales, coefficients, limits = self.tables
         terms = tuple(coefficients.T[:, :, None])
         with np.errstate(all="ignore"):
@@ -167,8 +174,8 @@ class RPC(SensorModel):
                 image[part] = (ratios * scales[3:, None] + offsets[3:, None]).T
                 if partials is not None:
                     changes = np.array(rpc_kernel.slopes(terms, *place))
-                    found = (changes[:, ::2] - ratios * changes[:, 1::2]) * (1.0 / denominators)
-                    partials[part] = (found * scales[3:, None] / scales[:3, None, None]).T
+                    by_place = (changes[:, ::2] - ratios * changes[:, 1::2]) * (1.0 / denominators)
+                    partials[part] = (by_place * scales[3:, None] / scales[:3, None, None]).T
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
         image = as_image(image)
@@ -184,7 +191,7 @@ class RPC(SensorModel):
         """Offsets and scales, coefficients and limits as in `rpc_kernel`."""
         offsets = np.array([self.lon_off, self.lat_off, self.h_off, self.col_off, self.row_off])
         scales = np.array([self.lon_scale, self.lat_scale, self.h_scale, self.col_scale, self.row_scale])
-        # With positive denominators at the centre: where one is not, there is a pole in between.
+        # Denominators are made positive at the centre; where one is negative, there is a pole in between.
         coefficients = self._polynomials * np.repeat(np.sign(self._polynomials[1::2, :1]), 2, axis=0)
         return offsets, scales, coefficients, np.array([DOMAIN_LIMIT, *self._reach])
 
@@ -198,7 +205,7 @@ class RPC(SensorModel):
         return self._replace(col_off=self.col_off - columns, row_off=self.row_off - rows)
 
     def scaled(self, factor: float) -> RPC:
-        """Return the model of this image resampled to pixels `factor` times as large."""
+        """Return the model of this image, resampled to pixels `factor` times as large."""
         return self._replace(
             col_off=self.col_off / factor,
             row_off=self.row_off / factor,
@@ -211,30 +218,30 @@ class RPC(SensorModel):
 
 #: The `ground_crs` of a model in geocentric coordinates.
 GEOCENTRIC = "geocentric"
-#: A denominator below this part of its constant is at, or behind, the pole of the model.
+#: A denominator below this part of its constant is at or behind the pole of the model.
 _POLE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Rational(SensorModel):
-    """A classical model: ratio of polynomials of normalised ground coordinates.
+    """A classical model: ratios of polynomials of normalised ground coordinates.
 
     Parameters
     ----------
     family : str
-        Which terms there are: a name of `ortho_pipeline.models.families`.
+        A name of `ortho_pipeline.models.families`, which defines the terms.
     ground_crs : str
-        CRS of the ground coordinates; ``geocentric`` takes lon, lat, h (EPSG:4979) and turns them into Cartesian
-        coordinates in the local ENU frame of the middle of `box`, an affine change of geocentric ones.
+        CRS of the ground. ``geocentric``: lon, lat, h (EPSG:4979) are converted to Cartesian coordinates in the local
+        ENU frame of the middle of `box`, which are affine to geocentric ones.
     coefficients : (P,)
         In the order of the family's `param_names`, for normalised coordinates.
     ground_offset, ground_scale : (3,)
     image_offset, image_scale : (2,)
-        Normalised is (value - offset) / scale.
+        Normalised coordinates are (value - offset) / scale.
     box : (2, 3)
-        Lowest and highest ground for which the model is meant; NaN beyond 1.5 half-sizes from its middle in plan.
+        Minimum and maximum ground coordinates; NaN beyond 1.5 half-sizes horizontally from its middle.
     wraps : bool
-        The first ground coordinate is a longitude in degrees.
+        Whether the first ground coordinate is a longitude in degrees.
     removed : tuple of str
         Coefficients that are zero and no parameters.
     """
@@ -265,18 +272,18 @@ class Rational(SensorModel):
         for name, shape in shapes.items():
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != shape or not np.isfinite(values).all():
-                raise InputError(f"a model of this family has {shape} finite numbers here", field=name)
+                raise InputError(f"a model of this family needs {shape} finite numbers", field=name)
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if not ((self.ground_scale > 0).all() and (self.image_scale > 0).all()):
-            raise InputError("scales are positive", field="ground_scale, image_scale")
+            raise InputError("scales must be positive", field="ground_scale, image_scale")
         if not (self.box[0] < self.box[1]).all():
-            raise InputError("the lowest is not below the highest", field="box")
+            raise InputError("each minimum must be below its maximum", field="box")
         object.__setattr__(self, "removed", tuple(self.removed))
         unknown = set(self.removed) - set(terms.family.param_names)
         gone = [terms.family.param_names.index(name) for name in self.removed if name not in unknown]
         if unknown or self.coefficients[gone].any():
-            raise InputError("what is removed is a coefficient of the family, and zero", field="removed")
+            raise InputError("only coefficients of the family that are zero can be removed", field="removed")
         object.__setattr__(self, "_table", terms.table(self.coefficients))
 
     @property
@@ -336,7 +343,7 @@ class Rational(SensorModel):
 
     @property
     def penalised(self) -> tuple[str, ...]:
-        """Names of the parameters that a regularisation draws to zero: all but the affine part of the numerators."""
+        """Names of the parameters that a regularisation pulls to zero: all but the affine part of the numerators."""
         return tuple(
             name for name in self.param_names if "den_" in name or int(exponents(name.rpartition("_")[2]).sum()) > 1
         )
@@ -344,9 +351,9 @@ class Rational(SensorModel):
     # -- evaluation --------------------------------------------------------------------------------------------------
 
     def normalise(self, ground: ArrayLike) -> tuple[Array, Array | None]:
-        """Return normalised coordinates ``(N, 3)``, NaN outside the domain, and their slopes if not simply 1 / scale.
+        """Return normalised coordinates ``(N, 3)``, NaN outside the domain, and slopes if they are not 1 / scale.
 
-        The slopes ``(N, 3, 3)`` are those of Cartesian by geodetic coordinates, before the scale.
+        The slopes ``(N, 3, 3)`` are the derivatives of Cartesian by geodetic coordinates, before scaling.
         """
         ground = as_ground(ground).copy()
         centre, half = self.domain
@@ -361,7 +368,7 @@ class Rational(SensorModel):
         return (ground - self.ground_offset) / self.ground_scale, slopes
 
     def _sums(self, terms: Array) -> Array:
-        """Return the four polynomials ``(4, N)``; NaN where a denominator has its pole behind it."""
+        """Return the four polynomials ``(4, N)``; NaN beyond a pole of a denominator."""
         sums = self._table @ terms  # type: ignore[attr-defined]
         with np.errstate(invalid="ignore"):
             sums[:, ~(sums[2:] > _POLE).all(axis=0)] = np.nan
@@ -402,5 +409,5 @@ class Rational(SensorModel):
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         if not isinstance(data.get("family"), str):
-            raise InputError("a rational model has the name of its family", field="family")
+            raise InputError("a rational model needs the name of its family", field="family")
         return super().from_dict(data)

@@ -15,9 +15,9 @@ from ortho_pipeline.models.rational import GEOCENTRIC, Rational
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
-#: The domain goes beyond the points by this part of its size.
+#: The domain extends beyond the points by this part of its size.
 _MARGIN = 0.02
-#: Heights of a domain span at least this part of its extent in plan: terrain is never quite flat.
+#: Least range of heights of a domain, as part of its horizontal extent: terrain is never exactly flat.
 _LEAST_RELIEF = 1e-3
 
 
@@ -57,18 +57,18 @@ def start_model(
     family : str
         A name of `ortho_pipeline.models.families`; ``affine14`` starts with the column as the paper's x.
     points : Points
-        Control points normalise and solve; all points lie in the domain, apart from check points far outside of it.
+        Control points give normalisation and start values. The domain includes all points except distant check points.
     crs : str, optional
-        As for `model_crs`; the CRS of the points if not given.
+        As for `model_crs`. Default: the CRS of the points.
     size : (int, int), optional
-        Columns and rows of the image, whose corners the domain then reaches.
+        Columns and rows of the image, whose corners the domain includes.
     heights : (float, float), optional
-        Lowest and highest ellipsoidal height that the domain reaches.
+        Lowest and highest ellipsoidal height (m) that the domain includes.
 
     Raises
     ------
     TooFewPoints
-        If the control points are fewer than the parameters need.
+        If there are too few control points for the parameters.
     """
     chosen = family_of(family)
     chosen = family_of(chosen.variants[0]) if chosen.variants else chosen
@@ -82,7 +82,7 @@ def start_model(
             f"{counted(int(usable.sum()), 'control point does', 'control points do')} not determine the "
             f"{counted(chosen.parameters, 'parameter')} of {family}",
             file=points.source or None,
-            remedy=f"give at least {counted(chosen.minimum_points, 'control point')}, or take a simpler model",
+            remedy=f"give at least {counted(chosen.minimum_points, 'control point')}, or use a simpler model",
         )
     box = _box(ground, points.image, usable, size, heights, moved.crs)
     coordinates = ground[usable]
@@ -99,7 +99,7 @@ def start_model(
 
 
 def _with_heights(ground: Array, family: Family, wraps: bool) -> Array:
-    """Return ground with longitudes in one piece and, for models of the plane, without gaps in the heights."""
+    """Return ground with continuous longitudes and, for models of the plane, without missing heights."""
     ground = ground.copy()
     if wraps and np.isfinite(ground[:, 0]).any() and np.nanmax(ground[:, 0]) - np.nanmin(ground[:, 0]) > 180:
         ground[ground[:, 0] < 0, 0] += 360.0
@@ -112,7 +112,7 @@ def _with_heights(ground: Array, family: Family, wraps: bool) -> Array:
 def _normalisation(values: Array) -> tuple[Array, Array]:
     low, high = values.min(axis=0), values.max(axis=0)
     scale = (high - low) / 2
-    # Coordinates that are all the same (up to rounding) carry nothing: their columns are to be zero, not noise.
+    # A coordinate that is the same for all points (up to rounding) must become zero, not noise.
     scale[scale <= 1e-12 * np.abs(values).max(axis=0)] = 1.0
     return (low + high) / 2, scale
 
@@ -125,9 +125,9 @@ def _box(
     heights: tuple[float, float] | None,
     crs: pyproj.CRS,
 ) -> Array:
-    """Return the lowest and the highest ground ``(2, 3)`` of the points, the image's corners and the heights.
+    """Return minimum and maximum ``(2, 3)`` of the points, the image's corners and the heights.
 
-    A check point that lies farther away than control points and corners span is a mistake, and not reached.
+    A check point far outside control points and corners is a mistake, and not included.
     """
     reached = [ground[usable]]
     if size is not None:
@@ -160,9 +160,9 @@ def _box(
 def _coefficients(family: Family, ground: Array, image: Array) -> Array:
     """Return start coefficients for normalised points: the algebraic solution, or the numerators alone.
 
-    Multiplied by its denominator a model is linear in all coefficients. With many of them that is close to singular, so
-    such families start with denominators of one; the numerators must not be zero then, or the columns of the
-    denominators vanish from the design.
+    Multiplied by its denominator, a model is linear in all coefficients. With many of them this is nearly singular, so
+    such families start with denominators of one. Numerators must not be zero then, because the design would lose the
+    columns of the denominators.
     """
     col, row, den = (_values(terms, ground) for terms in (family.col, family.row, family.den))
     numerators = col.shape[1] + row.shape[1]

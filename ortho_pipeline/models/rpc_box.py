@@ -1,8 +1,8 @@
-r"""Prove that an RPC is sound all over its own box: no pole, no fold, pixels of a size that there is.
+r"""Prove that an RPC is sound all over its box: no pole, no fold, pixels of a realistic size.
 
-A polynomial over a box is bounded by its control values (coefficients in Bernstein's basis): they enclose it, those at
-the corners are values of it, and halving the box brings them closer quadratically. So a denominator is bounded, and not
-sampled: a pole between samples is found too.
+Control values (coefficients in Bernstein's basis) bound a polynomial over a box: they enclose it, those at the corners
+are values of it, and halving the box brings them closer quadratically. So a denominator is bounded instead of sampled,
+and a pole between samples is also found.
 
 Source: Garloff 1986, Convergent bounds for the range of multivariate polynomials.
 """
@@ -49,7 +49,7 @@ RPC_TERMS = np.array(
 )
 #: A denominator below this part of its value at the centre is at a pole.
 POLE = 1e-3
-#: Boxes of one size that are looked at, before what is still undecided counts as a pole.
+#: Largest number of boxes of one size; if more are undecided, they count as a pole.
 _MOST_BOXES = 4096
 #: Largest offsets and half-sizes that a scene on Earth can have: degrees, metres of height, pixels.
 _LARGEST = {
@@ -64,16 +64,16 @@ _LARGEST = {
     "col_scale": 1e9,
     "row_scale": 1e9,
 }
-#: Sides of a pixel on the ground (m): microscopes and whole continents are not scenes.
+#: Least and greatest side of a pixel on the ground (m).
 _PIXEL = (1e-3, 1e5)
 _METRES_PER_DEGREE = 111_320.0
-_DAMAGED = "the RPC is damaged or belongs to another image: ask for its file again"
+_DAMAGED = "the RPC is damaged or belongs to another image: get its file again"
 _HALF = np.array([[1, 0, 0, 0], [0.5, 0.5, 0, 0], [0.25, 0.5, 0.25, 0], [0.125, 0.375, 0.375, 0.125]])
 _SIDES = (_HALF, _HALF[::-1, ::-1])
-#: Normalised heights at which folds are looked for, and within which of them an RPC has to be sound.
+#: Normalised heights at which folds are searched, and the height up to which an RPC must be sound.
 _LEVELS = np.linspace(-1.0, 1.0, 17)
 _LEAST = 0.25
-#: Places on each of these levels: normalised longitudes and latitudes of 5 x 5.
+#: Points on each of these levels: normalised longitudes and latitudes of 5 x 5.
 _ACROSS, _ALONG = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, 5)] * 2))
 
 
@@ -97,7 +97,7 @@ def _controls(low: float, high: float) -> Array:
 
 
 def has_pole(denominator: Array, low: float = -1.0, high: float = 1.0) -> bool:
-    """Tell whether a denominator ``(20,)`` comes near zero, or changes its sign, in the box -1 to 1 of its terms.
+    """Return whether a denominator ``(20,)`` is near zero, or changes its sign, in the box -1 to 1 of its terms.
 
     `low` and `high` are the normalised heights of the box.
     """
@@ -133,15 +133,15 @@ def check_numbers(values: dict[str, float]) -> None:
         if name.endswith("_scale") and value == 0.0:
             raise InputError("an RPC scale cannot be zero", field=name, remedy=_DAMAGED)
         if abs(value) > _LARGEST[name]:
-            raise InputError(f"{value:g} is more than a scene on Earth can have", field=name, remedy=_DAMAGED)
+            raise InputError(f"{value:g} is too large for a scene on Earth", field=name, remedy=_DAMAGED)
 
 
 def sound_heights(values: dict[str, float], coefficients: Array) -> tuple[float, float]:
     """Return the lowest and highest normalised height within the box, -1 to 1, up to which an RPC is sound.
 
-    It is unsound where a denominator is zero, and where the ground is folded (the Jacobian changes its sign). A few
-    vendors' RPCs are at heights where they have no terrain: they lose these heights. One that is unsound near the
-    middle of its box, or has pixels of a size that no image has, is refused.
+    It is unsound where a denominator is zero, or where it maps two ground points to one pixel (the Jacobian changes its
+    sign). Some vendors' RPCs are unsound at heights without terrain: these heights are excluded. An RPC that is unsound
+    near the middle of its box, or has pixels of an impossible size, is refused.
 
     Parameters
     ----------
@@ -174,9 +174,10 @@ def sound_heights(values: dict[str, float], coefficients: Array) -> tuple[float,
                 ends.append(float(level))
                 break
             if abs(level) <= _LEAST:
-                what = "the denominator of an RPC is zero" if poles else "this RPC folds the ground"
-                field = ", ".join(poles) or "col_num, row_num"
-                raise InputError(f"{what} within its box", field=field, remedy=_DAMAGED)
+                what = "the denominator of this RPC is zero within its box"
+                if not poles:
+                    what = "this RPC maps several places on the ground to one pixel"
+                raise InputError(what, field=", ".join(poles) or "col_num, row_num", remedy=_DAMAGED)
     return ends[0], ends[1]
 
 
@@ -195,7 +196,7 @@ def _check_pixel(values: dict[str, float], jacobian: Array) -> None:
     long, short = np.linalg.svd(pixels, compute_uv=False) if np.isfinite(pixels).all() else (np.nan, np.nan)
     if not (_PIXEL[0] <= 1.0 / long and 1.0 / short <= _PIXEL[1]):
         raise InputError(
-            f"a pixel of this RPC is {1.0 / long:.2g} x {1.0 / short:.2g} m on the ground",
+            f"a pixel of this RPC would be {1.0 / long:.2g} x {1.0 / short:.2g} m on the ground",
             field="col_scale, row_scale, lon_scale, lat_scale",
             remedy=_DAMAGED,
         )

@@ -1,12 +1,11 @@
 """The polynomials of RPCs with their slopes, and compiled loops over many points.
 
-What is inlined here is plain Python where Python calls it: `rational` takes it for few points, as arrays, and loads no
-compiler. The operations are the same in the same order, so a point has the same image in every bit.
+Inlined functions are plain Python when Python calls them: for few points `rational` calls them with arrays and loads no
+compiler. The order of operations is the same, so results agree in every bit.
 
-Points are taken in blocks that stay in the first cache, each coordinate in an array of its own: loops without branches
-over those become vector instructions, as wide as the processor has them. They read copies of the coefficients, which
-the compiler knows to share no memory with what is written. Products and sums are not contracted (no FMA), so that a
-point's result is the same on every processor, in every place of a block and by itself.
+A block of points stays in the first-level cache, with an array for each coordinate: loops without branches become
+vector instructions. They read copies of the coefficients, which share no memory with the output. Products and sums are
+not contracted (no FMA), so the result of a point is the same on every processor and at any position of a block.
 
 The tables of an RPC are `offsets` and `scales` of lon, lat, h, column, row; `coefficients` ``(4, 20)`` of column
 numerator and denominator, row numerator and denominator, the denominators positive at the centre; and `limits` of
@@ -19,7 +18,7 @@ import numpy as np
 
 from ortho_pipeline.runtime.compiled import compiled, inlined
 
-#: Points of a block: what is kept of them fits into the first cache.
+#: Points of a block; their arrays fit into the first-level cache.
 BLOCK = 256
 
 

@@ -1,6 +1,6 @@
 """Control, check and tie points: one table, a reader for every format, and which of them control.
 
-Imports `geodesy` and what is below. A new point format is an entry in `formats`.
+Imports `geodesy` and the rooms below. A new point format is an entry in `formats`.
 """
 
 from __future__ import annotations

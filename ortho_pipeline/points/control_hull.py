@@ -1,4 +1,4 @@
-"""The part of an image that control points speak for, and the sides of which they say nothing."""
+"""The part of an image that control points cover, and the names of the empty sides."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.points.table import Array
 
-#: Below this share of the image, with the margin, the rest is not covered: models that fit the points alike differ
-#: there (docs/accuracy.md).
+#: Control that covers less than this share (with the margin) leaves part of the image untested: models that fit the
+#: points equally well differ there (docs/accuracy.md).
 COVERED = 0.7
-#: An empty part is named from this share of what is empty on.
+#: An empty part is named if it has at least this share of the empty area.
 _PART = 0.2
-#: The middle of a side's empty part is at least so far from that of the image, in parts of its size.
+#: Least distance of the middle of an empty side from the middle of the image, in parts of its size.
 _ASIDE = 0.15
 
 
 class ControlHull(Record):
-    """Convex hull of the used control points, and its share of the image; no outline of points in a line."""
+    """Convex hull of the used control points, and its share of the image; no outline if the points are on one line."""
 
     share: Annotated[float, pydantic.Field(ge=0)]
     n: Count
@@ -31,7 +31,7 @@ class ControlHull(Record):
 
 
 def control_hull(image: Array, size: tuple[int, int]) -> ControlHull | None:
-    """Return the convex hull of points ``(N, 2)`` px; None below three points."""
+    """Return the convex hull of points ``(N, 2)`` px; None for fewer than three points."""
     if len(image) < 3:
         return None
     import shapely
@@ -43,7 +43,7 @@ def control_hull(image: Array, size: tuple[int, int]) -> ControlHull | None:
 
 
 def outside_of_hull(control: Array, image: Array) -> NDArray[np.bool_]:
-    """Tell which points ``(m, 2)`` px lie farther outside the hull of control ``(n, 2)`` than half its spacing."""
+    """Return which points ``(m, 2)`` px are outside the hull of control ``(n, 2)`` by more than half its spacing."""
     if not len(control) or not len(image):
         return np.zeros(len(image), dtype=bool)
     import shapely
@@ -56,8 +56,8 @@ def outside_of_hull(control: Array, image: Array) -> NDArray[np.bool_]:
 def empty_parts(image: Array, size: tuple[int, int]) -> tuple[float, tuple[str, ...]]:
     """Return the share (0 to 1) of the image that points ``(N, 2)`` px cover, and the names of the empty sides.
 
-    Covered is their convex hull, extended by half of the distance that N points have if they are spread evenly:
-    so much is left at the rim by control that is as good as it can be.
+    The covered area is their convex hull, extended by half the spacing of N evenly spread points: even ideal control
+    leaves such a margin.
     """
     if not len(image):
         return 0.0, ("everywhere",)
@@ -81,15 +81,14 @@ def uncovered(image: Array, size: tuple[int, int] | None) -> tuple[Notice, ...]:
     if share >= COVERED:
         return ()
     text = (
-        f"control covers {100 * share:.0f} % of the image (its hull and a margin of half the distance between points); "
-        f"empty: {' and '.join(where)}. Points say nothing of where there are none, nor which model is right there: "
-        "measure some there, or rely on the result only where control is"
+        f"control covers {100 * share:.0f} % of the image; empty: {' and '.join(where)}. Accuracy there is untested, "
+        "and models can differ: add points there, or do not use the result there"
     )
     return (Notice("control-covers-part", text, share=share, empty=list(where)),)
 
 
 def _place(part: Any) -> str:
-    """Return in words where a part of the unit square lies: top is the first row, left the first column."""
+    """Return in words where a part of the unit square is: top is the first row, left the first column."""
     if part.interiors:
         return "all around"
     across, down = part.centroid.x - 0.5, part.centroid.y - 0.5

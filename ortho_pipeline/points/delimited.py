@@ -1,4 +1,4 @@
-"""Points as CSV or TSV with a header: our own columns, and those that surveyors and other programs write."""
+"""Points as CSV or TSV with a header: our own columns, and those of surveyors and other programs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from ortho_pipeline.points.rows import (
 CSV_IGNORED = frozenset(
     ["info", "note", "notes", "comment", "comments", "remark", "remarks", "description", "desc", "code", "date", "time"]
 )
-#: What a column is called elsewhere (without blanks, punctuation and the unit of the inside) -> what it is called here.
+#: Our name of a column by its names elsewhere (without blanks, punctuation and a unit in brackets).
 _ALIASES = {
     alias: name
     for name, aliases in {
@@ -55,27 +55,27 @@ _ALIASES = {
     }.items()
     for alias in aliases.split()
 }
-#: Names of ground columns that say which kind of system they are in.
+#: Names of ground columns that show the kind of their CRS.
 _GEOGRAPHIC = frozenset(["longitude", "long", "lon", "lng", "latitude", "lat"])
 _PROJECTED = frozenset(["easting", "east", "northing", "north"])
-#: Units in brackets that are those of the inside; any other unit is not known here.
+#: Units in brackets that are our own; any other unit is unknown.
 _OWN_UNIT = re.compile(r"[\[(](m|metres?|meters?|px|pixels?|deg|degrees?|°)[\])]$")
-#: Status of a point as PCI's programs write it; an inactive one is left out.
+#: Status of a point as PCI's programs write it; inactive points are left out.
 _STATUS = {"g": "control", "c": "check"}
-_UNDERSTOOD = "Name, Pixel, Line, Easting, Northing, Lat, Lon, Elev, alt, xPix, yPix and their like are understood"
+_UNDERSTOOD = "common names such as Name, Pixel, Line, Easting, Northing, Lat, Lon, Elev, xPix, yPix also work"
 
 
 @dataclass(frozen=True)
 class Header:
-    """The columns of a file: their names as written, and where each of ours is.
+    """The columns of a file: their names as written, and the index of each of ours.
 
     Parameters
     ----------
     names : sequence of str
     place : mapping of str to int
-        Ours -> index among `names`; columns for people are not in it.
+        Index among `names` by our name; without the columns for people.
     delimiter : str
-        A blank stands for any white space.
+        A blank means any white space.
     """
 
     names: Sequence[str]
@@ -84,27 +84,25 @@ class Header:
 
     @property
     def of_ground(self) -> str | None:
-        """Return ``geographic`` or ``projected`` where the names of x and y say so."""
-        said = {_plain(self.names[self.place[axis]]) for axis in ("x", "y") if axis in self.place}
-        if said & _GEOGRAPHIC:
+        """Return ``geographic`` or ``projected`` if the names of x and y show it."""
+        names = {_plain(self.names[self.place[axis]]) for axis in ("x", "y") if axis in self.place}
+        if names & _GEOGRAPHIC:
             return "geographic"
-        return "projected" if said & _PROJECTED else None
+        return "projected" if names & _PROJECTED else None
 
 
 def is_header(text: str) -> bool:
-    """Tell whether a line is a header rather than numbers: at least three of its words name an id or coordinates."""
+    """Return whether a line is a header, not numbers: at least three of its words name an id or coordinates."""
     names = {_ours(name) for name in text.replace('"', "").split(None if _delimiter(text) == " " else _delimiter(text))}
     return len(names & {"id", "image", "col", "row", "x", "y", "h"}) >= 3
 
 
 def read_csv(path: str | os.PathLike[str], text: str, expected: ColumnRules = OF_IMAGE) -> Table:
-    """Read a table with a header: ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]`` or their like.
+    """Read a table with a header: ``id,col,row,x,y,h[,role][,sigma_image][,sigma_xy][,sigma_h][,image]`` or similar.
 
-    Further columns are those of `CSV_ERRORS`.
-
-    The delimiter (comma, semicolon, tab, bar, else blanks) is that of the header; where it is not a comma, numbers may
-    have a decimal comma, in the whole file. Lines that start with ``#`` are comments; of these ``#CRS: ...`` and
-    ``#vertical: ...`` state what the coordinates are. An empty `h` is a height that is not given.
+    Further columns are those of `CSV_ERRORS`. The delimiter (comma, semicolon, tab, bar, else blanks) is that of the
+    header. If it is not a comma, all numbers of the file may have a decimal comma. Lines that start with ``#`` are
+    comments; ``#CRS: ...`` and ``#vertical: ...`` state CRS and height datum. An empty `h` means no height.
     """
     table = Table("CSV", origin_allowed=True)
     header: Header | None = None
@@ -131,8 +129,8 @@ def read_csv(path: str | os.PathLike[str], text: str, expected: ColumnRules = OF
 
 
 def _delimiter(header: str) -> str:
-    found = max("\t;,|", key=header.count)
-    return found if found in header else " "
+    delimiter = max("\t;,|", key=header.count)
+    return delimiter if delimiter in header else " "
 
 
 def _plain(name: str) -> str:
@@ -140,9 +138,9 @@ def _plain(name: str) -> str:
 
 
 def _ours(name: str) -> str:
-    """Return what we call a column; of one that is not known its own name."""
-    own = name.strip().lower()
-    return own if own in ("id", "col", "row", "x", "y", "h", "role") else _ALIASES.get(_plain(name), own)
+    """Return our name of a column; of an unknown one its own name."""
+    lowered = name.strip().lower()
+    return lowered if lowered in ("id", "col", "row", "x", "y", "h", "role") else _ALIASES.get(_plain(name), lowered)
 
 
 def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> Header:
@@ -152,18 +150,18 @@ def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> 
     place: dict[str, int] = {}
 
     def refuse(message: str) -> InputError:
-        own = f"name them {','.join(expected.names)}; {_UNDERSTOOD}"
-        digits = all(re.fullmatch(r"[+-]?[\d.,]+", name) for name in names[1:])
-        remedy = f"put a header above the numbers: {own}" if digits else own
-        found = ", ".join(name or "(no name)" for name in names)
-        shown = found if len(found) <= 300 else f"{found[:300]}..."
+        remedy = f"name the columns {','.join(expected.names)}; {_UNDERSTOOD}"
+        if all(re.fullmatch(r"[+-]?[\d.,]+", name) for name in names[1:]):
+            remedy = f"add a header line above the numbers, and {remedy}"
+        listed = ", ".join(name or "(no name)" for name in names)
+        shown = listed if len(listed) <= 300 else f"{listed[:300]}..."
         return InputError(f"{message}; the columns are: {shown}", file=path, field=f"line {line.number}", remedy=remedy)
 
     for index, name in enumerate(ours):
         if name in CSV_IGNORED or (not name and index in (0, len(names) - 1)):
             continue
         if name not in (*expected.names, "status"):
-            raise refuse(f"the column {short(names[index])} is not known")
+            raise refuse(f"unknown column {short(names[index])}")
         if name in place:
             raise refuse(f"the columns {short(names[place[name]])} and {short(names[index])} both mean {name}")
         place[name] = index
@@ -174,13 +172,13 @@ def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> 
 
 
 def _our_names(names: Sequence[str]) -> list[str]:
-    """Return what we call each column; some names mean something by what stands beside them."""
+    """Return our name of each column; the meaning of some names depends on the other columns."""
     ours, plain = [_ours(name) for name in names], [_plain(name) for name in names]
     # A table that was saved with its index has a first column without a name.
     if re.fullmatch(r"(unnamed:\s*0)?", names[0].strip().lower()):
         ours[0] = "" if "id" in ours else "id"
-    # In PCI's layouts (IDPLXYE) E is the elevation; beside N it is the easting.
-    return ["h" if one == "e" and {"x", "y"} <= set(plain) else name for one, name in zip(plain, ours, strict=True)]
+    # In PCI's layouts (IDPLXYE) E is the elevation; with N it is the easting.
+    return ["h" if key == "e" and {"x", "y"} <= set(plain) else name for key, name in zip(plain, ours, strict=True)]
 
 
 # -- a line ----------------------------------------------------------------------------------------------------------
@@ -188,7 +186,7 @@ def _our_names(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Cells:
-    """The cells of a line, read by what we call their columns; `marks` are the decimal marks of the file until here."""
+    """The cells of a line by our names of the columns; `marks` are the decimal marks of the file so far."""
 
     path: str | os.PathLike[str]
     where: str
@@ -206,7 +204,7 @@ class _Cells:
         return f"{self.where}, column {self.header.names[self.header.place[name]] or name}"
 
     def plain(self, name: str) -> Any:
-        """Return a cell, if it is not empty with a decimal point."""
+        """Return a cell with a decimal point; an empty one as it is."""
         cell = self.text(name)
         return _decimal(cell, self.header, self.marks, self.path, self.column(name)) if cell else cell
 
@@ -224,44 +222,44 @@ class _Cells:
 def _row(
     path: str | os.PathLike[str], line: Line, header: Header, expected: ColumnRules, marks: set[str]
 ) -> PointRow | None:
-    """Return the point of a line, None where it is inactive; `marks` are the decimal marks of the file until here."""
+    """Return the point of a line, None if it is inactive; `marks` are the decimal marks of the file so far."""
     cells, where = cells_of(path, line, header.delimiter), f"line {line.number}"
     if len(cells) != len(header.names):
         comma = header.delimiter == "," and len(cells) > len(header.names)
-        remedy = "a decimal comma splits numbers: write decimal points, or ; between the columns" if comma else None
+        remedy = "write decimal points instead of commas, or separate the columns with ;" if comma else None
         raise InputError(
-            f"{counted(len(cells), 'cell')} under {counted(len(header.names), 'column name')} "
+            f"this line has {counted(len(cells), 'cell')}, but there are {len(header.names)} columns "
             f"({', '.join(header.names)[:120]})",
             file=path,
             field=where,
             remedy=remedy,
         )
     if not header.names[-1] and cells[-1]:
-        raise InputError(f"{short(cells[-1])} stands under no column name", file=path, field=where)
-    of = _Cells(path, where, cells, header, expected, marks)
-    for name, what in (("id", "an id"), (CSV_IMAGE, "an image")):
-        if (name in expected.needed or (name == "id" and "id" in header.place)) and not of.text(name):
-            raise InputError(f"a point without {what}", file=path, field=of.column(name))
-    role = role_of(of.text("role"), path, of.column("role")) if of.text("role") else expected.role
-    if of.text("status"):
-        found = _STATUS.get(of.text("status").lower(), of.text("status").lower())
-        if found == "i":
+        raise InputError(f"the column of {short(cells[-1])} has no name", file=path, field=where)
+    row = _Cells(path, where, cells, header, expected, marks)
+    for name, what in (("id", "id"), (CSV_IMAGE, "image")):
+        if (name in expected.needed or (name == "id" and "id" in header.place)) and not row.text(name):
+            raise InputError(f"this point has no {what}", file=path, field=row.column(name))
+    role = role_of(row.text("role"), path, row.column("role")) if row.text("role") else expected.role
+    if row.text("status"):
+        status = _STATUS.get(row.text("status").lower(), row.text("status").lower())
+        if status == "i":
             return None
-        role = role_of(found, path, of.column("status"))
-    sigma = of.sigma("sigma_image", False)
+        role = role_of(status, path, row.column("status"))
+    sigma = row.sigma("sigma_image", False)
     covariance, group, common, alike = read_image_errors(
-        [of.plain(name) for name in CSV_ERRORS], path, [of.column(name) for name in CSV_ERRORS], sigma
+        [row.plain(name) for name in CSV_ERRORS], path, [row.column(name) for name in CSV_ERRORS], sigma
     )
     return PointRow(
         where=where,
-        id=of.text("id") or None,
-        image=(of.value("col"), of.value("row")),
-        ground=(of.value("x"), of.value("y"), of.value("h")),
+        id=row.text("id") or None,
+        image=(row.value("col"), row.value("row")),
+        ground=(row.value("x"), row.value("y"), row.value("h")),
         role=role,
         sigma_image=sigma,
-        sigma_xy=of.sigma("sigma_xy", True),
-        sigma_h=of.sigma("sigma_h", True),
-        image_name=of.text(CSV_IMAGE) or None,
+        sigma_xy=row.sigma("sigma_xy", True),
+        sigma_h=row.sigma("sigma_h", True),
+        image_name=row.text(CSV_IMAGE) or None,
         covariance=covariance,
         group=group,
         sigma_common=common,
@@ -270,16 +268,16 @@ def _row(
 
 
 def _decimal(cell: str, header: Header, marks: set[str], path: str | os.PathLike[str], where: str) -> Any:
-    """Return a number with a decimal point, from one with a decimal comma where commas do not part columns."""
+    """Return a number with a decimal point instead of a decimal comma, if commas do not separate columns."""
     comma, point = "," in cell, "." in cell
     if not (comma or point) or (header.delimiter == "," and comma):
         return cell
-    marks.update(mark for mark, there in ((",", comma), (".", point)) if there)
+    marks.update(mark for mark, used in ((",", comma), (".", point)) if used)
     if len(marks) > 1:
         raise InputError(
-            f"{short(cell)}: commas and points both stand in the numbers of this file",
+            f"this file mixes decimal commas and decimal points, as in {short(cell)}",
             file=path,
             field=where,
-            remedy="write all decimals alike, and no separators of thousands",
+            remedy="use one of the two in the whole file, and no thousands separators",
         )
     return re.sub(r",(?=\d*(?:[eE][+-]?\d+)?$)", ".", cell, count=1) if comma else cell

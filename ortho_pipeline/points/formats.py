@@ -1,6 +1,6 @@
-"""Point files as they are written: which reader a file is for, and which of its points belong to an image.
+"""Formats of point files: find the reader of a file, and the points that belong to an image.
 
-A new format is a reader, in `link_lists` if it is a list of another program, and one entry of `_FORMATS`.
+A new format is a reader (in `link_lists` if it is a list of another program) and one entry of `_FORMATS`.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from ortho_pipeline.points.rows import (
 
 
 class _Format(NamedTuple):
-    """A format: its name, its reader, what a file of it has to hold, and how one is known.
+    """A format: its name, its reader, and how to recognise its files.
 
-    `known` takes the suffix, the first characters and the first line. `of_block` says which columns of a block's table
-    it can hold. `wanted` is the remedy of errors whose own place knows no better one.
+    `known` takes the suffix, the first characters and the first line. `of_block` lists the tables of blocks that it can
+    hold. `wanted` is the remedy of errors that have no better one.
     """
 
     name: str
@@ -44,7 +44,7 @@ class _Format(NamedTuple):
     of_block: tuple[ColumnRules, ...] = ()
 
 
-#: In the order in which they are tried: content tells them apart, then the suffix.
+#: In the order in which they are tried: content first, then the suffix.
 _FORMATS = (
     _Format(
         "GeoJSON with 'ji'",
@@ -93,57 +93,56 @@ _FORMATS = (
         lambda suffix, start, first: LINK_TABLE.match(first),
     ),
 )
-_NAMES = ", ".join(one.name for one in _FORMATS)
+_NAMES = ", ".join(kind.name for kind in _FORMATS)
 
 
-@reads("see docs/formats.md for what stands in a file of points")
+@reads("see docs/formats.md for the formats of point files")
 def read_table(
     path: str | os.PathLike[str],
     image_name: str | None = None,
     pieces: Mapping[str, Placement] | None = None,
 ) -> Table:
-    """Read a point file; its format is known by its content, then by its suffix.
+    """Read a point file; its content shows its format, or else its suffix.
 
     Parameters
     ----------
     image_name : str, optional
-        Keep the points of this image, where a file holds points of several.
+        Keep only the points of this image.
     pieces : mapping of str to (float, float, float), optional
-        Further images whose points are kept: column and row of their first corner in this image, and the width of one
-        of their pixels.
+        Further images to keep: column and row of their first corner in this image, and the width of their pixels.
 
     Raises
     ------
     InputError
-        For anything that is not a table of finite numbers; names file, line and column.
+        For anything that is not a table of finite numbers. The message names file, line and column.
     """
     text = load_text(path)
     table = _read(_format_of(path, text), path, text)
     if not table.rows:
-        raise InputError("this file holds no points", file=path, remedy=f"give one of: {_NAMES}")
+        raise InputError("this file has no points", file=path, remedy=f"give one of: {_NAMES}")
     return _of_image(path, table, image_name, pieces or {})
 
 
 def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BLOCK) -> Table:
-    """Read the rays of a block, or ground alone (`OF_GROUND`, `OF_HEIGHTS`): CSV, GeoJSON; rays as ODM or ASP too.
+    """Read the rays of a block (CSV, GeoJSON, ODM, ASP), or ground points (`OF_GROUND`, `OF_HEIGHTS`; CSV, GeoJSON).
 
     Raises
     ------
     InputError
-        As `read_table`; also for a line that does not say which image it is of.
+        As `read_table`; also for a line that does not name its image.
     """
     text = load_text(path)
     kind = _format_of(path, text)
     if expected not in kind.of_block:
         raise InputError(
-            "points of several images do not stand in this format",
+            "this format cannot hold points of several images",
             file=path,
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
         )
-    # Only formats whose columns have names can be asked for those of ground alone.
+    # Only formats with named columns can hold ground points alone.
     table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
     if not table.rows:
-        raise InputError("this file holds no points", file=path, remedy="add points to it")
+        raise InputError("this file has no points", file=path, remedy="add points to it")
     return table
 
 
@@ -164,14 +163,14 @@ def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
             return kind
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(
-            f"numbers without names: it is not said what the columns are; the first line is {short(first)}",
+            f"these columns have no names; the first line is {short(first)}",
             file=path,
             field="line 1",
-            remedy="put a line with their names above them, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
+            remedy="add a first line with their names, such as ID P L X Y Z (PCI), or 'link table' (ArcGIS: "
             "from-x from-y to-x to-y)",
         )
     raise InputError(
-        f"the format of this point file is not known; its first line is {short(first)}",
+        f"unknown format of points; the first line is {short(first)}",
         file=path,
         field="line 1",
         remedy=f"give one of: {_NAMES}",
@@ -185,32 +184,32 @@ def _of_image(
     if image_name is None and len({Path(name).stem.lower() for name in named}) > 1:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"there are points of several images ({some})",
+            f"this file has points of several images ({some})",
             file=path,
             field="image",
-            remedy="say which with image_name, or read them as a block (read_block_points)",
+            remedy="choose one with image_name, or read them as a block (read_block_points)",
         )
     if image_name is None or not named:
         return table
     kept: list[PointRow] = []
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
-        # A point that was measured in several of the images counts once: where it was measured first, this image ahead.
+        # A point that was measured in several images counts once: in this image, else in the first piece.
         kept += [
             replace(row, piece=piece)
             for row in table.rows
             if row.image_name and Path(row.image_name).stem.lower() == wanted and row.id not in ids
         ]
     if not kept and table.format == "GeoJSON" and len(named) == 1:
-        # The 'filename' of a GeoJSON is a remark; a renamed image still has these points.
+        # The 'filename' of a GeoJSON is only a note; a renamed image still has these points.
         return table
     if not kept:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"no point belongs to the image {image_name!r}; there are points of {some}",
+            f"no point was measured in {image_name!r}, only in {some}",
             file=path,
             field="image",
-            remedy="use the name of the image that the points were measured in",
+            remedy="use the name of the image in which the points were measured",
         )
     table.rows = kept
     return table

@@ -33,8 +33,8 @@ def read_geojson(path: str | os.PathLike[str], text: str, expected: ColumnRules 
     """Read points with a property ``ji`` = [column, row] from the *centre* of the first pixel; lon, lat, height.
 
     Further properties: ``id``, ``role``, ``sigma_image``, ``sigma_xy``, ``sigma_h``, ``filename`` (the image), and
-    those of `CSV_ERRORS`. Heights are ellipsoidal, as the format says. In a block ``ji`` may be a mapping of images to
-    [column, row], and the geometry of a tie point is null; where only ground is wanted, ``ji`` is ignored.
+    those of `CSV_ERRORS`. GeoJSON heights are ellipsoidal. In a block ``ji`` may be a mapping of images to
+    [column, row], and the geometry of a tie point is null. For ground points ``ji`` is ignored.
     """
     document = parse_json(text, path, "write a FeatureCollection of Points")
     features = document.get("features") if isinstance(document, dict) else None
@@ -54,13 +54,16 @@ def _geojson_crs(path: str | os.PathLike[str], document: dict[str, Any]) -> str:
     name = str(properties.get("name", "")) if isinstance(properties, dict) else ""
     if not re.search(r"(CRS84h?|:4326|:4979)$", name):
         raise CrsError(
-            f"the CRS {short(name)} of this GeoJSON is not WGS84", file=path, field="crs", remedy="write EPSG:4979"
+            f"the CRS {short(name)} of this GeoJSON is not WGS84",
+            file=path,
+            field="crs",
+            remedy="convert the points to EPSG:4979",
         )
     return "EPSG:4979"
 
 
 def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: ColumnRules) -> list[PointRow]:
-    """Return a row for each image that the point of a feature was measured in."""
+    """Return a row for each image in which the point of a feature was measured."""
     properties = feature.get("properties") if isinstance(feature, dict) else None
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     tie = geometry is None and expected is OF_BLOCK
@@ -80,9 +83,9 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
     role = properties.get("role") or expected.role
     sigma_image = sigma("sigma_image", False)
     covariance, group, common, alike = read_image_errors(
-        [properties.get(one) for one in CSV_ERRORS],
+        [properties.get(key) for key in CSV_ERRORS],
         path,
-        [f"{where}.properties.{one}" for one in CSV_ERRORS],
+        [f"{where}.properties.{key}" for key in CSV_ERRORS],
         sigma_image,
     )
     row = PointRow(
@@ -107,7 +110,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
 def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -> tuple[float, float, float]:
     place = geometry.get("coordinates")
     if not isinstance(place, list) or len(place) not in (2, 3):
-        raise InputError("not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
+        raise InputError("the coordinates are not [lon, lat, height]", file=path, field=f"{where}.geometry.coordinates")
     ground = [number(value, path, f"{where}.geometry.coordinates[{k}]") for k, value in enumerate(place)]
     return ground[0], ground[1], ground[2] if len(ground) == 3 else math.nan
 
@@ -115,7 +118,7 @@ def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -
 def _measured(
     path: str | os.PathLike[str], where: str, properties: dict[str, Any], expected: ColumnRules
 ) -> Iterator[tuple[str | None, tuple[float, float]]]:
-    """Yield image and column, row from the corner of the first pixel, for each image that a point was measured in."""
+    """Yield the image, and column and row from the corner of its first pixel, for each image of a point."""
     ji, file_name = properties.get("ji"), properties.get("filename")
     field = f"{where}.properties.ji"
     pairs = [(file_name if isinstance(file_name, str) else None, ji)]
@@ -123,14 +126,19 @@ def _measured(
         pairs = list(ji.items())
     elif expected is OF_BLOCK and not isinstance(file_name, str):
         raise InputError(
-            "it is not said in which image this point was measured",
+            "this point does not name its image",
             file=path,
             field=field,
-            remedy="give 'ji' as {image: [column, row]}, or 'filename' beside [column, row]",
+            remedy="give 'ji' as {image: [column, row]}, or as [column, row] with 'filename'",
         )
     for image, pair in pairs:
         if not isinstance(pair, list) or len(pair) != 2:
-            raise InputError("no property 'ji' = [column, row]", file=path, field=field, remedy="measure the points")
+            raise InputError(
+                "this point has no property 'ji' = [column, row]",
+                file=path,
+                field=field,
+                remedy="measure it in the image, or delete it",
+            )
         column, row = (number(pair[k], path, f"{field}[{k}]") for k in range(2))
         # From the centre of the first pixel to its corner.
         yield image, (column + 0.5, row + 0.5)
@@ -156,15 +164,15 @@ def feature_of(point: TablePoint) -> dict[str, Any]:
 
 
 def _error_properties(point: TablePoint) -> dict[str, float]:
-    """Return the properties `CSV_ERRORS` of a point that say more than `sigma_image` does."""
+    """Return the properties `CSV_ERRORS` of a point that add information to `sigma_image`."""
     (column, both), (_, row) = point.covariance_image
-    found: dict[str, float] = {}
+    properties: dict[str, float] = {}
     if says_more(np.array([point.covariance_image]))[0]:
-        found.update(zip(CSV_ERRORS[:3], (column, row, both), strict=True))
+        properties.update(zip(CSV_ERRORS[:3], (column, row, both), strict=True))
     if point.group >= 0:
-        found[CSV_ERRORS[3]] = point.group
+        properties[CSV_ERRORS[3]] = point.group
     if point.sigma_common:
-        found[CSV_ERRORS[4]] = point.sigma_common
+        properties[CSV_ERRORS[4]] = point.sigma_common
     if point.sigma_alike:
-        found[CSV_ERRORS[5]] = point.sigma_alike
-    return found
+        properties[CSV_ERRORS[5]] = point.sigma_alike
+    return properties

@@ -1,4 +1,4 @@
-"""Where the points of a file are: its CRS and height datum against what the user says, and ellipsoidal heights."""
+"""Ground coordinates of the points of a file: its CRS and height datum, checked against the options of the user."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def ground_of(
     Parameters
     ----------
     crs, vertical : optional
-        What the coordinates and the heights are in, where the file does not say it.
+        CRS and height datum, if the file does not state them.
 
     Raises
     ------
     InputError, CrsError, DatumError
-        If that is not known or contradicts the file, or a place is not on Earth.
+        If one is unknown or contradicts the file, or a point is not on Earth.
     """
     ground = np.array([row.ground for row in table.rows], dtype=float).reshape(-1, 3)
     wheres = [row.where for row in table.rows]
@@ -55,25 +55,25 @@ def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS
         stated = None if table.crs is None else parse_crs(table.crs)
     except CrsError as error:
         raise CrsError(error.message, file=path, field="CRS", remedy=error.remedy) from error
-    given = None if option is None else parse_crs(option)
-    if stated is None and given is None:
+    wanted = None if option is None else parse_crs(option)
+    if stated is None and wanted is None:
         raise CrsError(
-            "the CRS of these points is not known",
+            "the CRS of these points is unknown",
             file=path,
             field="points.crs",
             remedy=Text("give ", Setting("points.crs", "EPSG:n")),
         )
-    if stated is None or given is None:
-        return given if stated is None else stated  # type: ignore[return-value]
-    if not same_crs(_plan(stated), _plan(given)):
+    if stated is None or wanted is None:
+        return wanted if stated is None else stated  # type: ignore[return-value]
+    if not same_crs(_plan(stated), _plan(wanted)):
         raise CrsError(
-            Text(f"the file says {stated.name!r}, ", Setting("points.crs"), f" says {given.name!r}"),
+            Text(f"the file states {stated.name!r}, but ", Setting("points.crs"), f" states {wanted.name!r}"),
             file=path,
             field="points.crs",
             remedy="leave the option out",
         )
-    # The one that also says what heights are in tells more.
-    return stated if declared_vertical(given) is None else given
+    # Prefer the CRS that also has a height datum.
+    return stated if declared_vertical(wanted) is None else wanted
 
 
 def _plan(crs: pyproj.CRS) -> pyproj.CRS:
@@ -90,19 +90,19 @@ def _from_geocentric(
 ) -> tuple[Array, pyproj.CRS]:
     """Return longitude, latitude and ellipsoidal height of points in Earth-centred X, Y, Z (metres)."""
     _check_kind(path, table, crs)
-    given = None if option is None else Vertical.parse(option)
+    wanted = None if option is None else Vertical.parse(option)
     stated = None if table.vertical is None else Vertical.stated(table.vertical)
-    for said in (given, stated):
-        if said is not None and not said.is_ellipsoid:
+    for datum in (wanted, stated):
+        if datum is not None and not datum.is_ellipsoid:
             raise DatumError(
-                f"{crs.name!r} has X, Y, Z from the centre of the Earth and no heights above {said.label}",
+                f"{crs.name!r} is geocentric (X, Y, Z from the centre of the Earth), so it has no height datum",
                 file=path,
                 field="points.vertical",
                 remedy="leave the height datum out",
             )
-    placed = ground_transform(crs, "EPSG:4979")(ground)
-    # No deeper than the sea, no higher than an aircraft: kilometres for metres and other systems come out elsewhere.
-    bad = ~(np.abs(placed[:, 2]) < _ON_EARTH) & np.isfinite(ground).any(axis=1)
+    geographic = ground_transform(crs, "EPSG:4979")(ground)
+    # No deeper than the sea, no higher than an aircraft: kilometres instead of metres, and other CRSs, fail here.
+    bad = ~(np.abs(geographic[:, 2]) < _ON_EARTH) & np.isfinite(ground).any(axis=1)
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
         x, y, z = ground[first]
@@ -111,10 +111,10 @@ def _from_geocentric(
             file=path,
             field=wheres[first],
             remedy=Text(
-                "geocentric points need x, y and h (Z) in metres; other coordinates another ", Setting("points.crs")
+                "give x, y and h (Z) in metres from the centre of the Earth, or another ", Setting("points.crs")
             ),
         )
-    return placed, pyproj.CRS.from_epsg(4326)
+    return geographic, pyproj.CRS.from_epsg(4326)
 
 
 def _vertical_of(
@@ -123,44 +123,44 @@ def _vertical_of(
     """Return the height datum of the points, and metres per unit of their heights."""
     declared = declared_vertical(crs)
     if table.assumed_vertical is not None and option is not None:
-        # The CRS is what the format prescribes, not what anybody said of these heights.
+        # The format prescribes this CRS; nobody stated it for these heights.
         declared = None
-    given = None if option is None else Vertical.parse(option)
+    wanted = None if option is None else Vertical.parse(option)
     stated = None if table.vertical is None else Vertical.stated(table.vertical)
     unit = declared.metres_per_unit if declared else 1.0
-    said = _certain(declared)
-    if stated is not None and said is not None and stated != said:
+    of_crs = _certain(declared)
+    if stated is not None and of_crs is not None and stated != of_crs:
         raise DatumError(
-            f"the file states its heights in {stated.label}, and its CRS {crs.name!r} in {said.label}",
+            f"the file states heights in {stated.label}, but its CRS {crs.name!r} has heights in {of_crs.label}",
             file=path,
             field="vertical",
-            remedy="state the height datum once",
+            remedy="correct one of the two",
         )
-    certain = stated or said
-    if given is not None and certain is not None and given != certain:
+    certain = stated or of_crs
+    if wanted is not None and certain is not None and wanted != certain:
         raise DatumError(
             Text(
-                f"the heights of these points are in {certain.label}, ",
+                f"the file states heights in {certain.label}, but ",
                 Setting("points.vertical"),
-                f" says {given.label}",
+                f" states {wanted.label}",
             ),
             file=path,
             field="points.vertical",
             remedy="leave the option out",
         )
-    found = given or stated or (declared.vertical if declared else None)
-    if found is None and table.assumed_vertical is not None:
-        found = Vertical.parse(table.assumed_vertical)
-    if found is None and not needed:
+    datum = wanted or stated or (declared.vertical if declared else None)
+    if datum is None and table.assumed_vertical is not None:
+        datum = Vertical.parse(table.assumed_vertical)
+    if datum is None and not needed:
         return Vertical("ellipsoid"), unit
-    if found is None:
+    if datum is None:
         raise DatumError(
-            "it is not known what the heights of these points are measured above",
+            "the height datum of these points is unknown",
             file=path,
             field="points.vertical",
-            remedy=Text("say it with ", Setting("points.vertical"), f" ({VERTICAL_FORMS})"),
+            remedy=Text("give it with ", Setting("points.vertical"), f" ({VERTICAL_FORMS})"),
         )
-    return found, unit
+    return datum, unit
 
 
 def _certain(declared: DeclaredVertical | None) -> Vertical | None:
@@ -170,8 +170,8 @@ def _certain(declared: DeclaredVertical | None) -> Vertical | None:
 def _ellipsoidal(
     path: str | os.PathLike[str], wheres: Sequence[str], ground: Array, crs: pyproj.CRS, vertical: Vertical
 ) -> Array:
-    given = np.isfinite(ground[:, 2])
-    if vertical.is_ellipsoid or not given.any():
+    known = np.isfinite(ground[:, 2])
+    if vertical.is_ellipsoid or not known.any():
         return ground
     plan = np.column_stack([ground[:, :2], np.zeros(len(ground))])
     lonlat = ground_transform(crs, "EPSG:4979")(plan)
@@ -179,30 +179,30 @@ def _ellipsoidal(
         undulation = vertical.undulation(lonlat[:, 0], lonlat[:, 1])
     except DatumError as error:
         raise DatumError(error.message, file=path, field="points.vertical", remedy=error.remedy) from error
-    outside = given & ~np.isfinite(undulation)
+    outside = known & ~np.isfinite(undulation)
     if outside.any():
         raise DatumError(
-            f"the geoid of {vertical.label} does not reach this point",
+            f"{vertical.label} does not cover this point",
             file=path,
             field=wheres[int(np.flatnonzero(outside)[0])],
             remedy=Text("check its coordinates and ", Setting("points.crs")),
         )
-    out = ground.copy()
-    out[given, 2] += undulation[given]
-    return out
+    ellipsoidal = ground.copy()
+    ellipsoidal[known, 2] += undulation[known]
+    return ellipsoidal
 
 
 def _check_kind(path: str | os.PathLike[str], table: Table, crs: pyproj.CRS) -> None:
-    """Refuse degrees in columns that are called Easting and Northing, and metres in those called Lat and Lon."""
+    """Refuse degrees in columns named Easting and Northing, and metres in columns named Lat and Lon."""
     kind = "geographic" if crs.is_geographic else "geocentric" if crs.is_geocentric else "projected"
     if table.of_ground in (None, kind):
         return
-    named = "longitude" if table.of_ground == "geographic" else "easting"
+    named = "longitude and latitude" if table.of_ground == "geographic" else "easting and northing"
     raise CrsError(
-        f"the columns are called {named} and so on, but {crs.name!r} is {kind}",
+        f"the columns are named {named}, but {crs.name!r} is {kind}",
         file=path,
         field="points.crs",
-        remedy="give the CRS that these columns are in, or rename them x and y",
+        remedy="give the CRS of these columns, or rename them x and y",
     )
 
 
@@ -216,6 +216,7 @@ def _check_places(path: str | os.PathLike[str], crs: pyproj.CRS, wheres: Sequenc
                     file=path,
                     field=where,
                     remedy=Text(
-                        "x is longitude and y latitude; projected coordinates need another ", Setting("points.crs")
+                        "give longitude as x and latitude as y; for projected coordinates give another ",
+                        Setting("points.crs"),
                     ),
                 )

@@ -1,6 +1,6 @@
-"""Errors of image measurements: covariance of a point, groups of points that share errors, what all have in common.
+"""Errors of image measurements: the covariance of a point, and the errors that points share.
 
-A covariance that is the same in all directions says no more than a standard deviation, and is that one's square.
+A covariance that is the same in all directions equals the square of a standard deviation.
 """
 
 from __future__ import annotations
@@ -14,24 +14,25 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, number, short, sigma_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-#: Column and row that depend on each other beyond this leave no second direction: 1 - correlation^2.
+#: Below this 1 - correlation^2, column and row depend on each other so much that the covariance is singular.
 _SINGULAR = 1e-12
-#: Halves of a covariance that differ by this part of its trace are the same.
+#: Off-diagonal elements that differ by less than this part of the trace are equal.
 _ROUNDING = 1e-12
-#: A standard deviation agrees with a covariance within this part of it: files round.
+#: Relative difference up to which a standard deviation agrees with a covariance, because files round.
 _SAME_SIGMA = 0.01
 
 
 def reconciled(sigma: Array, covariance: ArrayLike | None) -> tuple[Array, Array]:
-    """Return standard deviations ``(N,)`` px and covariances ``(N, 2, 2)`` px^2 that say the same.
+    """Return standard deviations ``(N,)`` px and covariances ``(N, 2, 2)`` px^2 that agree.
 
-    Of a covariance that differs with the direction the standard deviation is the root mean square of both axes;
-    elsewhere `sigma` says all, and its square is the covariance.
+    If a covariance differs with the direction, the standard deviation is the root mean square of both axes. Otherwise
+    the covariance is the square of `sigma`.
 
     Raises
     ------
@@ -43,22 +44,21 @@ def reconciled(sigma: Array, covariance: ArrayLike | None) -> tuple[Array, Array
         square[:, 0, 0] = square[:, 1, 1] = sigma**2
     if covariance is None:
         return sigma, square
-    given = _of_shape(covariance, len(sigma))
-    alike = ((given == square) | np.isnan(given) & np.isnan(square)).all(axis=(1, 2))
-    _refuse_impossible(given[~alike], np.flatnonzero(~alike))
-    more = says_more(given)
-    derived = sigma_of_covariance(given)
-    # A change of scale of points without directions changes sigma alone.
+    full = _of_shape(covariance, len(sigma))
+    alike = ((full == square) | np.isnan(full) & np.isnan(square)).all(axis=(1, 2))
+    _refuse_impossible(full[~alike], np.flatnonzero(~alike))
+    more = says_more(full)
+    derived = sigma_of_covariance(full)
+    # Scaling points with the same error in all directions changes sigma alone.
     wrong = more & ~(np.abs(sigma - derived) <= _SAME_SIGMA * derived)
     if wrong.any():
         k = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"sigma_image {sigma[k]:g} of point {k + 1} contradicts covariance_image, whose root mean square per axis "
-            f"is {derived[k]:g}",
+            f"sigma_image of point {k + 1} is {sigma[k]:g}, but its covariance_image gives {derived[k]:g}",
             field="sigma_image",
-            remedy="change both, or give the covariance by with_covariance_image",
+            remedy="change both, or use with_covariance_image",
         )
-    return np.where(more, derived, sigma), np.where(more[:, None, None], given, square)
+    return np.where(more, derived, sigma), np.where(more[:, None, None], full, square)
 
 
 def checked_covariance(covariance: ArrayLike, count: int) -> Array:
@@ -69,21 +69,21 @@ def checked_covariance(covariance: ArrayLike, count: int) -> Array:
     InputError
         If they are not.
     """
-    given = _of_shape(covariance, count)
-    _refuse_impossible(given, np.arange(count))
-    return given
+    checked = _of_shape(covariance, count)
+    _refuse_impossible(checked, np.arange(count))
+    return checked
 
 
 def _of_shape(covariance: ArrayLike, count: int) -> Array:
-    """Return covariances ``(N, 2, 2)``; what rounding did to their symmetry is undone."""
-    given = np.array(covariance, dtype=float)
-    if given.shape != (count, 2, 2):
-        raise InputError(f"covariance_image has the shape {given.shape}, not {(count, 2, 2)}", field="covariance_image")
-    both = given[:, 0, 1] / 2 + given[:, 1, 0] / 2
+    """Return covariances ``(N, 2, 2)``, made symmetric where only rounding differs."""
+    full = np.array(covariance, dtype=float)
+    if full.shape != (count, 2, 2):
+        raise InputError(f"covariance_image has the shape {full.shape}, not {(count, 2, 2)}", field="covariance_image")
+    both = full[:, 0, 1] / 2 + full[:, 1, 0] / 2
     with np.errstate(invalid="ignore"):
-        rounded = np.abs(given[:, 0, 1] - given[:, 1, 0]) <= _ROUNDING * (given[:, 0, 0] + given[:, 1, 1])
-    given[rounded, 0, 1] = given[rounded, 1, 0] = both[rounded]
-    return given
+        rounded = np.abs(full[:, 0, 1] - full[:, 1, 0]) <= _ROUNDING * (full[:, 0, 0] + full[:, 1, 1])
+    full[rounded, 0, 1] = full[rounded, 1, 0] = both[rounded]
+    return full
 
 
 def sigma_of_covariance(covariance: Array) -> Array:
@@ -98,35 +98,35 @@ def says_more(covariance: Array) -> NDArray[np.bool_]:
 
 
 def checked_groups(groups: ArrayLike | None, count: int) -> Index:
-    """Return groups ``(N,)``: -1 for a point that errs on its own, else the same number for those that share errors.
+    """Return groups ``(N,)``: the same number for points that share errors, -1 for a point that shares none.
 
     Raises
     ------
     InputError
-        If they are not so many whole numbers from -1 on.
+        If they are not N integers from -1.
     """
     if groups is None:
         return np.full(count, -1, dtype=np.int64)
-    found = np.asarray(groups)
-    if found.shape != (count,):
-        raise InputError(f"groups has the shape {found.shape}, not {(count,)}", field="groups")
-    if count and (found.dtype.kind not in "iu" or (found < -1).any()):
-        raise InputError("groups are whole numbers, -1 for a point that errs on its own", field="groups")
-    return found.astype(np.int64)
+    numbers = np.asarray(groups)
+    if numbers.shape != (count,):
+        raise InputError(f"groups has the shape {numbers.shape}, not {(count,)}", field="groups")
+    if count and (numbers.dtype.kind not in "iu" or (numbers < -1).any()):
+        raise InputError("groups must be integers, -1 for a point that shares no errors", field="groups")
+    return numbers.astype(np.int64)
 
 
 def checked_common(sigma: ArrayLike | None, count: int, name: str = "sigma_common") -> Array:
-    """Return standard deviations ``(N,)``, 0 for points that have no error in common with others.
+    """Return standard deviations ``(N,)`` of common errors, 0 for points that have none.
 
     Raises
     ------
     InputError
-        If they are not so many numbers from 0 on.
+        If they are not N finite numbers from 0.
     """
-    found = np.zeros(count) if sigma is None else np.asarray(sigma, dtype=float)
-    if found.shape != (count,) or not ((found >= 0) & np.isfinite(found)).all():
-        raise InputError(f"{name} is {count} numbers, none negative", field=name)
-    return found
+    sigmas = np.zeros(count) if sigma is None else np.asarray(sigma, dtype=float)
+    if sigmas.shape != (count,) or not ((sigmas >= 0) & np.isfinite(sigmas)).all():
+        raise InputError(f"{name} must have {counted(count, 'number')}, none negative", field=name)
+    return sigmas
 
 
 def _refuse_impossible(covariance: Array, rows: Index) -> None:
@@ -154,33 +154,33 @@ def _is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
 def read_image_errors(
     values: Sequence[Any], path: str | os.PathLike[str], where: Sequence[str], sigma: float | None
 ) -> tuple[tuple[float, float, float] | None, int | None, float | None, float | None]:
-    """Return variances and covariance of a measurement, group, sigma_common and sigma_alike; None is not given.
+    """Return variances and covariance of a measurement, group, sigma_common and sigma_alike; None if not given.
 
     Parameters
     ----------
     values : sequence of six
-        Of `CSV_ERRORS`, as a file has them; None and empty text are not given.
+        Values of `CSV_ERRORS` in a file; None or empty text if not given.
     where : sequence of six str
-        Where in the file each stands.
+        Place of each in the file.
     sigma : float or None
-        The standard deviation beside them, which has to agree.
+        The standard deviation of the measurement, which must agree.
 
     Raises
     ------
     InputError
-        If only some of a covariance is given, or it is impossible or contradicts the standard deviation.
+        If a covariance is incomplete, impossible, or contradicts the standard deviation.
     """
-    there = [value is not None and value != "" for value in values]
-    group = _group(values[3], path, where[3]) if there[3] else None
-    common, alike = (sigma_of(values[k], path, where[k], zero=True) if there[k] else None for k in (4, 5))
-    if not any(there[:3]):
+    filled = [value is not None and value != "" for value in values]
+    group = _group(values[3], path, where[3]) if filled[3] else None
+    common, alike = (sigma_of(values[k], path, where[k], zero=True) if filled[k] else None for k in (4, 5))
+    if not any(filled[:3]):
         return None, group, common, alike
-    if not all(there[:3]):
-        missing = CSV_ERRORS[there[:3].index(False)]
+    if not all(filled[:3]):
+        missing = CSV_ERRORS[filled[:3].index(False)]
         raise InputError(
-            f"a covariance without {missing}",
+            f"the covariance has no {missing}",
             file=path,
-            field=where[there.index(True)],
+            field=where[filled.index(True)],
             remedy=f"give {', '.join(CSV_ERRORS[:3])}, or sigma_image alone",
         )
     column, row = (sigma_of(values[k], path, where[k], zero=False, what="variance") for k in range(2))
@@ -188,42 +188,42 @@ def read_image_errors(
     matrix = np.array([[[column, both], [both, row]]])
     if not _is_positive_definite(matrix)[0]:
         raise InputError(
-            f"{short(values[2])} is too large for the covariance of column and row: it is not positive definite",
+            f"{short(values[2])} is too large: the covariance is not positive definite",
             file=path,
             field=where[2],
-            remedy="its square is below var_col times var_row",
+            remedy="the square of cov_col_row must be less than var_col times var_row",
         )
     derived = float(sigma_of_covariance(matrix)[0])
     if sigma is not None and not abs(sigma - derived) <= _SAME_SIGMA * derived:
         raise InputError(
-            f"sigma_image is {sigma:g}, and the covariance beside it has {derived:g}",
+            f"sigma_image is {sigma:g}, but the covariance gives {derived:g}",
             file=path,
             field=where[0],
-            remedy="leave sigma_image empty where a covariance is given",
+            remedy="leave sigma_image empty",
         )
     return (column, row, both), group, common, alike
 
 
 def _group(value: Any, path: str | os.PathLike[str], where: str) -> int:
-    found = number(value, path, where)
-    if found != math.floor(found) or not 0 <= found < 2**53:
+    group = number(value, path, where)
+    if group != math.floor(group) or not 0 <= group < 2**53:
         raise InputError(
             f"{short(value)} is not a group",
             file=path,
             field=where,
-            remedy="number the groups from 0 on; leave it empty for a point that errs on its own",
+            remedy="number the groups from 0; leave it empty for a point that shares no errors",
         )
-    return int(found)
+    return int(group)
 
 
 def covariance_of(rows: Sequence[PointRow], sigma: Array) -> Array:
-    """Return covariances ``(N, 2, 2)`` px^2 of the rows of a file, from `sigma` where they give none."""
-    found = reconciled(sigma, None)[1]
+    """Return covariances ``(N, 2, 2)`` px^2 of the rows of a file; from `sigma` if a row has none."""
+    covariance = reconciled(sigma, None)[1]
     for k, row in enumerate(rows):
         if row.covariance is not None:
             column, other, both = row.covariance
-            found[k] = np.array([[column, both], [both, other]]) * row.piece[2] ** 2
-    return found
+            covariance[k] = np.array([[column, both], [both, other]]) * row.piece[2] ** 2
+    return covariance
 
 
 def groups_of(rows: Sequence[PointRow]) -> Index:
@@ -232,7 +232,7 @@ def groups_of(rows: Sequence[PointRow]) -> Index:
 
 
 def common_of(rows: Sequence[PointRow]) -> dict[str, Array]:
-    """Return the standard deviations ``(N,)`` of what points have in common, by name, of the rows of a file."""
+    """Return the standard deviations ``(N,)`` of common errors, by name, of the rows of a file."""
     return {
         name: np.array([getattr(row, name) or 0.0 for row in rows], dtype=np.float64)
         for name in ("sigma_common", "sigma_alike")
@@ -240,12 +240,12 @@ def common_of(rows: Sequence[PointRow]) -> dict[str, Array]:
 
 
 def sigmas_of(rows: Sequence[PointRow], default: float) -> Array:
-    """Return standard deviations ``(N,)`` px of the rows of a file; `default` for those that give nothing."""
-    found = np.empty(len(rows))
+    """Return standard deviations ``(N,)`` px of the rows of a file; `default` for rows that have none."""
+    sigmas = np.empty(len(rows))
     for k, row in enumerate(rows):
         if row.covariance is not None:
             sigma = math.sqrt(row.covariance[0] / 2 + row.covariance[1] / 2)
         else:
             sigma = default if row.sigma_image is None else row.sigma_image
-        found[k] = sigma * row.piece[2]
-    return found
+        sigmas[k] = sigma * row.piece[2]
+    return sigmas

@@ -1,4 +1,4 @@
-"""Lists of points that other programs write: each one's origin, order and header, undone on the line that reads it."""
+"""Lists of points of other programs. The line that reads a number converts its origin, order and sign."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells:
     where = f"line {line.number}"
     if len(cells) != len(names):
         raise InputError(
-            f"{counted(len(cells), 'cell')} under {counted(len(names), 'column name')}", file=path, field=where
+            f"this line has {counted(len(cells), 'cell')}, but there are {len(names)} columns", file=path, field=where
         )
-    given = dict(zip(names, cells, strict=True))
-    if given.get("enable", "1") not in ("0", "1"):
-        raise InputError(f"{short(given['enable'])} is neither 0 nor 1", file=path, field=f"{where}, column enable")
+    fields = dict(zip(names, cells, strict=True))
+    if fields.get("enable", "1") not in ("0", "1"):
+        raise InputError(f"{short(fields['enable'])} is neither 0 nor 1", file=path, field=f"{where}, column enable")
     x, y, column, minus_line = (
-        number(given[name], path, f"{where}, column {name}") for name in ("mapx", "mapy", "sourcex", "sourcey")
+        number(fields[name], path, f"{where}, column {name}") for name in ("mapx", "mapy", "sourcex", "sourcey")
     )
-    if given.get("enable", "1") == "0":
+    if fields.get("enable", "1") == "0":
         return None
     return PointRow(where=where, id=None, image=(column, -minus_line), ground=(x, y, math.nan))
 
@@ -67,7 +67,7 @@ def _qgis_row(path: str | os.PathLike[str], line: Line, names: list[str], cells:
 def read_odm(path: str | os.PathLike[str], text: str) -> Table:
     """Read an ODM ``gcp_list.txt``: line 1 is the CRS, then ``x y z column row image [label]``; ``#`` comments.
 
-    Columns and rows are taken to count from the corner of the first pixel. A `z` of NaN is a height not given.
+    Columns and rows count from the corner of the first pixel. A `z` of NaN means no height.
     """
     table = Table("ODM list", origin_allowed=True)
     for line in lines_of(path, text):
@@ -81,13 +81,15 @@ def read_odm(path: str | os.PathLike[str], text: str) -> Table:
                     f"{short(line.text.strip())} is not a CRS",
                     file=path,
                     field=where,
-                    remedy="the first line of an ODM list is EPSG:n, a PROJ string, or like WGS84 UTM 33N",
+                    remedy="begin the list with EPSG:n, a PROJ string, or a name such as WGS84 UTM 33N",
                 )
             continue
         cells = line.text.strip().split("\t") if "\t" in line.text.strip() else line.text.split()
         cells = [cell.strip() for cell in cells if cell.strip()]
         if len(cells) < 6:
-            raise InputError(f"{counted(len(cells), 'cell')}, not x y z column row image", file=path, field=where)
+            raise InputError(
+                f"this line has {counted(len(cells), 'cell')}; expected: x y z column row image", file=path, field=where
+            )
         unknown_height = cells[2].lower() == "nan"
         x, y, column, row = (
             number(cells[k], path, f"{where}, column {name}")
@@ -117,7 +119,7 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
     """Read ground control of ENVI (``.pts``): comments after ``;`` name the layout, the corner of the image is (1, 1).
 
     ``projection info`` on WGS84 (geographic or UTM) states the CRS. With ``ImageFile#`` each line begins with the
-    number of its image, which a comment ``FileName0=...`` names.
+    number of its image; a comment ``FileName0=...`` has its name.
     """
     table = Table("ENVI points")
     layout: list[str] = []
@@ -132,42 +134,44 @@ def read_envi(path: str | os.PathLike[str], text: str) -> Table:
             continue
         if not layout:
             raise InputError(
-                "this layout of ENVI points is not known",
+                "unknown layout of ENVI points",
                 file=path,
                 field=where,
-                remedy="a comment line must say 'Map (x,y), Image (x,y)' or 'Map (x,y,elev), Image (x,y)'",
+                remedy="add a comment line '; Map (x,y), Image (x,y)' or '; Map (x,y,elev), Image (x,y)'",
             )
         cells = plain.split()
         if len(cells) < len(layout):
-            raise InputError(f"{counted(len(cells), 'cell')}, not {', '.join(layout)}", file=path, field=where)
-        given = dict(zip(layout, cells, strict=False))
-        image = given.pop("image file", None)
+            raise InputError(
+                f"this line has {counted(len(cells), 'cell')}; expected: {', '.join(layout)}", file=path, field=where
+            )
+        fields = dict(zip(layout, cells, strict=False))
+        image = fields.pop("image file", None)
         if image is not None and image not in images:
             raise InputError(
                 f"no comment FileName{short(image)[1:-1]}= names the image of this point",
                 file=path,
                 field=where,
-                remedy="name it, for example ; FileName0=scene.tif",
+                remedy="add this comment, for example ; FileName0=scene.tif",
             )
-        value = {name: number(cell, path, f"{where}, {name}") for name, cell in given.items()}
-        at = (value["image x"] - 1.0, value["image y"] - 1.0)
+        value = {name: number(cell, path, f"{where}, {name}") for name, cell in fields.items()}
+        position = (value["image x"] - 1.0, value["image y"] - 1.0)
         ground = (value["x"], value["y"], value.get("elev", math.nan))
         name = None if image is None else re.split(r"[\\/]", images[image])[-1]
-        table.rows.append(PointRow(where, None, at, ground, image_name=name))
+        table.rows.append(PointRow(where, None, position, ground, image_name=name))
     return table
 
 
 def _envi_layout(comment: str) -> list[str]:
-    found = re.search(r"(?i)(imagefile#\s*,\s*)?map\s*\(x\s*,\s*y(\s*,\s*\w+)?\)\s*,\s*image\s*\(x\s*,\s*y\)", comment)
-    if found is None:
+    match = re.search(r"(?i)(imagefile#\s*,\s*)?map\s*\(x\s*,\s*y(\s*,\s*\w+)?\)\s*,\s*image\s*\(x\s*,\s*y\)", comment)
+    if match is None:
         return []
-    first, elevation = ["image file"] if found.group(1) else [], ["elev"] if found.group(2) else []
+    first, elevation = ["image file"] if match.group(1) else [], ["elev"] if match.group(2) else []
     return [*first, "x", "y", *elevation, "image x", "image y"]
 
 
 def _envi_crs(comment: str) -> str | None:
-    found = re.search(r"(?i)projection info\s*=\s*\{([^}]*)\}", comment)
-    words = [word.strip().lower() for word in found.group(1).split(",")] if found else []
+    match = re.search(r"(?i)projection info\s*=\s*\{([^}]*)\}", comment)
+    words = [word.strip().lower() for word in match.group(1).split(",")] if match else []
     if "wgs-84" not in words:
         return None
     if words[0] == "geographic lat/lon" and "units=degrees" in words:
@@ -181,11 +185,11 @@ def _envi_crs(comment: str) -> str | None:
 
 
 def read_asp(path: str | os.PathLike[str], text: str) -> Table:
-    """Read a ``.gcp`` of the Ames Stereo Pipeline: a line per point, with every image that it was measured in.
+    """Read a ``.gcp`` of the Ames Stereo Pipeline: a line per point, with every image in which it was measured.
 
-    ``id latitude longitude height sigma sigma sigma`` and for each image ``name column row sigma sigma``, parted by
-    blanks or commas. Columns and rows count from the centre of the first pixel, heights are above the ellipsoid; a
-    comment ``# WKT:`` states the CRS. The three sigmas (m) are taken as those of latitude, longitude and height.
+    ``id latitude longitude height sigma sigma sigma`` and for each image ``name column row sigma sigma``, separated by
+    blanks or commas. Columns and rows count from the centre of the first pixel; heights are ellipsoidal. A comment
+    ``# WKT:`` states the CRS. The three sigmas (m) are those of latitude, longitude and height.
     """
     table = Table("ASP points", assumed_vertical="ellipsoid", of_ground="geographic")
     for line in lines_of(path, text):
@@ -198,10 +202,10 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
         cells = re.split(r"\s*,\s*|\s+", line.text.strip())
         if len(cells) < 12 or (len(cells) - 7) % 5:
             raise InputError(
-                f"{counted(len(cells), 'cell')}, not 7 of the point and 5 of each image",
+                f"this line has {counted(len(cells), 'cell')}; expected: 7 of the point and 5 of each image",
                 file=path,
                 field=where,
-                remedy="id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
+                remedy="write id lat lon height sigma sigma sigma, then for each image: name column row sigma sigma",
             )
         lat, lon, height = (
             number(cells[k], path, f"{where}, {name}") for k, name in ((1, "latitude"), (2, "longitude"), (3, "height"))
@@ -218,33 +222,37 @@ def read_asp(path: str | os.PathLike[str], text: str) -> Table:
 
 # -- ArcGIS ----------------------------------------------------------------------------------------------------------
 
-#: The first line of a link file; ArcGIS takes files without it too, which nothing tells from other columns of numbers.
+#: The first line of a link file. ArcGIS also reads files without it, but they look like any other columns of numbers.
 LINK_TABLE = re.compile(r"(?i)link table\s*$")
 
 
 def read_links(path: str | os.PathLike[str], text: str) -> Table:
     """Read a link table of ArcGIS: ``[id] from-x from-y to-x to-y`` under a line ``link table``; no heights.
 
-    A raster without georeference lies below the x axis there: from-y is minus the row. Where its first pixel is counted
-    from is the user's to say.
+    ArcGIS places a raster without georeference below the x axis, so from-y is minus the row. The user states the pixel
+    origin.
     """
     table = Table("ArcGIS links", origin_allowed=True)
     lines = list(lines_of(path, text))[1:]
     for line in lines:
         cells, where = line.text.split(), f"line {line.number}"
         if len(cells) not in (4, 5):
-            raise InputError(f"{counted(len(cells), 'cell')}, not [id] from-x from-y to-x to-y", file=path, field=where)
+            raise InputError(
+                f"this line has {counted(len(cells), 'cell')}; expected: [id] from-x from-y to-x to-y",
+                file=path,
+                field=where,
+            )
         x, minus_row, *to = (
             number(cell, path, f"{where}, {name}")
             for cell, name in zip(cells[-4:], ("from-x", "from-y", "to-x", "to-y"), strict=True)
         )
         if minus_row > 1.0:
             raise InputError(
-                f"from-y is {minus_row:g}: counted upwards, from a place that the file does not say",
+                f"from-y is {minus_row:g}, but it must be minus the row",
                 file=path,
                 field=f"{where}, from-y",
-                remedy="make the links on the raster without its georeference, where y is "
-                "minus the row, or give the points as CSV with the columns Pixel and Line",
+                remedy="make the links on the raster without its georeference, or give the points as CSV with the "
+                "columns Pixel and Line",
             )
         label = cells[0] if len(cells) == 5 else None
         table.rows.append(PointRow(where, label, (x, -minus_row), (to[0], to[1], math.nan)))

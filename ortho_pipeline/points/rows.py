@@ -1,7 +1,7 @@
-"""The table of points that every reader of a point file fills, and how text and numbers of strangers are read.
+"""The table of points that every reader of a point file fills, and how text and numbers of a file are checked.
 
-Image points are (column, row) from the outer corner of the first pixel, ground points as the file has them, with what
-it says about their CRS. `ortho_pipeline.points` makes ellipsoidal heights of that.
+Image points are (column, row) from the outer corner of the first pixel. Ground points are as in the file, with the CRS
+that it states; `points.ground` makes ellipsoidal heights.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from ortho_pipeline.options import PIXEL_ORIGINS
 
 Array = NDArray[np.float64]
 
-#: A point file beyond this is not read (bytes), nor a line beyond that (characters).
+#: Limits: bytes of a point file, characters of a line.
 MAX_FILE = 32_000_000
 MAX_LINE = 100_000
-#: A standard deviation beyond this has no square.
+#: The square of a larger standard deviation would overflow.
 MAX_SIGMA = 1e150
 ROLES = ("control", "check", "tie")
 CSV_COLUMNS = ("id", "col", "row", "x", "y", "h", "role", "sigma_image", "sigma_xy", "sigma_h")
-#: Column of a CSV of several images: the file that a point was measured in.
+#: Column of a CSV of several images: the image in which a point was measured.
 CSV_IMAGE = "image"
-#: Columns of points whose errors differ with the direction, or are shared with those of neighbours, or with all.
+#: Columns for errors that differ with the direction, or that points share with neighbours or with all others.
 CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common", "sigma_alike")
 
 
 class ColumnRules(NamedTuple):
-    """Columns that a CSV may have, those that every line fills, and the role of lines that give none."""
+    """Columns that a CSV may have, those that every line needs, and the default role."""
 
     names: tuple[str, ...]
     needed: tuple[str, ...]
     role: str
 
 
-#: Points of one image; rays of a block, whose ground may be known; ground whose heights count; ground alone.
+#: Points of one image; rays of a block, with or without ground; ground points that test heights; ground points.
 OF_IMAGE = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
 OF_BLOCK = ColumnRules(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
 OF_HEIGHTS = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
@@ -53,16 +53,18 @@ OF_GROUND = ColumnRules(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x",
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
-#: Where another image lies in this one: column and row of its first corner, and the width of one of its pixels.
+#: Position of another image in this one: column and row of its first corner, and the width of its pixels.
 Placement = tuple[float, float, float]
 OWN_IMAGE: Placement = (0.0, 0.0, 1.0)
 
 
 class TablePoint(NamedTuple):
-    """One of the points of a table, in its units; `image` and `sigma_image` in px, sigmas of the ground in metres.
+    """A point of a table: `image` and `sigma_image` in px, `sigma_ground` in metres.
 
-    `covariance_image` (px^2) and `group` are those of its measurement, as in `Points`; so are `sigma_common` (m) and
-    `sigma_alike` (px).
+    `covariance_image` (px^2) is the covariance of column and row. Points with the same `group` from 0 on share errors,
+    as matched neighbours do; -1 means no shared errors. `sigma_common` (m, per axis) is an error of the ground that all
+    points with one have in common, such as that of a reference. `sigma_alike` (px, per axis) is such an error of the
+    measurement, for example if the bands of a reference disagree. More points do not reduce common errors.
     """
 
     id: str
@@ -108,11 +110,11 @@ class PointRow:
 
 @dataclass
 class Table:
-    """All points of a file, and what it says about their coordinates.
+    """All points of a file, and what it states about their coordinates.
 
-    `vertical` is stated by the file; `assumed_vertical` is what the format means where nothing is stated. `of_ground`
-    is ``geographic`` or ``projected`` where the columns are called so. With `origin_allowed` the file does not say what
-    (0, 0) is, and the user may. `source` is the file.
+    `vertical` is stated by the file; `assumed_vertical` is the default of the format. `of_ground` is ``geographic`` or
+    ``projected`` if column names say so. With `origin_allowed` the user may state the pixel origin. `source` is the
+    file.
     """
 
     format: str
@@ -126,26 +128,26 @@ class Table:
 
 
 def plain_id(text: str) -> str:
-    """Return an id as it is known by: no blanks around it, single ones within, and so nothing that ends a line."""
+    """Return an id in its plain form: no blanks around it, single blanks within, no line breaks."""
     return " ".join(text.split())
 
 
 def is_writable(text: str) -> bool:
-    """Tell whether text can stand in a UTF-8 file: no NUL and no half of a surrogate pair, which JSON can hold."""
+    """Return whether a UTF-8 file can hold a text: no NUL, and no half of a surrogate pair, which JSON can hold."""
     return "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def numbered_ids(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> tuple[str, ...]:
-    """Number the points without an id by their place in the file; refuse an id that stands twice."""
+    """Number the points without an id by their position in the file; refuse an id that appears twice."""
     first: dict[str, str] = {}
     for count, row in enumerate(rows, start=1):
         row.id = row.id if row.id is not None else str(count)
         if row.id in first:
             raise InputError(
-                f"the id {row.id!r} stands twice, first in {first[row.id]}",
+                f"two points have the id {row.id!r}; the first is in {first[row.id]}",
                 file=path,
                 field=row.where,
-                remedy="give each point an id of its own",
+                remedy="give each point a different id",
             )
         first[row.id] = row.where
     return tuple(str(row.id) for row in rows)
@@ -154,7 +156,7 @@ def numbered_ids(path: str | os.PathLike[str], rows: Sequence[PointRow]) -> tupl
 def refuse_duplicates(
     path: str | os.PathLike[str], wheres: Sequence[str], image: Array, ground: Array, roles: Sequence[str]
 ) -> None:
-    """Refuse points that stand twice: the same ground or the same pixel, to all digits that can matter."""
+    """Refuse points that appear twice: the same ground or the same pixel, to all digits that matter."""
     # A millimetre in degrees and in metres; pixels to a millionth.
     digits = 8 if np.abs(ground[:, :2]).max(initial=0) <= 360 else 3
     for what, keys in (("ground", np.round(ground, digits)), ("image", np.round(image, 6))):
@@ -173,22 +175,22 @@ def refuse_duplicates(
 
 
 def origin_shift(path: str | os.PathLike[str], table: Table, origin: str) -> float:
-    """Return what is added to image coordinates of a file whose first pixel is called so.
+    """Return the number to add to image coordinates of a file with this pixel origin.
 
     Raises
     ------
     InputError
-        For an unknown name, and for one where the format itself says it.
+        For an unknown origin, or if the format defines its own.
     """
     if origin not in PIXEL_ORIGINS:
         raise InputError(
             f"{origin!r} is not a pixel origin",
             field="points.pixel_origin",
-            remedy=f"one of {', '.join(PIXEL_ORIGINS)}",
+            remedy=f"use one of {', '.join(PIXEL_ORIGINS)}",
         )
     if origin != "corner" and not table.origin_allowed:
         raise InputError(
-            f"the format {table.format} says itself what its first pixel is called",
+            f"the format {table.format} defines its own pixel origin",
             file=path,
             field="points.pixel_origin",
             remedy="leave the option out",
@@ -208,21 +210,23 @@ def load_text(path: str | os.PathLike[str]) -> str:
     data = read_bounded(path, MAX_FILE, remedy="check the path")
     if len(data) > MAX_FILE:
         raise InputError(
-            f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path, remedy="thin the points out"
+            f"this file is larger than {MAX_FILE // 1_000_000} MB, the limit for point files",
+            file=path,
+            remedy="use fewer points",
         )
     if data.startswith(b"EHFA_HEADER_TAG") or Path(path).suffix.lower() == ".gcc":
         raise InputError(
-            "how GCP files of ERDAS IMAGINE (.gcc) are written is not published",
+            "cannot read GCP files of ERDAS IMAGINE (.gcc): their format is not published",
             file=path,
-            remedy="export the cell array of the GCP tool as text, and give its columns names such as Name, Pixel, "
-            "Line, Easting, Northing, Elev",
+            remedy="export the cell array of the GCP tool as text, and name its columns Name, Pixel, Line, Easting, "
+            "Northing, Elev",
         )
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError("this file is UTF-16", file=path, remedy="save it as UTF-8")
     if b"\0" in data:
         line = data[: data.index(b"\0")].count(b"\n") + 1
         raise InputError(
-            "a NUL byte: this is not a text file", file=path, field=f"line {line}", remedy="save it as text (UTF-8)"
+            "this is not a text file (NUL byte)", file=path, field=f"line {line}", remedy="save it as text (UTF-8)"
         )
     try:
         return data.decode("utf-8-sig")
@@ -234,7 +238,7 @@ def load_text(path: str | os.PathLike[str]) -> str:
 
 
 def number(text: Any, path: str | os.PathLike[str], where: str) -> float:
-    """Return a finite number; `where` (line and column) goes into the error."""
+    """Return a finite number; an error names `where` (line and column)."""
     if isinstance(text, bool) or not isinstance(text, str | int | float):
         raise InputError(f"{short(text)} is not a number", file=path, field=where)
     try:
@@ -259,7 +263,9 @@ def short(value: Any) -> str:
 def lines_of(path: str | os.PathLike[str], text: str) -> Iterator[Line]:
     for count, line in enumerate(text.splitlines(), start=1):
         if len(line) > MAX_LINE:
-            raise InputError(f"a line of {len(line)} characters", file=path, field=f"line {count}")
+            raise InputError(
+                f"this line has {len(line)} characters; the limit is {MAX_LINE}", file=path, field=f"line {count}"
+            )
         if line.strip():
             yield Line(count, line)
 
@@ -283,11 +289,11 @@ def sigma_of(
 
 
 def cells_of(path: str | os.PathLike[str], line: Line, delimiter: str) -> list[str]:
-    """Return the cells of a line without blanks around them; a blank as delimiter stands for any white space."""
+    """Return the cells of a line without blanks around them; a blank as delimiter means any white space."""
     if delimiter == " " and '"' not in line.text:
         return line.text.split()
     try:
         text = " ".join(line.text.split()) if delimiter == " " else line.text
         return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter, strict=True))]
     except csv.Error as error:
-        raise InputError(f"the line cannot be split ({error})", file=path, field=f"line {line.number}") from error
+        raise InputError(f"this line is not valid CSV ({error})", file=path, field=f"line {line.number}") from error

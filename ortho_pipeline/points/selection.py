@@ -1,6 +1,6 @@
-"""Selection of control points: the rest become check points. This is how the tables of papers are made.
+"""Selection of control points as in the tables of papers: the others become check points.
 
-A few can be made check points instead (`assign_roles`), of one image or of a block.
+`assign_roles` makes check points of some control points, of one image or of a block.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.table import Array, Points
 
 _FORMS = "even:N, cluster:N[:K] (K 1-4: corners clockwise from the upper left, 5: middle), ids:a,b,c or random:N:seed"
-#: Groups of `cluster` as places in the box of the points, (column, row) from 0 to 1.
+#: Centres of the groups of `cluster` in the box of the points, (column, row) from 0 to 1.
 _REGIONS = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.5, 0.5)])
 
 
 def select_control(points: Points, spec: str) -> Points:
-    """Keep some of the control points and make check points of the others; what is not a control point stays as it is.
+    """Keep some control points and make check points of the others; all other points keep their roles.
 
     Parameters
     ----------
     spec : str
-        ``even:N`` for N points as far apart in the image as can be; ``cluster:N`` for the N points nearest to the
-        upper left, ``cluster:N:K`` for group K of 1 to 5 (corners clockwise, middle); ``ids:a,b,c`` for these;
-        ``random:N:seed`` for a draw that is the same every time.
+        ``even:N``: N points as far apart in the image as possible. ``cluster:N``: the N points nearest to the upper
+        left; ``cluster:N:K``: group K of 1 to 5 (corners clockwise, middle). ``ids:a,b,c``: these points.
+        ``random:N:seed``: a random choice, the same for the same seed.
 
     Raises
     ------
     InputError, TooFewPoints
-        If the text is none of these, an id does not exist, or there are not so many control points.
+        If the text is none of these, an id does not exist, or there are too few control points.
     """
     kind, _, rest = spec.strip().partition(":")
     # By id, so that the order of the file does not matter.
@@ -44,7 +44,7 @@ def select_control(points: Points, spec: str) -> Points:
         count, other = _numbers(rest, spec)
         if count > len(rows):
             raise TooFewPoints(
-                f"{spec!r} asks for {count} of {counted(len(rows), 'control point')}",
+                f"{spec!r} selects {counted(count, 'point')}, but the file has {counted(len(rows), 'control point')}",
                 file=points.source or None,
                 field="points.select",
             )
@@ -66,7 +66,7 @@ def select_control(points: Points, spec: str) -> Points:
 
 
 def _unknown(spec: str) -> InputError:
-    return InputError(f"{spec!r} does not select points", field="points.select", remedy=f"give {_FORMS}")
+    return InputError(f"{spec!r} is not a selection of points", field="points.select", remedy=f"give {_FORMS}")
 
 
 def _numbers(text: str, spec: str) -> tuple[int, int | None]:
@@ -84,19 +84,19 @@ def _named(points: Points, text: str) -> list[int]:
     unknown = [name for name in names if name not in points.ids]
     if unknown or not names:
         raise InputError(
-            f"there is no point {', '.join(unknown)}" if unknown else "no point is named",
+            f"there is no point {', '.join(unknown)}" if unknown else "the selection names no point",
             file=points.source or None,
             field="points.select",
             remedy=f"the ids are {', '.join(points.ids[:12])}{' ...' if len(points) > 12 else ''}",
         )
     wrong = [name for name in names if points.roles[points.ids.index(name)] != "control"]
     if wrong:
-        raise InputError(f"{', '.join(wrong)}: no control point", file=points.source or None, field="points.select")
+        raise InputError(f"not a control point: {', '.join(wrong)}", file=points.source or None, field="points.select")
     return [points.ids.index(name) for name in names]
 
 
 def _spread(places: Array, count: int) -> list[int]:
-    """Return the point farthest from the middle, then again and again the one farthest from those chosen."""
+    """Return the point farthest from the middle, then each time the point farthest from all chosen ones."""
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
     chosen = [int(np.argmax(((places - middle) ** 2).sum(axis=1)))]
     nearest = ((places - places[chosen[0]]) ** 2).sum(axis=1)
@@ -165,4 +165,6 @@ def assign_roles(points: AnyPoints, spec: str) -> AnyPoints:
             )
         roles[np.isin(np.array(points.ids), names)] = "check"
         return points.with_roles(roles)
-    raise InputError(f"{spec!r} does not choose check points", field="points.check", remedy="give every:N or ids:a,b,c")
+    raise InputError(
+        f"{spec!r} is not a selection of check points", field="points.check", remedy="give every:N or ids:a,b,c"
+    )

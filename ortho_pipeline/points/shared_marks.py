@@ -1,4 +1,4 @@
-"""Points that lie on one mark of the ground, measured twice."""
+"""Pairs of points that are one mark on the ground, measured twice."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.geodesy.crs import (
-    ground_transform,
-)
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.points.table import Array
 
-#: Two points closer than this (m) are one mark; the targets of no survey stand so close together.
+#: Two points closer than this (m) are one mark; no survey has targets so close together.
 _ONE_MARK = 0.01
 
 
@@ -31,7 +29,7 @@ class HasGround(Protocol):
 def one_mark(points: HasGround) -> list[tuple[str, str]]:
     """Return pairs of ids of points that are within a centimetre on the ground: one mark that was measured twice.
 
-    Of a crowd each point stands in one pair, with its nearest neighbour.
+    In a cluster each point is in one pair, with its nearest neighbour.
     """
     plan = np.isfinite(points.ground[:, :2]).all(axis=1)
     place = np.nan_to_num(points.ground[plan])
@@ -40,27 +38,27 @@ def one_mark(points: HasGround) -> list[tuple[str, str]]:
     place = ground_transform(points.crs, "EPSG:4978")(place)
     index = np.flatnonzero(plan)[np.isfinite(place).all(axis=1)]
     place = place[np.isfinite(place).all(axis=1)]
-    # Points that are near each other are so along each axis: with few points the next one is further along some axis.
+    # Near points are near along each axis; with few points this excludes all of them quickly.
     if (np.diff(np.sort(place, axis=0), axis=0) > _ONE_MARK).all(axis=0).any():
         return []
-    from scipy.spatial import cKDTree  # takes as long to load as a small scene to warp
+    from scipy.spatial import cKDTree  # loading it takes as long as the warp of a small scene
 
     distance, neighbour = cKDTree(place).query(place, k=2, distance_upper_bound=_ONE_MARK)
-    # Of points at one place the first neighbour may be the other.
+    # For points at the same position, the first neighbour may be the other point.
     other = np.where(neighbour[:, 0] == np.arange(len(place)), neighbour[:, 1], neighbour[:, 0])
     near = np.flatnonzero(np.isfinite(distance).all(axis=1))
     pairs = {(min(index[k], index[other[k]]), max(index[k], index[other[k]])) for k in near}
-    return [(points.ids[one], points.ids[two]) for one, two in sorted(pairs)]
+    return [(points.ids[first], points.ids[second]) for first, second in sorted(pairs)]
 
 
 def marks_warning(control: HasGround) -> list[Notice]:
-    """Return a warning of control points that are one mark: they add no knowledge of its place."""
+    """Return a warning if control points are one mark: the second one adds no information."""
     pairs = one_mark(control)
     if not pairs:
         return []
-    shown = ", ".join(f"{one} and {two}" for one, two in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
+    shown = ", ".join(f"{first} and {second}" for first, second in pairs[:5]) + (" ..." if len(pairs) > 5 else "")
     text = (
-        f"control points within a centimetre of each other ({shown}): one mark that was measured twice counts as two, "
-        "and redundancy and sigmas are too good by that; keep one of them"
+        f"control points are within a centimetre of each other ({shown}). A mark that was measured twice counts as "
+        "two points, so redundancy and sigmas look too good: keep one point of each pair"
     )
     return [Notice("one-mark-twice", text, pairs=[list(pair) for pair in pairs])]

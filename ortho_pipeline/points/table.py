@@ -1,7 +1,7 @@
-"""Control, check and tie points: one table type, read from and written to every common format.
+"""Control, check and tie points: one table, read from and written to every common format.
 
-Whatever a file's convention is, points have image coordinates (column, row) from the outer corner of the first pixel,
-and ground coordinates x, y in a stated CRS with heights in metres above the WGS84 ellipsoid (NaN: not given).
+Image coordinates are (column, row) from the outer corner of the first pixel, whatever the convention of the file.
+Ground coordinates are x, y in a stated CRS. Heights are metres above the WGS84 ellipsoid; NaN means not given.
 """
 
 from __future__ import annotations
@@ -59,43 +59,31 @@ Array = NDArray[np.float64]
 
 #: Standard deviation (px) of an image measurement whose file gives none.
 DEFAULT_SIGMA_IMAGE = 0.5
-_FORMATS = "see docs/formats.md for what stands in a file of points"
+_FORMATS = "see docs/formats.md for the formats of point files"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Points:
-    """Points that were measured in an image and on the ground.
+    """Points measured in an image and on the ground. `Points.of` makes them from arrays.
 
     Parameters
     ----------
     ids : tuple of str
-        All different.
     image : ndarray (N, 2)
-        Column, row in pixels.
+        Column, row (px) from the outer corner of the first pixel.
     ground : ndarray (N, 3)
-        x, y in `crs`, height in metres above the ellipsoid; NaN is a height that is not given.
-    roles : ndarray (N,) of str
-        ``control``, ``check`` or ``tie``.
+        x, y in `crs`, height in metres above the ellipsoid; NaN if not given.
+    roles : ndarray (N,) of {'control', 'check', 'tie'}
     sigma_image : ndarray (N,)
-        Standard deviation of the image measurement, px: the root mean square of both axes.
+        Standard deviation of the image measurement (px): the root mean square of both axes.
     sigma_ground : ndarray (N, 3)
-        Standard deviation of the ground in metres true east, north and up, whatever `crs`; 0 is perfect.
+        Standard deviation (m) true east, north and up, whatever `crs`. 0 is perfect.
     crs : pyproj.CRS
         Horizontal CRS, x first.
     source : str
-        Where they come from, for people.
-    covariance_image : ndarray (N, 2, 2), optional
-        Covariance of column and row of the measurement, px^2. Where it is not given, and where it is the same in all
-        directions, it is that of `sigma_image`.
-    groups : ndarray (N,) of int, optional
-        -1 is a point that errs on its own, as one that was measured by hand; points of one number from 0 on share
-        errors, as matched neighbours do.
-    sigma_common : ndarray (N,), optional
-        Standard deviation in metres, per axis in plan, of an error of the ground that all points with one have in
-        common, as matches have that of their reference; 0 without. No number of points makes it less.
-    sigma_alike : ndarray (N,), optional
-        Standard deviation in px, per axis, of an error of the measurement that all points with one have in common, as
-        matches have where bands of the reference disagree; 0 without.
+        Name of their file, for people.
+    covariance_image, groups, sigma_common, sigma_alike : ndarray, optional
+        See `TablePoint`; by default a measurement has no correlation, and shares no error.
     """
 
     ids: tuple[str, ...]
@@ -131,11 +119,11 @@ class Points:
             object.__setattr__(self, name, checked_common(getattr(self, name), count, name))
         roles = np.asarray(self.roles, dtype="<U7")
         if roles.shape != (count,) or not set(roles.tolist()) <= set(ROLES):
-            raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+            raise InputError(f"each role must be one of {', '.join(ROLES)}", field="roles")
         object.__setattr__(self, "roles", roles)
         if len(set(self.ids)) != count:
             twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
-            raise InputError(f"the id {twice[0]!r} stands twice", file=self.source or None, field="id")
+            raise InputError(f"two points have the id {twice[0]!r}", file=self.source or None, field="id")
 
     @classmethod
     def of(
@@ -149,14 +137,19 @@ class Points:
         sigma_image: ArrayLike = DEFAULT_SIGMA_IMAGE,
         sigma_ground: ArrayLike = 0.0,
     ) -> Points:
-        """Make points of arrays: `image` ``(N, 2)`` from the outer corner of the first pixel, `ground` ``(N, 3)``.
+        """Make points from arrays: `image` ``(N, 2)`` from the outer corner of the first pixel, `ground` ``(N, 3)``.
 
-        The rest is one value for all points or one for each; without `ids` points are numbered from 1.
+        All other arguments are one value, or one for each point. Without `ids`, points are numbered from 1.
 
         Raises
         ------
         InputError
-            If the shapes do not agree, or `crs` is none.
+            If the shapes do not agree, or `crs` is not a CRS.
+
+        Examples
+        --------
+        >>> Points.of([[10.0, 20.0]], [[33.35, 37.25, 800.0]], "EPSG:4979")
+        <1 point: 1 control; WGS 84; arrays>
         """
         image = np.asarray(image, dtype=float)
         count = len(image)
@@ -190,10 +183,10 @@ class Points:
 
     @property
     def __geo_interface__(self) -> dict[str, Any]:
-        """The points as GeoJSON values in longitude, latitude (WGS84) and ellipsoidal height, as files have them.
+        """The points as GeoJSON values: longitude, latitude (WGS84) and ellipsoidal height.
 
-        `ji` are column and row from the centre of the first pixel. A point without a place has no geometry. shapely,
-        GeoPandas (``GeoDataFrame.from_features(points, crs=4326)``) and others read it.
+        `ji` is column and row from the centre of the first pixel. A point without ground coordinates has no geometry.
+        shapely and GeoPandas (``GeoDataFrame.from_features(points, crs=4326)``) read it.
         """
         return {"type": "FeatureCollection", "features": [feature_of(point) for point in self.to_crs("EPSG:4979")]}
 
@@ -209,15 +202,15 @@ class Points:
 
     @property
     def tests(self) -> NDArray[np.bool_]:
-        """Check points that test the result ``(N,)``: those that somebody measured, or matches where there is no other.
+        """Check points ``(N,)`` that test the result: the measured ones, or matches if there are no others.
 
-        Matches (points with a group) that check are relative to their reference, and have a figure of their own.
+        Matches (points with a group) test relative to their reference, so they have a separate figure.
         """
         measured = self.check & (self.groups < 0)
         return measured if measured.any() else self.check
 
     def select(self, mask: ArrayLike) -> Points:
-        """Return the points of a mask ``(N,)`` or of indices, in their order."""
+        """Return the points that a mask ``(N,)`` or indices select, in their order."""
         index = np.arange(len(self))[np.asarray(mask)]
         return replace(
             self,
@@ -234,9 +227,9 @@ class Points:
         )
 
     def with_covariance_image(self, covariance: ArrayLike, groups: ArrayLike | None = None) -> Points:
-        """Return these points with other covariances ``(N, 2, 2)`` px^2 of their measurement, and groups if given."""
-        given = checked_covariance(covariance, len(self))
-        changed = replace(self, sigma_image=sigma_of_covariance(given), covariance_image=given)
+        """Return these points with other covariances ``(N, 2, 2)`` px^2 of the measurement, and groups if given."""
+        covariance = checked_covariance(covariance, len(self))
+        changed = replace(self, sigma_image=sigma_of_covariance(covariance), covariance_image=covariance)
         return changed if groups is None else replace(changed, groups=np.asarray(groups))
 
     def with_roles(self, roles: ArrayLike) -> Points:
@@ -244,11 +237,11 @@ class Points:
         return replace(self, roles=np.asarray(roles))
 
     def with_ground(self, ground: ArrayLike) -> Points:
-        """Return these points at another place ``(N, 3)`` of the same CRS."""
+        """Return these points with other ground coordinates ``(N, 3)`` in the same CRS."""
         return replace(self, ground=np.asarray(ground, dtype=float))
 
     def to_crs(self, target: str | pyproj.CRS) -> Points:
-        """Return these points in another CRS; heights that are not given stay so.
+        """Return these points in another CRS; missing heights stay NaN.
 
         Raises
         ------
@@ -281,31 +274,34 @@ def read_points(
     image_name: str | None = None,
     pieces: Mapping[str, Placement] | None = None,
 ) -> Points:
-    """Read points of any known format (docs/formats.md).
+    """Read points from any known format (docs/formats.md).
 
     Parameters
     ----------
     crs, vertical : optional
-        What the coordinates and the heights are in, where the file does not say it.
+        CRS and height datum, if the file does not state them.
     pixel_origin : 'corner', 'center', 'corner-1' or 'center-1'
-        What CSV, ODM and link files call the outer corner, or the centre, of the first pixel: (0, 0) or (1, 1). The
-        other formats have a convention of their own.
+        Part of the first pixel that CSV, ODM and link files count as (0, 0), or with ``-1`` as (1, 1).
     image_name : str, optional
-        Keep the points of this image, where a file holds points of several.
+        Keep only the points of this image.
     pieces : mapping of str to (float, float, float), optional
-        Further images whose points are kept: column and row of their first corner in this image, and the width of one
-        of their pixels.
+        Further images to keep: column and row of their first corner in this image, and the width of their pixels.
 
     Raises
     ------
     InputError, CrsError, DatumError
-        Names file, line and column, and what to do.
+        The message names file, line and column.
+
+    Examples
+    --------
+    >>> read_points("sample_data/gcps.geojson")
+    <18 points: 12 control, 6 check; WGS 84; sample_data/gcps.geojson>
     """
     return points_of(read_table(path, image_name, pieces), crs, vertical, pixel_origin)
 
 
 def points_of(table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertical | None, pixel_origin: str) -> Points:
-    """Return the points of a table that was read; parameters and errors are those of `read_points`."""
+    """Return the points of a table; parameters and errors are those of `read_points`."""
     path = table.source
     with completed(path, remedy=_FORMATS):
         shift, rows = origin_shift(path, table, pixel_origin), table.rows
@@ -333,19 +329,19 @@ def points_of(table: Table, crs: str | pyproj.CRS | None, vertical: str | Vertic
 def gcps_of_dataset(
     dataset: Any, *, crs: str | pyproj.CRS | None = None, vertical: str | Vertical | None = None
 ) -> Points:
-    """Return the ground control points that an open GDAL dataset carries.
+    """Return the ground control points of an open GDAL dataset.
 
-    Heights that are all zero are GDAL's way to say that there are none: they are NaN here.
+    If all heights are zero, there are none (a convention of GDAL): they become NaN.
 
     Raises
     ------
     InputError, CrsError, DatumError
-        If there are none, or the CRS or the height datum is not known.
+        If there are no points, or the CRS or the height datum is unknown.
     """
     path = dataset.GetDescription()
     gcps = dataset.GetGCPs()
     if not gcps:
-        raise InputError("this raster carries no ground control points", file=path, remedy="give a point file")
+        raise InputError("this raster has no ground control points", file=path, remedy="give a point file")
     names = [plain_id(gcp.Id) for gcp in gcps]
     named = all(names) and len(set(names)) == len(gcps)
     flat = all(gcp.GCPZ == 0 for gcp in gcps)
@@ -360,14 +356,14 @@ def gcps_of_dataset(
     ]
     image, ground = np.array([row.image for row in rows]), np.array([row.ground for row in rows])
     if not (np.isfinite(image).all() and np.isfinite(ground[:, :2]).all()):
-        raise InputError("a ground control point is not finite", file=path, field="GCP")
+        raise InputError("a coordinate of a ground control point is not finite", file=path, field="GCP")
     table = Table("GCPs", rows, crs=dataset.GetGCPProjection() or None)
-    placed, plane = ground_of(path, table, crs, vertical)
-    refuse_duplicates(path, [row.where for row in rows], image, placed, [row.role for row in rows])
+    ground, plane = ground_of(path, table, crs, vertical)
+    refuse_duplicates(path, [row.where for row in rows], image, ground, [row.role for row in rows])
     return Points(
         ids=tuple(str(row.id) for row in rows),
         image=image,
-        ground=placed,
+        ground=ground,
         roles=np.full(len(rows), "control", dtype="<U7"),
         sigma_image=np.full(len(rows), DEFAULT_SIGMA_IMAGE),
         sigma_ground=np.zeros((len(rows), 3)),
@@ -382,32 +378,34 @@ def gcps_of_dataset(
 def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequence[str] | None = None) -> None:
     """Write points as ``.csv``/``.tsv``, ``.geojson`` (lon, lat, EPSG:4979) or QGIS ``.points``; whole or not at all.
 
-    CSV and GeoJSON read back as they were; a QGIS file has no ids, heights, roles or sigmas. An id is text without
-    blanks around it, or several in a row.
+    CSV and GeoJSON keep everything. A QGIS file has no ids, heights, roles or sigmas.
 
     Parameters
     ----------
     images : sequence of str, optional
-        Name of the file that each point was measured in, where they are several: CSV and TSV alone can say it.
+        Name of the image of each point; only for CSV and TSV.
 
     Raises
     ------
     InputError
-        For another suffix, an id that would be read as another one, or a folder that cannot be written.
+        For another suffix, an id that would change (with blanks around it, or several in a row), or a folder that
+        cannot be written.
     """
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
     suffix = Path(path).suffix.lower()
     if suffix not in writers:
-        raise InputError("points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}")
+        raise InputError(
+            "points cannot be written in this format", file=path, remedy=f"use one of {', '.join(writers)}"
+        )
     if images is not None and writers[suffix] is not _csv_text:
-        raise InputError(f"{suffix} does not say in which file a point was measured", file=path, remedy="write .csv")
+        raise InputError(f"{suffix} files cannot name the image of a point", file=path, remedy="write .csv")
     odd = next((name for name in points.ids if not name or name != plain_id(name) or not is_writable(name)), None)
     if odd is not None and writers[suffix] is not _qgis_text:
         raise InputError(
-            f"the id {short(odd)} would be read as another one",
+            f"the id {short(odd)} would be different when it is read again",
             file=path,
             field="id",
-            remedy="give each point a name without line breaks, and no blanks around it or in a row",
+            remedy="use ids without line breaks, without blanks around them, and without several blanks in a row",
         )
     write_text(path, _csv_text(points, suffix, images) if images is not None else writers[suffix](points, suffix))
 
@@ -415,7 +413,7 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
 def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) -> str:
     out = io.StringIO()
     out.write(f"#CRS: {crs_definition(points.crs)}\n#vertical: ellipsoid\n")
-    # An id that starts with '#' would read as a comment without quotation marks.
+    # Without quotation marks, an id that starts with '#' would become a comment.
     hidden = any(name.startswith("#") for name in points.ids)
     writer = csv.writer(
         out,
@@ -425,7 +423,7 @@ def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) 
     )
     extra = _error_columns(points)
     writer.writerow([*CSV_COLUMNS, *extra, *([] if images is None else ["image"])])
-    # One column holds both plan components: the larger one is the careful choice.
+    # One column has both horizontal components: the larger one is safe.
     sigma_xy = points.sigma_ground[:, :2].max(axis=1)
     numbers = np.column_stack([points.image, points.ground])
     sigmas = np.column_stack([points.sigma_image, sigma_xy, points.sigma_ground[:, 2]])
@@ -437,19 +435,19 @@ def _csv_text(points: Points, suffix: str, images: Sequence[str] | None = None) 
 
 
 def _error_columns(points: Points) -> dict[str, list[str]]:
-    """Return cells of the columns `CSV_ERRORS` by their names: of those that say more than `sigma_image` does."""
-    found: dict[str, list[str]] = {}
+    """Return the cells of those columns of `CSV_ERRORS` that add information to `sigma_image`, by name."""
+    columns: dict[str, list[str]] = {}
     more = says_more(points.covariance_image)
     if more.any():
         for name, i, j in zip(CSV_ERRORS[:3], (0, 1, 0), (0, 1, 1), strict=True):
             values = points.covariance_image[:, i, j].tolist()
-            found[name] = [repr(value) if there else "" for value, there in zip(values, more, strict=True)]
+            columns[name] = [repr(value) if written else "" for value, written in zip(values, more, strict=True)]
     if (points.groups >= 0).any():
-        found[CSV_ERRORS[3]] = [str(group) if group >= 0 else "" for group in points.groups.tolist()]
+        columns[CSV_ERRORS[3]] = [str(group) if group >= 0 else "" for group in points.groups.tolist()]
     for name in CSV_ERRORS[4:]:
         if getattr(points, name).any():
-            found[name] = [repr(sigma) if sigma else "" for sigma in getattr(points, name).tolist()]
-    return found
+            columns[name] = [repr(sigma) if sigma else "" for sigma in getattr(points, name).tolist()]
+    return columns
 
 
 def _geojson_text(points: Points, suffix: str) -> str:

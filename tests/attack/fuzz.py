@@ -47,7 +47,7 @@ _PART = 500
 WHOLE = re.compile(
     r"cannot be read|not read|not text|binary|UTF-16|not UTF-8|well-formed|no RPC|no points"
     r"|(more|larger) than .* (MB|bytes)|plain ASCII|is a JSON object|is empty|no such file|GDAL cannot open"
-    r"|do not stand in this format|is not in this table"
+    r"|cannot hold points of several images|is not in this table"
     r"|this is no|this is not|there is no .* in this file|nothing in|cut off|too large, or not text|no text"
 )
 _VARYING = re.compile(r"'[^']*'|\".*|[(].*|[0-9.]+")

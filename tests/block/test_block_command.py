@@ -427,7 +427,7 @@ def test_geoid_heights_are_brought_to_the_ellipsoid(stereo: Stereo, tmp_path: Pa
         (("--model", "affine3d", "--correction", "shift"), "fitted as a whole"),
         (("--model-crs", "utm"), "ground CRS of a fitted model"),
         (("--correction", "model"), "no parameters of its own"),
-        (("--check", "every:0"), "does not choose check points"),
+        (("--check", "every:0"), "not a selection of check points"),
     ],
 )
 def test_options_that_do_not_go_together(stereo: Stereo, tmp_path: Path, args: tuple[str, ...], message: str) -> None:
@@ -542,7 +542,7 @@ def test_pixel_centres_and_ground_of_its_own(tmp_path: Path) -> None:
     points = read(tmp_path, text, pixel_origin="center", **given)
     np.testing.assert_array_equal(points.measured, [[10.5, 20.5], [30.5, 40.5], [11.5, 21.5]])
     assert points.roles.tolist() == ["check", "tie"]
-    with pytest.raises(CrsError, match="CRS of these points is not known"):
+    with pytest.raises(CrsError, match="CRS of these points is unknown"):
         read(tmp_path, text, gcps=tmp_path / "ground.csv")
     (tmp_path / "ground.csv").write_text("id,x,y,h\nq,24.4,-33.6,100\n")
     with pytest.raises(InputError, match="none of these points was measured"):
@@ -560,10 +560,10 @@ def test_pixel_centres_and_ground_of_its_own(tmp_path: Path) -> None:
         ("a,l,1,2,24,,5,\n", "ground is x and y, or none"),
         ("a,l,1,2,,,,control\n", "control points without ground"),
         ("a,l,1,nan,,,,\n", "is not a number"),
-        ("a,,1,2,,,,\n", "a point without an image"),
-        (",l,1,2,,,,\n", "a point without an id"),
+        ("a,,1,2,,,,\n", "this point has no image"),
+        (",l,1,2,,,,\n", "this point has no id"),
         ("a,l,1,2,240000,-33,5,\n", None),
-        ("", "holds no points"),
+        ("", "this file has no points"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, lines: str, message: str | None) -> None:
@@ -578,7 +578,7 @@ def test_a_file_of_one_image_is_no_block(tmp_path: Path) -> None:
     feature = {
         "type": "Feature", "geometry": {"type": "Point", "coordinates": [24, -33, 5]}, "properties": {"ji": [1, 2]},
     }  # fmt: skip
-    with pytest.raises(InputError, match="in which image"):
+    with pytest.raises(InputError, match="does not name its image"):
         read(tmp_path, json.dumps({"type": "FeatureCollection", "features": [feature]}), "a.geojson")
 
 

@@ -509,6 +509,6 @@ def test_a_model_of_another_place_is_a_warning(tiny):
 
 def test_a_model_that_could_not_be_read_again_is_not_written(tiny, tmp_path, monkeypatch):
     monkeypatch.delitem(KINDS, "rpc")
-    with pytest.raises(PluginError, match=r"m_model\.json: .*could not be read again.*'rpc'(.|\n)*ortho_models"):
+    with pytest.raises(PluginError, match=r"m_model\.json: .*cannot be read again.*'rpc'(.|\n)*ortho_models"):
         ortho_pipeline.save_model(tiny.model, tmp_path / "m_model.json")
     assert not list(tmp_path.glob("*.json"))

@@ -297,4 +297,4 @@ def test_crops_with_the_file_of_the_whole_are_of_the_size_that_it_names(real, tm
         shutil.copy(folder / "image" / "phr_gizeh" / f"{name}.tif", image)
         scene = open_scene(image, SceneOptions(rpc=str(folder / "rpc" / "phr_gizeh" / f"{name}.geom")))
         assert scene.facts["crop_offset"] == list(place)
-        assert "the file of the RPC" in scene.warnings[0]
+        assert "the RPC file is for" in scene.warnings[0]

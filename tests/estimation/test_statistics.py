@@ -141,7 +141,7 @@ def test_check_points_stay_check_points():
     assert not select_control(points, "even:20").check[10:].any()
     with pytest.raises(TooFewPoints):
         select_control(points, "even:21")
-    with pytest.raises(InputError, match="no control point"):
+    with pytest.raises(InputError, match="not a control point"):
         select_control(points, "ids:p0")
 
 

@@ -296,7 +296,7 @@ def test_what_stands_for_the_model_is_not_beside_a_geotransform(tiny, tmp_path, 
 
 
 def test_an_unknown_format_is_refused(tiny, tmp_path):
-    with pytest.raises(InputError, match="no format is called shp") as caught:
+    with pytest.raises(InputError, match="unknown format shp") as caught:
         commands.export(tiny.image, tmp_path / "out", formats=["rpb", "shp"])
     assert "geolocation" in str(caught.value.remedy)
     assert not (tmp_path / "out").exists()

@@ -66,7 +66,7 @@ def test_frames_of_others_say_what_their_heights_are(points):
         {"col": [10, 20.5], "row": [3, 4], "sigma_xy": [0.2, None]},
         geometry=[shapely.Point(33.3, 37.2, 800.0), shapely.Point(33.4, 37.3, 900.0)], crs="EPSG:4326",
     )  # fmt: skip
-    with pytest.raises(DatumError, match="not known what the heights"):
+    with pytest.raises(DatumError, match="height datum of these points is unknown"):
         op.from_geodataframe(frame)
     found = op.from_geodataframe(frame, vertical="ellipsoid")
     assert found.ids == ("1", "2")
@@ -75,7 +75,7 @@ def test_frames_of_others_say_what_their_heights_are(points):
     assert found.roles.tolist() == ["control"] * 2
     # The CRS of EPSG:4979 says it itself.
     assert op.from_geodataframe(frame.set_crs("EPSG:4979", allow_override=True)).ground[1, 2] == 900.0
-    with pytest.raises(CrsError, match="CRS of these points is not known"):
+    with pytest.raises(CrsError, match="CRS of these points is unknown"):
         op.from_geodataframe(frame.set_crs(None, allow_override=True), vertical="ellipsoid")
 
 
@@ -87,10 +87,13 @@ def test_frames_of_others_say_what_their_heights_are(points):
         (lambda f: f.assign(role="gcp"), "row 0, role: 'gcp' is not a role"),
         (lambda f: f.assign(sigma_x=-1.0), "row 0, sigma_x: -1.0 is not a standard deviation"),
         (lambda f: f.assign(group=0.5), "row 0, group: 0.5 is not a group"),
-        (lambda f: f.assign(id="A"), "the id 'A' stands twice"),
-        (lambda f: f.set_geometry(f.buffer(1.0)), "Polygon is not the place of a point"),
+        (lambda f: f.assign(id="A"), "two points have the id 'A'"),
+        (lambda f: f.set_geometry(f.buffer(1.0)), "Polygon is not a point"),
         (lambda f: f.drop(columns="geometry"), "DataFrame has no geometry"),
-        (lambda f: geopandas.GeoDataFrame(f.rename(columns={"h": "col"}), geometry="geometry"), "two columns"),
+        (
+            lambda f: geopandas.GeoDataFrame(f.rename(columns={"h": "col"}), geometry="geometry"),
+            "two columns have the same name",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(points, change, said):

@@ -276,7 +276,7 @@ def test_stale_side_car_is_an_error_with_a_choice(tmp_path):
 
 def test_choice_that_is_not_there_is_an_error(tmp_path):
     dataset = gdal.Open(str(make_image(tmp_path / "a.tif", make_rpc())))
-    with pytest.raises(InputError, match="no RPC side-car"):
+    with pytest.raises(InputError, match="no RPC sidecar"):
         rpc_of_dataset(dataset, "sidecar")
     with pytest.raises(InputError, match="cannot be read"):
         rpc_of_dataset(dataset, "nowhere.txt")
@@ -572,7 +572,7 @@ def test_poor_fit_warns_or_is_refused(monkeypatch, caplog):
     assert "only to" in poor.warnings[0]
     assert "only to" in caplog.text
     monkeypatch.setattr(Wavy, "amplitude", 1.0)
-    with pytest.raises(InputError, match="stands for this model only to"):
+    with pytest.raises(InputError, match="represents this model only to"):
         export_rpc(Wavy())
     assert export_rpc(Wavy(), force=True).max_error_px > 0.5
 

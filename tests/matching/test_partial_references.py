@@ -74,7 +74,7 @@ def test_a_reference_without_values_says_so(case: Case, tmp_path: Path) -> None:
         np.zeros((case.reference_grid()[2], case.reference_grid()[1]), np.uint16)
     )
     refused = tried(case, [empty]).refused
-    assert "has no values" in refused
+    assert "has no pixel values" in refused
     assert "reference_bands" in refused
 
 

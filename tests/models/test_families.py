@@ -89,7 +89,7 @@ def test_terms():
     assert family_of("affine14-col").col[-1] == "X2"
     assert family_of("affine14-col").row[-1] == "XY"
     assert family_of("affine14-row").row[-1] == "X2"
-    with pytest.raises(InputError, match="no model family"):
+    with pytest.raises(InputError, match="unknown model family"):
         family_of("poly9")
 
 

@@ -594,7 +594,7 @@ def test_an_orbit_may_begin_a_little_late(late: float) -> None:
         )  # fmt: skip
 
     if late > 0.01:
-        with pytest.raises(InputError, match="after the first row, the image from 0 to"):
+        with pytest.raises(InputError, match="after the first row, but the image needs 0 to"):
             made()
         return
     place, whole = made().rays([[5.0, 0.5]])[0], camera.rays(np.array([[5.0, 0.5]]))[0]

@@ -46,7 +46,7 @@ def test_an_even_grid_covers_the_image_whatever_its_number(n):
 def test_the_empty_side_is_named(box, empty):
     (said,) = uncovered(grid(5, 5, box), SIZE)
     assert f"empty: {empty}." in said
-    assert "measure some there" in said
+    assert "add points there" in said
 
 
 def test_a_missing_corner_is_named_and_not_warned_of():

@@ -96,7 +96,7 @@ def test_what_is_not_a_covariance_is_refused(covariance: list[list[float]], said
 
 def test_a_scalar_that_contradicts_a_covariance_is_refused_and_rounding_is_not() -> None:
     points = made(1).with_covariance_image([[[4, 1], [1, 2]]])
-    with pytest.raises(InputError, match="contradicts covariance_image") as caught:
+    with pytest.raises(InputError, match="but its covariance_image gives") as caught:
         replace(points, sigma_image=2 * points.sigma_image)
     assert caught.value.field == "sigma_image"
     assert replace(points, sigma_image=[1.73]).sigma_image == pytest.approx([np.sqrt(3)], rel=1e-15)

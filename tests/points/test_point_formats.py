@@ -81,11 +81,11 @@ def test_status_of_a_point(tmp_path: Path) -> None:
         # Which of them is the image, which the ground?
         ("Name,X,Y,Easting,Northing,Elev\na,1,2,3,4,5\n", "'X' and 'Easting' both mean x"),
         ("Name,Pixel,Line,x,y,Elev,alt\na,1,2,3,4,5,6\n", "'Elev' and 'alt' both mean h"),
-        ("Name,i,j,Easting,Northing\na,1,2,3,4\n", "'i' is not known"),
-        ("Name,Pixel,Line,Easting,Northing,Elev (ft)\na,1,2,3,4,5\n", r"'Elev \(ft\)' is not known"),
+        ("Name,i,j,Easting,Northing\na,1,2,3,4\n", "unknown column 'i'"),
+        ("Name,Pixel,Line,Easting,Northing,Elev (ft)\na,1,2,3,4,5\n", r"unknown column 'Elev \(ft\)'"),
         ("Name,Easting,Northing,Elev\na,1,2,3\n", "no column col, row"),
-        ("Name,,Pixel,Line,Easting,Northing\na,b,1,2,3,4\n", "'' is not known"),
-        ("A1,10.5,20.25,500100.5,6270000.25,123.5\n", "is not known"),
+        ("Name,,Pixel,Line,Easting,Northing\na,b,1,2,3,4\n", "unknown column ''"),
+        ("A1,10.5,20.25,500100.5,6270000.25,123.5\n", "unknown column"),
     ],
 )
 def test_unclear_columns_are_shown(tmp_path: Path, text: str, said: str) -> None:
@@ -103,12 +103,12 @@ def test_unclear_columns_are_shown(tmp_path: Path, text: str, said: str) -> None
 @pytest.mark.parametrize(
     ("row", "said"),
     [
-        ("a;10,5;20.25;500100;6270000;1", "commas and points"),
-        ("a;10,5;20;500.100,5;6270000;1", "commas and points"),
+        ("a;10,5;20.25;500100;6270000;1", "decimal commas and decimal points"),
+        ("a;10,5;20;500.100,5;6270000;1", "decimal commas and decimal points"),
         ("a;10,5;20;500,100,5;6270000;1", "not a number"),
         ("a;1,2,3;20;500100;6270000;1", "not a number"),
         ("a;10,;20;500100;6270000;x", "line 2, column Elev"),
-        ("a;10,5;20;500100;6270000", "5 cells under 6"),
+        ("a;10,5;20;500100;6270000", "5 cells, but there are 6"),
     ],
 )
 def test_numbers_that_are_unclear(tmp_path: Path, row: str, said: str) -> None:
@@ -117,7 +117,7 @@ def test_numbers_that_are_unclear(tmp_path: Path, row: str, said: str) -> None:
 
 
 def test_marks_are_those_of_the_whole_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"line 3, column Line.*commas and points"):
+    with pytest.raises(InputError, match=r"line 3, column Line.*decimal commas and decimal points"):
         read(tmp_path, "Name;Pixel;Line;Easting;Northing\na;10,5;20;500100;6270000\nb;1;2.5;500200;6270000\n")
     assert read(tmp_path, "Name;Pixel;Line;x;y\na;1,5e1;2;500100;6270000\n").image[0, 0] == 15.0
 
@@ -149,7 +149,7 @@ def test_pixel_origins(tmp_path: Path, origin: str, centre_of_first_pixel: float
 
 def test_an_origin_is_not_swallowed(tmp_path: Path) -> None:
     qgis = "#CRS: EPSG:32735\nmapX,mapY,sourceX,sourceY,enable\n500100,6270000,1,-2,1\n"
-    with pytest.raises(InputError, match="QGIS points says itself"):
+    with pytest.raises(InputError, match="QGIS points defines its own"):
         read(tmp_path, qgis, "a.points", None, pixel_origin="center")
     with pytest.raises(InputError, match="corner, center, corner-1, center-1"):
         read(tmp_path, "id,col,row,x,y\na,1,2,3,4\n", pixel_origin="middle")
@@ -265,7 +265,7 @@ def test_ames_stereo_pipeline(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("5 23.7 160.1 427.1 1 1 1 a.tif 124.5 19.7 1", "line 1: 11 cells"),
+        ("5 23.7 160.1 427.1 1 1 1 a.tif 124.5 19.7 1", "line 1: this line has 11 cells"),
         ("5 23.7 160.1 x 1 1 1 a.tif 124.5 19.7 1 1", "line 1, height"),
         ("5 23.7 160.1 4 1 -1 1 a.tif 124.5 19.7 1 1", "line 1, sigma 2"),
         ("5 23.7 160.1 4 1 1 1 a.tif 124.5 19.7 0 1", "line 1, pixel sigma"),
@@ -296,7 +296,7 @@ def test_arcgis_link_table(tmp_path: Path) -> None:
         [1.5, 2.5]
     ]
     # The example of the vendor's own article counts upwards.
-    with pytest.raises(InputError, match=r"line 2, from-y.*counted upwards"):
+    with pytest.raises(InputError, match=r"line 2, from-y.*must be minus the row"):
         read(tmp_path, "link table\n00.00000 10.00000 247192.14926 4529042.15691\n", "l.txt")
     with pytest.raises(InputError, match="7 cells"):
         read(tmp_path, "link table\n1 -2 3 4 5 6 7\n", "l.txt")
@@ -304,7 +304,7 @@ def test_arcgis_link_table(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("line", ["10.5 -20.25 500100 6270000", "1 10.5 20.25 500100 6270000 5", "1,2,3,4,5"])
 def test_numbers_without_names_are_refused_with_the_line(tmp_path: Path, line: str) -> None:
-    with pytest.raises(InputError, match="without names") as caught:
+    with pytest.raises(InputError, match="have no names") as caught:
         read(tmp_path, line + "\n", "points.txt")
     assert line in str(caught.value)
     assert "ID P L X Y Z" in str(caught.value.remedy)

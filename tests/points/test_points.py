@@ -216,7 +216,7 @@ def test_latitude_first_is_found_where_it_can_be(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("second", "message"),
     [
-        ("a,1,2,24.5,-33,1,check", "stands twice"),
+        ("a,1,2,24.5,-33,1,check", "two points have the id"),
         ("b,1,2,24.4,-33.65,100,check", "same ground .* as check and control"),
         ("b,10.5,20.25,24.5,-33,100,control", "same image"),
     ],
@@ -365,7 +365,7 @@ def test_table_rules() -> None:
         points.with_ground(np.zeros((2, 3)))
     with pytest.raises(InputError):
         points.with_roles(["boss"] * 9)
-    with pytest.raises(InputError, match="twice"):
+    with pytest.raises(InputError, match="two points have the id"):
         Points(
             ("a", "a"),
             *[
@@ -466,5 +466,5 @@ def test_points_of_arrays_are_those_of_a_file(tmp_path):
         np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
     with pytest.raises(InputError, match="shape"):
         Points.of(image, ground[:1], "EPSG:4979")
-    with pytest.raises(InputError, match="twice"):
+    with pytest.raises(InputError, match="two points have the id"):
         Points.of(image, ground, "EPSG:4979", ids=["a", "a"])

@@ -122,14 +122,14 @@ def test_ids_of_strangers_are_points_that_can_be_written(tmp_path: Path, ids: li
     features = points_of(ids, seed).__geo_interface__
     path.write_text(json.dumps(features))
     if any(is_odd(name) for name in ids):
-        with pytest.raises(InputError, match=r"is not an id|stands twice|is not JSON"):
+        with pytest.raises(InputError, match=r"is not an id|two points have the id|is not JSON"):
             read_points(path)
         return
     names = [" ".join(name.split()) for name in ids]
     # A point without a name has the number of its place in the file.
     names = [name or str(count) for count, name in enumerate(names, start=1)]
     if len(set(names)) < len(names):
-        with pytest.raises(InputError, match="stands twice"):
+        with pytest.raises(InputError, match="two points have the id"):
             read_points(path)
         return
     points = read_points(path)

@@ -188,7 +188,7 @@ def test_what_has_no_state(tmp_path: Path) -> None:
         ("m_currentParameterValue", [1.0] * 16, "corrections beside"),
         ("m_quaternions", [0.0] * 40, "length one"),
         ("m_positions", None, "numbers belong here"),
-        ("m_positions", [1e14] * 300, "no place of a satellite"),
+        ("m_positions", [1e14] * 300, "where no satellite can be"),
         ("m_nLines", 0, "not a size"),
     ],
 )

@@ -385,7 +385,7 @@ def test_impossible_planes_are_refused(changes):
 
 
 def test_a_satellite_at_the_horizon_is_refused():
-    with pytest.raises(InputError, match="above the horizon"):
+    with pytest.raises(InputError, match="an elevation of"):
         MapPlane.from_view(UTM, CORNER, (1.0, 1.0), SIZE, PLANE, 1.0, 0.01, HEIGHTS)
 
 

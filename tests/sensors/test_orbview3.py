@@ -367,7 +367,7 @@ def test_a_denominator_with_a_zero_in_the_scene_is_refused(copied):
     start = next(k for k, line in enumerate(lines) if "pixelDenominatorCoefficients" in line)
     lines[start + 2], lines[start + 3] = "      1.0,", "      -1.0,"
     path.write_text("\n".join(lines))
-    with pytest.raises(InputError, match="denominator of an RPC is zero within its box") as caught:
+    with pytest.raises(InputError, match="denominator of this RPC is zero within its box") as caught:
         read_product(path)
     assert caught.value.field == f"{RATIONAL}.pixelDenominatorCoefficients"
 

@@ -64,10 +64,10 @@ _SAMPLES_SHOWN = 4
 #: Why a match was not kept, in words.
 REASONS = {
     "hidden": "the target shows too little of the chip",
-    "weak": "the chips do not look alike",
+    "weak": "the chips are too different",
     "ambiguous": "a second place fits nearly as well",
-    "backward": "the match back leads elsewhere",
-    "not measured": "least-squares matching does not give its place to half a pixel",
+    "backward": "matching back gives another place",
+    "not measured": "least-squares matching is uncertain by more than half a pixel",
     "contradicts": "contradicts the other matches",
 }
 
@@ -204,12 +204,12 @@ def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
     image = spread_over(view)
     inside = _inside(view, targets, image)
     if inside.sum() < _SAMPLES_SHOWN:
-        said = "shows nothing of the scene"
-        remedy = "give images of the same place; if they are, the model of the scene leads elsewhere (`ortho info`)"
+        what = "does not overlap the scene"
+        remedy = "give images of the same place; if they are, check the model of the scene with `ortho info`"
         if inside.any():
-            said = f"covers {inside.mean():.1%} of the scene, which is too little to match"
+            what = f"covers {inside.mean():.1%} of the scene, which is too little to match"
             remedy = "give images that cover more of the scene, or measure points by hand"
-        raise InputError(f"{targets[0].called} {said}", file=targets[0].path, field=targets[0].field, remedy=remedy)
+        raise InputError(f"{targets[0].called} {what}", file=targets[0].path, field=targets[0].field, remedy=remedy)
     return image[inside]
 
 
@@ -406,26 +406,25 @@ class _Tried:
         scatter = float(np.sqrt((residuals**2).mean()))
         if len(residuals) < _MOSTLY * seen and scatter > _VAGUE * self.factor:
             raise InputError(
-                f"the scene and the reference do not agree: {len(residuals)} of {counted(seen, 'chip')} fit together, "
-                f"and those only within {scatter:.1f} px",
+                f"cannot match the scene with the reference: only {len(residuals)} of {counted(seen, 'chip')} agree, "
+                f"and only within {scatter:.1f} px",
                 file=self.targets[0].path,
                 field=self.targets[0].field,
                 remedy=Text(
-                    "check that the reference shows this place, search farther (",
+                    "check that the reference shows this place. Give a better DEM, or search farther with ",
                     Setting("match.search"),
-                    ") if the model may be off by more, or give better heights",
                 ),
             )
 
     def _too_few(self) -> InputError:
         counts = {name: int((self.reason == name).sum()) for name in REASONS}
-        why = ", ".join(f"{count} {REASONS[name]}" for name, count in counts.items() if count)
+        why = "; ".join(f"{count}: {REASONS[name]}" for name, count in counts.items() if count)
         return TooFewPoints(
-            f"{counted(int((self.reason == '').sum()), 'match')} of {len(self.reason)} tried"
-            f"{': ' + why if why else ''}",
+            f"only {int((self.reason == '').sum())} of {counted(len(self.reason), 'place')} matched"
+            f"{f' ({why})' if why else ''}",
             file=self.targets[0].path,
             field=self.targets[0].field,
-            remedy="give images that are more alike (season, resolution), or points that are measured by hand",
+            remedy="give images that are more alike (season, resolution), or measure points by hand",
         )
 
     def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:

@@ -270,9 +270,9 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
     radius = max(_NEXT, math.ceil(reach / factor) + 2)
     if radius > _LARGEST_RADIUS:
         raise InputError(
-            f"a search over {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
+            f"a search within {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
             field="match.search",
-            remedy="search less far, or measure points by hand",
+            remedy="reduce the search distance, or measure points by hand",
         )
     return factor, radius
 
@@ -361,22 +361,22 @@ def _standing_out(
                 f"{targets[0].called} is inconsistent: {divided}",
                 file=targets[0].path,
                 field=targets[0].field,
-                remedy="give another reference, or cut out the part that is right and give that alone",
+                remedy="give another reference, or only the correct part of this one",
             )
         raise InputError(
-            f"no place within {reach:.0f} px stands out: the best two of {len(compared)} are too much alike "
-            f"(correlation {means[best]:.2f} and {means[other]:.2f} in the mean of {counted(len(common), 'chip')})",
+            f"cannot match the scene with {targets[0].called}: no clear best position within {reach:.0f} px "
+            f"(mean correlation of {counted(len(common), 'chip')}: {means[best]:.2f} and {means[other]:.2f})",
             file=targets[0].path,
             field=targets[0].field,
             remedy=Text(
-                f"check that {targets[0].called} shows this place, search farther (",
-                Setting("match.search"),
-                ") if the model may be off by more, and for rotations (",
-                Setting("match.search_rotation", "5"),
-                ") if it may be turned; state how wrong heights may be (",
+                f"check that {targets[0].called} shows this place. Flat ground in mountains causes this: give a DEM, "
+                "and its accuracy if it is coarse (",
                 Setting("surface.sigma", "20"),
-                ") if the DEM is coarse and the view oblique; measure points by hand where the ground is ",
-                "uniform or repeats itself",
+                "). If the model may be farther off, search farther (",
+                Setting("match.search"),
+                "); if it may be rotated, add ",
+                Setting("match.search_rotation", "5"),
+                ". On uniform or repetitive ground, measure points by hand",
             ),
         )
     return best
@@ -402,8 +402,9 @@ def _divided(one: Mapping[tuple[float, ...], float], other: Mapping[tuple[float,
     axis = int(np.abs(apart).argmax())
     side = (("left", "right"), ("upper", "lower"))[axis][int(apart[axis] > 0)]
     return (
-        f"{counted(int(first.sum()), 'chip')} fit it at one place, and {counted(int(second.sum()), 'chip')}, "
-        f"mostly in the {side} part of the scene, {far:.0f} m from there"
+        f"{counted(int(first.sum()), 'chip matches', 'chips match')} at one position; "
+        f"{counted(int(second.sum()), 'chip matches', 'chips match')} {far:.0f} m from there, "
+        f"mostly in the {side} part of the scene"
     )
 
 
@@ -427,31 +428,31 @@ def refuse_accident(
     share = min(1.0, math.pi * tolerance**2 / (2 * _NEXT + 1) ** 2)
     if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:
         raise InputError(
-            f"the scene and {targets[0].called} do not agree: {agreeing} of {counted(chips, 'chip')} fit together "
-            f"within {reach:.0f} px of where the model puts them, which chance does as well",
+            f"cannot match the scene with {targets[0].called}: only {agreeing} of {counted(chips, 'chip')} agree "
+            f"within {reach:.0f} px, which can be chance",
             file=targets[0].path,
             field=targets[0].field,
             remedy=Text(
-                f"check that {targets[0].called} shows this place, search farther (",
+                f"check that {targets[0].called} shows this place. If the model may be farther off, search farther (",
                 Setting("match.search"),
-                ") if the model may be off by more, for rotations (",
+                "); if it may be rotated, add ",
                 Setting("match.search_rotation", "5"),
-                ") if it may be turned, or measure points by hand",
+                ". Else measure points by hand",
             ),
         )
 
 
 def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
-    why = f"it shares {counted(count, 'chip')} with the scene, and {_FEWEST} are needed"
+    why = f"only {counted(count, 'chip')} in common with the scene; {_FEWEST} are needed"
     if not count:
-        why = "where it covers the scene, it has no values or there are no heights"
+        why = "it has no pixel values there, or heights are missing"
     return InputError(
         f"{targets[0].called} shows too little of the scene: {why}",
         file=targets[0].path,
         field=targets[0].field,
         remedy=Text(
-            "give images that overlap more, bands that have values (",
+            "give images that overlap more, choose bands that have values with ",
             Setting("match.reference_bands"),
-            "), and heights that cover the overlap",
+            ", or give a DEM that covers the overlap",
         ),
     )

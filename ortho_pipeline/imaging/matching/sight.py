@@ -203,11 +203,11 @@ def placed_along_sight(
     found = along_sight(view, targets, factor, reach, region, displaced, threads)
     if found is None:
         raise InputError(
-            f"{refused.message}; nor do chips agree across the line of sight, along which wrong heights displace them "
-            f"by {displaced:.0f} px",
+            f"{refused.message}. Wrong heights (up to {displaced:.0f} px along the line of sight) do not explain this: "
+            "chips also disagree across it",
             file=refused.file,
             field=refused.field,
-            remedy=Text("give better heights, or: ", refused.remedy or ""),
+            remedy=Text("give a better DEM, or ", refused.remedy or ""),
         ) from None
     correction, chips, agreeing = found
     shift = correction.coefficients[[0, 3]]

@@ -147,7 +147,7 @@ class Reference:
         if not text or transform is None:
             missing = "coordinate system" if transform is not None else "georeference"
             raise CrsError(
-                f"the reference has no {missing}: where it lies is not known",
+                f"the reference has no {missing}, so its position is unknown",
                 file=source.path,
                 field="reference",
                 remedy="give an orthoimage (GeoTIFF with its CRS), or set it with gdal_edit.py -a_srs and -a_ullr",
@@ -161,7 +161,7 @@ class Reference:
             sound = bool(np.isfinite(inverse).all() and np.abs(offset).max() < 2**52)
         if not sound:
             raise CrsError(
-                "the reference has a georeference that cannot be inverted",
+                "the geotransform of the reference cannot be inverted",
                 file=source.path,
                 field="reference",
                 remedy="give an orthoimage",
@@ -215,7 +215,7 @@ def open_references(
         As `Reference.open`, or if there is none.
     """
     if not paths:
-        raise InputError("there is no reference", field="reference", remedy="give an orthoimage")
+        raise InputError("no reference is given", field="reference", remedy="give an orthoimage")
     return tuple(Reference.open(path, bands, **access) for path in paths)
 
 

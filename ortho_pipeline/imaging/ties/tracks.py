@@ -20,7 +20,7 @@ from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
 from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, SceneView, metres_per_pixel
 from ortho_pipeline.imaging.ties.pairs import Pair, PairMatches, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 
 #: Cells of a scene are at most so many times those wanted of its smallest overlap.
@@ -73,31 +73,31 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
     overlaps = _overlaps(views, targets)
     if not overlaps:
         raise InputError(
-            "no two of the scenes show the same ground",
+            "no two scenes overlap",
             file=views[0].intensity.source.path,
             field="images",
-            remedy="give scenes that overlap; if they do, a model leads elsewhere (`ortho info`)",
+            remedy="give scenes that overlap; if they do, check their models with `ortho info`",
         )
     block = _Block(views, targets, settings)
     for home, view in enumerate(views):
         partners = {other: shown for (first, other), shown in overlaps.items() if first == home}
         block.tie_home(home, view, partners)
     if not block.tracks:
-        said = "; ".join(
-            f"{os.path.basename(views[one.images[0]].intensity.source.path)} and "
-            f"{os.path.basename(views[one.images[1]].intensity.source.path)}: {one.reason}"
-            for one in block.pairs
+        reasons = "; ".join(
+            f"{os.path.basename(views[pair.images[0]].intensity.source.path)} and "
+            f"{os.path.basename(views[pair.images[1]].intensity.source.path)}: {pair.reason}"
+            for pair in block.pairs
         )
         raise InputError(
-            f"there are no ties: {said}",
+            f"no tie points found: {reasons}",
             file=views[0].intensity.source.path,
             field="images",
             remedy=Text(
-                "search farther (",
+                "if the models may be farther off, search farther (",
                 Setting("match.search"),
-                ") if the models may be off by more, state how wrong the heights may be (",
+                "); if the DEM is coarse, state its accuracy (",
                 Setting("surface.sigma"),
-                "), or measure tie points by hand",
+                "); or measure tie points by hand",
             ),
         )
     return block.ties()
@@ -207,7 +207,7 @@ class _Block:
                     asking[k].places[other] = matched.second[row], matched.second_covariance[row]
                     own.setdefault(k, []).append(matched.first_covariance[row])
             count = int(matched.good.sum())
-            reason = "" if count else f"none of {len(index)} places was found again"
+            reason = "" if count else f"none of {counted(len(index), 'place')} matched"
             self.pairs.append(
                 PairSummary((home, other), count, len(index), placed[other].shift, matched.components, reason)
             )

@@ -1,13 +1,13 @@
-r"""Frame camera: the whole image at one instant through one perspective centre (collinearity).
+r"""Frame camera: the whole image at one instant, through one perspective centre (collinearity).
 
 With the perspective centre :math:`(X_L, Y_L, Z_L)` and the rotation :math:`M(\omega, \phi, \kappa)` from the axes
-of the working frame to those of the camera (x right, y up in the image, z backwards: before the camera
+of the working frame to those of the camera (x right, y up in the image, z backwards; in front of the camera
 :math:`w_3 < 0`), and :math:`w = M (X - X_L)`,
 
 .. math:: x - x_0 = -f\, w_1 / w_3, \qquad y - y_0 = -f\, w_2 / w_3 .
 
-Lens, principal point and the step to pixels are in `ortho_pipeline.models.lens`, the two kinds of working frame in
-`ortho_pipeline.models.frame.working_frame`, refraction, which is optional, in `ortho_pipeline.models.light.refraction`.
+Lens, principal point and pixels are in `ortho_pipeline.models.lens`, the two working frames in
+`ortho_pipeline.models.frame.working_frame`, the optional refraction in `ortho_pipeline.models.light.refraction`.
 
 Source: Ok and Turker, equations 1-7; McGlone 1996. Symbols: X_L ... kappa, f (focal_length), x0, y0 and M as there.
 """
@@ -58,12 +58,12 @@ PARAMETERS = (*EXTERIOR, *INTERIOR)
 #: Warning for a camera whose `FrameCamera.sees_ground` is false.
 LOOKS_PAST = Notice(
     "only-a-start",
-    "by its exterior orientation the camera looks past the ground: the model only starts an adjustment to ground "
-    "control points",
+    "with this exterior orientation the camera looks past the ground. The model is only a start for an adjustment: "
+    "add control points",
 )
-#: A point that is not seen is NaN, not a warning.
+#: A point that the camera does not see is NaN, not a warning.
 _quiet = partial(np.errstate, invalid="ignore", divide="ignore", over="ignore")
-#: Around the image, from its upper left corner, in parts of its size.
+#: Corners of the image from the upper left, in parts of its size.
 _RING = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 
 
@@ -85,9 +85,9 @@ class FrameCamera(SensorModel):
     heights : (float, float)
         Lowest and highest ellipsoidal height (m) of the ground.
     refraction : bool
-        Whether rays are bent by the standard atmosphere.
+        Whether the standard atmosphere bends the rays.
     free : tuple of str
-        Names out of `PARAMETERS` that an adjustment may change; a `Prior` weights them.
+        Names of `PARAMETERS` that an adjustment may change; a `Prior` weights them.
     """
 
     kind: ClassVar[str] = "frame"
@@ -104,7 +104,7 @@ class FrameCamera(SensorModel):
     def __post_init__(self) -> None:
         exterior = np.array(self.exterior, dtype=np.float64)
         if exterior.shape != (6,) or not np.isfinite(exterior).all():
-            raise InputError("the exterior orientation has six finite numbers", field="exterior")
+            raise InputError("the exterior orientation needs six finite numbers", field="exterior")
         exterior.setflags(write=False)
         object.__setattr__(self, "exterior", exterior)
         for name, count in (("origin", 3), ("heights", 2)):
@@ -112,7 +112,7 @@ class FrameCamera(SensorModel):
         if not self.heights[0] < self.heights[1]:
             raise InputError(f"heights from {self.heights[0]} to {self.heights[1]} are not a range", field="heights")
         require_frame(self.frame, self.ground_crs)
-        object.__setattr__(self, "free", checked_names(self.free, PARAMETERS, f"out of {', '.join(PARAMETERS)}"))
+        object.__setattr__(self, "free", checked_names(self.free, PARAMETERS, f"from {', '.join(PARAMETERS)}"))
 
     # -- other ways to state the orientation -------------------------------------------------------------------------
 
@@ -120,13 +120,13 @@ class FrameCamera(SensorModel):
     def from_geocentric(
         cls, interior: Interior, position: ArrayLike, camera_from_ecef: Array | None = None, **others: Any
     ) -> Self:
-        """Make the camera of a position in ECEF metres, with its origin on the ellipsoid below.
+        """Make the camera at a position in ECEF (m), with its origin on the ellipsoid below.
 
         Parameters
         ----------
         camera_from_ecef : (3, 3), optional
-            Rotation to camera axes. Without it omega, phi and kappa are zero, the paper's start (equation 5): the
-            camera looks straight down with the top of the image to the north.
+            Rotation to camera axes. Default: omega, phi and kappa are zero as in the paper (equation 5), so the camera
+            looks straight down and the top of the image is north.
         """
         exterior, origin = exterior_of_geocentric(position, camera_from_ecef)
         return cls(interior, exterior, origin=origin, **others)
@@ -135,25 +135,25 @@ class FrameCamera(SensorModel):
     def from_map(
         cls, interior: Interior, crs: str, exterior: ArrayLike, *, frame: str = TOPOCENTRIC, **others: Any
     ) -> Self:
-        """Make the camera of an exterior orientation ``(6,)`` in a map projection, heights above the ellipsoid.
+        """Make the camera from an exterior orientation ``(6,)`` in a map projection, with ellipsoidal height.
 
-        With ``frame='topocentric'`` the angles are turned by the meridian convergence at the perspective centre and
-        the projection is used nowhere else; with ``'map'`` they are taken as they are.
+        With ``frame='topocentric'`` the angles are rotated by the meridian convergence at the perspective centre, and
+        the projection is not used further. With ``'map'`` they are used as they are.
         """
-        given = np.asarray(exterior, dtype=np.float64)
+        orientation = np.asarray(exterior, dtype=np.float64)
         require_metres(crs)
         if frame == MAP:
-            return cls(interior, given, frame=MAP, ground_crs=crs, **others)
-        return cls.from_geocentric(interior, *geocentric_of_map(crs, given), **others)
+            return cls(interior, orientation, frame=MAP, ground_crs=crs, **others)
+        return cls.from_geocentric(interior, *geocentric_of_map(crs, orientation), **others)
 
     @classmethod
     def from_roll_pitch_yaw(
         cls, interior: Interior, position: ArrayLike, roll: float, pitch: float, yaw: float, **others: Any
     ) -> Self:
-        """Make the camera of a platform at lon, lat (degrees), ellipsoidal height with angles in radians.
+        """Make the camera of a platform at lon, lat (degrees), ellipsoidal height, with angles in radians.
 
-        The platform's axes are forward, right, down; yaw is the heading from true north clockwise, pitch lifts the
-        nose, roll lowers the right wing. At zero the camera looks straight down with the image's top forward.
+        The platform's axes are forward, right, down. Yaw is the heading clockwise from true north, positive pitch lifts
+        the nose, positive roll lowers the right wing. At zero the camera looks straight down, image top forward.
         """
         return cls.from_geocentric(interior, *geocentric_of_platform(position, roll, pitch, yaw), **others)
 
@@ -175,21 +175,21 @@ class FrameCamera(SensorModel):
 
     @cached_property
     def domain(self) -> tuple[Array, Array]:
-        """Centre and half-size of the box that the frame sees between `heights`, as far as rays are not too flat."""
+        """Centre and half-size of the box that the camera sees between `heights`, without too flat rays."""
         seen = self._seen
-        # Start values may look anywhere; what they are meant for is then below the camera.
+        # Start values may look anywhere; then the box is below the camera.
         return box_around(seen if len(seen) else self._below(), self.heights)
 
     @property
     def sees_ground(self) -> bool:
-        """Whether any of its rays meets the ground between `heights`; start values may look past it."""
+        """Whether any ray meets the ground between `heights`; start values may look past it."""
         return len(self._seen) > 0
 
     @property
     def corners(self) -> Array:
-        """Ground points ``(8, 3)`` of the corners of the image at both ends of `heights`; NaN where none is seen.
+        """Ground points ``(8, 3)`` of the corners of the image at both ends of `heights`; NaN if a ray misses.
 
-        The box of `domain` lies along the axes of the ground: its corners are far outside of an image that is not.
+        The box of `domain` is parallel to the ground axes, so its corners are far outside a rotated image.
         """
         size = (self.interior.width, self.interior.height)
         image = _RING * size
@@ -266,11 +266,11 @@ class FrameCamera(SensorModel):
         return partials[:, :, [PARAMETERS.index(name) for name in self.free]]
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
-        """Follow the rays of image points ``(N, 2)`` to an ellipsoidal height; NaN where they do not get there."""
+        """Intersect the rays of image points ``(N, 2)`` with an ellipsoidal height; NaN where they miss."""
         image = as_image(image)
-        wanted = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(image),))
+        heights = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(image),))
         with _quiet():
-            return self._outside.follow(rays(self.interior, image), wanted)
+            return self._outside.follow(rays(self.interior, image), heights)
 
     @cached_property
     def _outside(self) -> Exterior:
@@ -284,7 +284,7 @@ class FrameCamera(SensorModel):
             return seen[self._outside.steepness(seen) > FLATTEST]
 
     def _below(self) -> Array:
-        """Return the corners ``(4, 3)`` of a square under the camera as wide as the field of view."""
+        """Return the corners ``(4, 3)`` of a square below the camera, as wide as the field of view."""
         centre = self.perspective_centre
         reach = max(abs(centre[2] - sum(self.heights) / 2), 1.0) * math.tan(min(self.interior.field_of_view, 1.4))
         corners = (2 * _RING - 1) * reach / self.working_frame.metres_per_unit(centre)
@@ -301,10 +301,10 @@ class FrameCamera(SensorModel):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Make the model from what `to_dict` returned."""
+        """Make the model from the result of `to_dict`."""
         interior, exterior = data.get("interior"), data.get("exterior")
         if not isinstance(interior, dict) or not isinstance(exterior, dict) or set(exterior) != set(EXTERIOR):
-            raise InputError("a frame camera has an interior and an exterior orientation", field="interior, exterior")
+            raise InputError("a frame camera needs an interior and an exterior orientation", field="interior, exterior")
         values = np.array([exterior[name] for name in EXTERIOR], dtype=np.float64)
         return super().from_dict({**data, "interior": Interior(**interior), "exterior": values})
 
@@ -312,5 +312,5 @@ class FrameCamera(SensorModel):
 def _finite(values: tuple[float, ...], count: int, field: str) -> tuple[float, ...]:
     values = tuple(float(value) for value in values)
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{values}: not {counted(count, 'finite number')}", field=field)
+        raise InputError(f"{values} is not {counted(count, 'finite number')}", field=field)
     return values

@@ -18,12 +18,12 @@ _REFRACTION_STEPS = 12
 
 
 def directions(w: Array) -> Array:
-    """Return the tangents to the right and downwards ``(N, 2)`` of vectors in camera axes ``(N, 3)``."""
+    """Return the tangents ``(N, 2)``, right and down, of vectors in camera axes ``(N, 3)``."""
     return np.stack([-w[:, 0] / w[:, 2], w[:, 1] / w[:, 2]], axis=1)
 
 
 def rays(interior: Interior, image: Array) -> Array:
-    """Return vectors in camera axes ``(N, 3)``, one long along the axis, of the rays of image points ``(N, 2)``."""
+    """Return vectors ``(N, 3)`` in camera axes of the rays of image points ``(N, 2)``, with z = -1."""
     u, v = interior.directions_of(image).T
     return np.stack([u, -v, -np.ones_like(u)], axis=1)
 
@@ -48,7 +48,7 @@ class Exterior:
         `EXTERIOR` in the working frame, metres and radians.
     frame : WorkingFrame
     refraction : bool
-        Whether rays are bent by the standard atmosphere.
+        Whether the standard atmosphere bends the rays.
     """
 
     orientation: Array
@@ -68,7 +68,7 @@ class Exterior:
         return rotation
 
     def vectors(self, ground: Array) -> Array:
-        """Return the vectors ``(N, 3)`` from camera to points in its axes; NaN where it cannot see them."""
+        """Return the vectors ``(N, 3)`` from the camera to points, in its axes; NaN if it cannot see them."""
         place = self.frame.from_ground(ground)
         line = place - self.centre
         hidden = self.frame.behind_the_earth(ground, place, line)
@@ -91,14 +91,14 @@ class Exterior:
         return self.rotation @ moved
 
     def by_orientation(self, ground: Array, w: Array) -> Array:
-        """Return d(vectors)/d(orientation) as ``(N, 3, 6)`` of points whose vectors are `w`."""
+        """Return d(vectors)/d(orientation) as ``(N, 3, 6)`` of points with the vectors `w`."""
         moved = np.empty((len(ground), 3, 6))
         moved[:, :, :3] = -self.rotation
         if self.refraction:
             up = self.frame.verticals(ground)
             correction = self._corrections(ground, self.frame.from_ground(ground), up)
             moved[:, :, :3] += (up @ self.rotation.T)[:, :, None] * correction.by_centre[:, None]
-        # What omega, phi and kappa turn about, seen in the camera: phi about the second axis after kappa.
+        # The axes of omega, phi and kappa in the camera: phi turns about the second axis after kappa.
         kappa = float(self.orientation[5])
         second = np.array([math.sin(kappa), math.cos(kappa), 0.0])
         for column, axis in enumerate((self.rotation[:, 0], second, np.array([0.0, 0.0, 1.0])), start=3):
@@ -106,7 +106,7 @@ class Exterior:
         return moved
 
     def follow(self, seen: Array, height: Array) -> Array:
-        """Follow rays in camera axes ``(N, 3)`` to ellipsoidal heights ``(N,)``; NaN where they do not get there."""
+        """Intersect rays in camera axes ``(N, 3)`` with ellipsoidal heights ``(N,)``; NaN where they miss."""
         way = seen @ self.rotation
         way /= np.linalg.norm(way, axis=1)[:, None]
         ground = self._meet(way, height, 0.0)
@@ -126,7 +126,7 @@ class Exterior:
         return np.asarray(np.abs((line * self.frame.verticals(ground)).sum(axis=1)) / np.linalg.norm(line, axis=1))
 
     def _meet(self, way: Array, height: Array, correction: Array | float) -> Array:
-        """Return where straight lines meet the heights plus a correction, as points at these heights."""
+        """Return where straight lines meet heights plus a correction, as points at these heights."""
         ground = self.frame.meet(self.centre, way, height + correction)
         ground[np.isfinite(ground[:, 2]), 2] = height[np.isfinite(ground[:, 2])]
         return ground

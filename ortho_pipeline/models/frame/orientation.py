@@ -1,4 +1,4 @@
-"""Exterior orientations: their parameters, and the ways in which they are stated."""
+"""Exterior orientations: their parameters, and conversions between the ways to state them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC
 #: Parameters of the exterior orientation: metres and radians in the working frame.
 EXTERIOR = ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
 
-#: How far up to its camera ground may reach of which nothing is known: an aeroplane's ground is not on its wings.
+#: Highest ground below a camera, as part of its altitude, if nothing is known of the terrain.
 _BELOW = 0.9
 
 
@@ -31,8 +31,8 @@ def exterior_of_geocentric(
 ) -> tuple[Array, tuple[float, float, float]]:
     """Return the topocentric exterior ``(6,)`` of a position in ECEF, and its origin on the ellipsoid below.
 
-    `camera_from_ecef` is the rotation ``(3, 3)`` to camera axes; without it the camera looks straight down with the
-    top of the image to the north.
+    `camera_from_ecef` is the rotation ``(3, 3)`` to camera axes. Without it the camera looks straight down, and the top
+    of the image is north.
     """
     lon, lat, height = geodetic(np.asarray(position, dtype=np.float64)[None])[0].tolist()
     axes = enu_from_ecef(np.array([[lon, lat]]))[0]
@@ -41,24 +41,24 @@ def exterior_of_geocentric(
 
 
 def heights_below(position: ArrayLike, heights: tuple[float, float]) -> tuple[float, float]:
-    """Return a range of heights (m) of the ground whose upper end is clearly below a camera at a position in ECEF.
+    """Return a range of ground heights (m) whose upper end is clearly below a camera at a position in ECEF (m).
 
     Raises
     ------
     InputError
-        If the camera lies below all of it.
+        If the camera is below all of it.
     """
     low, high = heights
     altitude = float(geodetic(np.asarray(position, dtype=np.float64)[None])[0, 2])
     if not altitude > low:
-        raise InputError(f"a camera {altitude:.0f} m high sees no ground", field="position")
+        raise InputError(f"a camera at a height of {altitude:.0f} m sees no ground", field="position")
     return low, min(high, low + _BELOW * (altitude - low))
 
 
 def geocentric_of_map(crs: str, exterior: Array) -> tuple[Array, Array]:
-    """Return the position in ECEF ``(3,)`` and the rotation ``(3, 3)`` from there to the camera of a map's exterior.
+    """Return position in ECEF ``(3,)`` and rotation to the camera ``(3, 3)`` of an exterior orientation in a map.
 
-    The angles are turned by the meridian convergence at the perspective centre.
+    The angles are rotated by the meridian convergence at the perspective centre.
     """
     to_geographic = ground_transform(crs, GEOGRAPHIC)
     steps = np.array([[0, 0], [100.0, 0], [-100.0, 0], [0, 100.0], [0, -100.0]])
@@ -72,7 +72,7 @@ def geocentric_of_map(crs: str, exterior: Array) -> tuple[Array, Array]:
 
 
 def geocentric_of_platform(position: ArrayLike, roll: float, pitch: float, yaw: float) -> tuple[Array, Array]:
-    """Return the position in ECEF ``(3,)`` and the rotation ``(3, 3)`` from there to the camera of a platform.
+    """Return position in ECEF ``(3,)`` and rotation to the camera ``(3, 3)`` of a platform.
 
     See `FrameCamera.from_roll_pitch_yaw`.
     """
@@ -85,7 +85,15 @@ def geocentric_of_platform(position: ArrayLike, roll: float, pitch: float, yaw: 
 def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:
     """Return the rotation ``(3, 3)`` from north, east, down to camera axes, for a camera that looks down.
 
-    See `FrameCamera.from_roll_pitch_yaw`; for a satellite the same holds from the orbital frame along, right, down.
+    Angles (rad) are those of `FrameCamera.from_roll_pitch_yaw`. For a satellite it is the rotation from the orbital
+    axes along, right, down.
+
+    Examples
+    --------
+    >>> camera_from_platform(0.0, 0.0, 0.0)
+    array([[ 0.,  1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0., -1.]])
     """
     sr, cr, sp, cp, sy, cy = (f(a) for a in (roll, pitch, yaw) for f in (math.sin, math.cos))
     platform_from_level = np.array(
@@ -100,7 +108,13 @@ def camera_from_platform(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def exterior_sigmas(position: float | None, angle: float | None) -> dict[str, float]:
-    """Return standard deviations by parameter: of the position (m) and the angles (rad), as far as they are known."""
+    """Return standard deviations of the exterior orientation by parameter, from those of position (m) and angles (rad).
+
+    Examples
+    --------
+    >>> exterior_sigmas(5.0, None)
+    {'X_L': 5.0, 'Y_L': 5.0, 'Z_L': 5.0}
+    """
     known = {EXTERIOR[:3]: position, EXTERIOR[3:]: angle}
     return {name: sigma for names, sigma in known.items() if sigma is not None for name in names}
 

@@ -1,10 +1,10 @@
 """Resection in space: the exterior orientation of a frame camera from ground points, without start values.
 
-Three points and their directions leave up to four positions (P3P, Grunert's quartic). Each of a number of well-spread
-triples is solved, every solution is judged by the median miss over *all* points, so that gross errors and the false
-solutions lose, and the best few are refined by damped least squares. The result is a start for `estimation.fit`.
+Three points and their directions give up to four positions (P3P, Grunert's quartic). Many well-spread triples are
+solved. The median miss over *all* points ranks the solutions, which excludes gross errors and false solutions. Damped
+least squares refines the best few. The result is a start for `estimation.fit`.
 
-With a known position (an ephemeris) only the rotation is missing, which three or more directions give in closed form.
+With a known position (an ephemeris), three or more directions give the rotation in closed form.
 
 Source: Haralick, Lee, Ottenberg and Noelle 1994 (P3P); Kabsch 1976 (rotation). Symbols as in Haralick: sides a, b, c,
 angles alpha, beta, gamma, s2 = u s1, s3 = v s1.
@@ -28,7 +28,7 @@ from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
-#: Triples that are tried, and solutions that are refined.
+#: Numbers of triples to solve, and of solutions to refine.
 _TRIPLES, _REFINED = 60, 8
 #: Triangles flatter than this (height over longest side, on the ground or in the image) are not solved.
 _FLAT = 0.05
@@ -43,18 +43,18 @@ def resect(
     heights: tuple[float, float] | None = None,
     refraction: bool = False,
 ) -> FrameCamera:
-    """Find the camera that sees the control points where they were measured, from nothing.
+    """Return the camera that sees the control points where they were measured, without start values.
 
     Parameters
     ----------
     points : Points
         At least 4 control points with heights (3 if the position is given).
     map_crs : str, optional
-        Work in this map projection; in a topocentric frame about the points without it.
+        Work in this map projection. Default: a topocentric frame about the points.
     position : (3,), optional
         Approximate perspective centre: lon, lat, ellipsoidal height, or map coordinates and height with `map_crs`.
     heights : (float, float), optional
-        Range of heights of the ground; without it that of the points, widened.
+        Range of ground heights (m). Default: that of the points, extended.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def resect(
         starts = _best(list(_solutions(place, bearings)), place, bearings)
     if not starts:
         raise DegeneratePoints(
-            "the control points lie on a line, on the ground or in the image",
+            "the control points are on one line, on the ground or in the image",
             file=points.source or None,
             remedy="spread the points over the image",
         )
@@ -87,14 +87,14 @@ def resect(
     best = int(np.argmin(misses))
     if not math.isfinite(misses[best]) or misses[best] > 0.05 * math.hypot(interior.width, interior.height):
         raise NotConverged(
-            "no orientation brings these points and this camera together",
-            remedy="check focal length and pixel pitch, and the points (column, row; x, y, height)",
+            "no orientation of this camera fits the control points",
+            remedy="check focal length, pixel pitch, and the points (column, row; x, y, height)",
         )
     return refined[best]._replace(heights=heights or _heights(refined[best], control))
 
 
 def _blank(control: Points, interior: Interior, map_crs: str | None, refraction: bool) -> FrameCamera:
-    """Return a camera in the working frame, whose orientation means nothing yet."""
+    """Return a camera in the working frame, with a meaningless orientation."""
     low, high = control.ground[:, 2].min(), control.ground[:, 2].max()
     middle = control.ground.mean(axis=0)
     lon = control.ground[:, 0]
@@ -138,7 +138,7 @@ def _solutions(place: Array, bearings: Array) -> Iterator[tuple[Array, Array]]:
 
 
 def _triples(place: Array, bearings: Array) -> list[Array]:
-    """Return the largest and best-shaped triangles in the image out of many, each an index ``(3,)``."""
+    """Return the largest well-shaped triangles in the image out of many, each as indices ``(3,)``."""
     usable = np.flatnonzero(np.isfinite(bearings).all(axis=1))
     generator = np.random.default_rng(0)  # the same points give the same answer every time
     if math.comb(len(usable), 3) <= 4 * _TRIPLES:
@@ -183,7 +183,7 @@ def _grunert(ground: Array, rays: Array) -> Iterator[Array]:
         (1 + q) ** 2 - 4 * a_b * cos_c**2,
     ]
     for root in np.roots(quartic):
-        # Noise makes a double root complex: its real part is still a start.
+        # Noise makes a double root complex; its real part is still a start.
         v = float(root.real)
         if v <= 0 or abs(root.imag) > 0.1 * v:
             continue
@@ -210,7 +210,7 @@ def _best(solutions: list[tuple[Array, Array]], place: Array, bearings: Array) -
 
 
 def _refine(camera: FrameCamera, control: Points) -> FrameCamera:
-    """Adjust the exterior orientation to the points, gross errors softened; the start itself if that fails."""
+    """Adjust the exterior orientation to the points with a robust loss; return the start if that fails."""
     from scipy.optimize import least_squares
 
     seen = np.isfinite(camera.ground_to_image(control.ground)).all(axis=1)
@@ -225,10 +225,10 @@ def _refine(camera: FrameCamera, control: Points) -> FrameCamera:
         return camera.with_params(params).param_partials(ground).reshape(-1, 6)
 
     try:
-        found = least_squares(misfit, camera.params, slope, x_scale="jac", loss="soft_l1", f_scale=3.0, max_nfev=50)
+        solution = least_squares(misfit, camera.params, slope, x_scale="jac", loss="soft_l1", f_scale=3.0, max_nfev=50)
     except (ValueError, np.linalg.LinAlgError):
-        return camera  # a step behind the points: this start was none
-    return camera.with_params(found.x)
+        return camera  # a step behind the points: a useless start
+    return camera.with_params(solution.x)
 
 
 def _median_miss(camera: FrameCamera, control: Points) -> float:

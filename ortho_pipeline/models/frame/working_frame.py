@@ -1,10 +1,9 @@
-"""Working frames, in which the exterior orientation of a frame camera is stated.
+"""Working frames of the exterior orientation of a frame camera.
 
-- **topocentric**: east, north, up in metres from an origin on or near the ground. The ground is EPSG:4979 and goes
-  through ECEF in closed form, so that the curvature of the Earth is right by construction; or
-- **map**: the coordinates of a map projection and ellipsoidal heights, as Ok and Turker worked; its error grows with
-  the square of the footprint (d^2 / 2R: 53 m at the edge of a scene of 52 km) and is partly taken up by the
-  orientation.
+- **topocentric**: east, north, up in metres from an origin on or near the ground. The ground is EPSG:4979; conversion
+  through ECEF in closed form makes the curvature of the Earth exact.
+- **map**: map coordinates and ellipsoidal heights, as in Ok and Turker. The error grows with the square of the
+  footprint (d^2 / 2R: 53 m at the edge of a scene of 52 km); the orientation absorbs a part of it.
 """
 
 from __future__ import annotations
@@ -25,16 +24,16 @@ from ortho_pipeline.geodesy.ellipsoid import (
 )
 from ortho_pipeline.models.base import Array
 
-#: The frames that a camera can have its orientation in: tangential to the ellipsoid below it, or a map projection.
+#: The two frames: tangential to the ellipsoid below the camera, or a map projection.
 TOPOCENTRIC, MAP = "topocentric", "map"
 #: The ground of a topocentric frame.
 GEOGRAPHIC = "EPSG:4979"
 
 
 class WorkingFrame(Protocol):
-    """Cartesian metres in which a camera stands, and their relation to the ground ``(N, 3)``."""
+    """Cartesian coordinates (m) of a camera, and their relation to the ground ``(N, 3)``."""
 
-    #: Of the Earth in this frame (1/m): how fast the vertical turns with the place.
+    #: Curvature of the Earth in this frame (1/m): how fast the vertical turns with the position.
     curvature: float
 
     def from_ground(self, ground: Array) -> Array:
@@ -50,13 +49,13 @@ class WorkingFrame(Protocol):
         """Return the upward directions at ground points in this frame ``(N, 3)``."""
 
     def behind_the_earth(self, ground: Array, place: Array, line: Array) -> np.ndarray:
-        """Tell which lines of sight ``(N, 3)``, to points `place`, go through the Earth before they get there."""
+        """Return which lines of sight ``(N, 3)`` pass through the Earth before they reach their points `place`."""
 
     def meet(self, position: Array, direction: Array, height: Array) -> Array:
-        """Follow rays ``(N, 3)`` from a position ``(3,)`` to ellipsoidal heights ``(N,)``; NaN where they miss."""
+        """Intersect rays ``(N, 3)`` from a position ``(3,)`` with ellipsoidal heights ``(N,)``; NaN where they miss."""
 
     def metres_per_unit(self, position: Array) -> Array:
-        """Return how long the units of x and y of the ground are at a position on it, ``(2,)`` in metres."""
+        """Return the length (m) ``(2,)`` of a unit of x and of y of the ground at a position."""
 
 
 class Topocentric:
@@ -86,7 +85,7 @@ class Topocentric:
         return np.asarray(enu_from_ecef(ground)[:, 2] @ self.axes.T)
 
     def behind_the_earth(self, ground: Array, place: Array, line: Array) -> np.ndarray:
-        """Tell which lines of sight go through the Earth before they reach the point."""
+        """Return which lines of sight pass through the Earth before they reach the point."""
         radial = place + self.axes @ self.zero
         length2 = (line**2).sum(axis=1)
         # Distance from the point back along the line to where it is nearest to the Earth's centre, times its length.
@@ -96,10 +95,10 @@ class Topocentric:
         return np.asarray((back > 0) & (back < length2) & (nearest2 < sea_level**2))
 
     def meet(self, position: Array, direction: Array, height: Array) -> Array:
-        """Follow rays from a position to ellipsoidal heights; NaN where they miss."""
+        """Intersect rays from a position with ellipsoidal heights; NaN where they miss."""
         start = np.broadcast_to(self.zero + position @ self.axes, direction.shape)
         ground = meet_height(start, direction @ self.axes, height)
-        # Beside the antimeridian, stay on the side of the origin.
+        # Near the antimeridian, stay on the side of the origin.
         ground[:, 0] = self.origin[0] + np.remainder(ground[:, 0] - self.origin[0] + 180.0, 360.0) - 180.0
         return ground
 
@@ -126,15 +125,15 @@ class ProjectionFrame:
         return np.broadcast_to(np.eye(3), (len(ground), 3, 3))
 
     def verticals(self, ground: Array) -> Array:
-        """Return the upward directions ``(N, 3)``, all alike."""
+        """Return the upward directions ``(N, 3)``, which are all equal."""
         return np.broadcast_to([0.0, 0.0, 1.0], ground.shape)
 
     def behind_the_earth(self, ground: Array, place: Array, line: Array) -> np.ndarray:
-        """Tell that nothing is behind a flat Earth."""
+        """Return False for each point: a flat Earth hides nothing."""
         return np.zeros(len(ground), dtype=bool)
 
     def meet(self, position: Array, direction: Array, height: Array) -> Array:
-        """Follow rays from a position to heights; NaN where they miss."""
+        """Intersect rays from a position with heights; NaN where they miss."""
         distance = (height - position[2]) / direction[:, 2]
         ground = position + distance[:, None] * direction
         ground[~(distance > 0)] = np.nan
@@ -146,12 +145,12 @@ class ProjectionFrame:
 
 
 def require_frame(frame: str, ground_crs: str) -> None:
-    """Raise `InputError` unless there is such a working frame, for ground in such a CRS."""
+    """Raise `InputError` unless the working frame exists and suits the CRS of the ground."""
     if frame not in (TOPOCENTRIC, MAP):
-        raise InputError(f"{frame!r} is not a working frame", field="frame", remedy=f"{TOPOCENTRIC} or {MAP}")
+        raise InputError(f"{frame!r} is not a working frame", field="frame", remedy=f"use {TOPOCENTRIC} or {MAP}")
     if (frame == TOPOCENTRIC) != (ground_crs == GEOGRAPHIC):
         raise InputError(
-            f"a {frame} frame does not go with ground in {ground_crs}",
+            f"a {frame} frame cannot be used with ground in {ground_crs}",
             field="ground_crs",
-            remedy=f"{GEOGRAPHIC} for {TOPOCENTRIC}, a projected CRS for {MAP}",
+            remedy=f"use {GEOGRAPHIC} for {TOPOCENTRIC}, a projected CRS for {MAP}",
         )

@@ -1,4 +1,4 @@
-"""What light does between ground and camera: the air bends its way, and a camera that moves sees it come aslant."""
+"""Light between ground and camera: refraction by the air, and aberration by the motion of the camera."""
 
 from __future__ import annotations
 

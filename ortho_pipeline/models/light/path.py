@@ -1,15 +1,15 @@
-r"""The way of light to a camera in space, where a vendor's angles leave it out.
+r"""The path of light to a camera in space, for vendors' angles that do not include it.
 
 A camera at S that moves with v over the turning Earth sees the point P along
 
 .. math:: P + \ell\, n - S + |P - S|\, v / c, \qquad \ell = s\, \nu_0 e^{-h/s} / \cos^2 z ,
 
-with n upwards at P, z the zenith angle of the line there and h the height of P: refraction lifts the point
-(`ortho_pipeline.models.light.refraction`, far above the air), and the velocity, which is that of the aberration less
-the way of the ground while the light is under way, moves it forwards. From 600 km that is 20 m, and 2.5 m of height.
+with n up at P, z the zenith angle of the line there, and h the height of P. Refraction lifts the point
+(`ortho_pipeline.models.light.refraction`, far above the air). Aberration, less the motion of the ground during the
+travel of the light, moves it forwards. From 600 km that is 20 m, and 2.5 m of height.
 
-Left out is the turn of the Earth between ground and camera while the light is under way, 0.2 m at most (it is the same
-for the whole image), and terms of v²/c², a millimetre.
+Not included: the rotation of the Earth during the travel of the light, at most 0.2 m and the same for the whole image;
+and terms of v²/c², a millimetre.
 
 Source: Greslou, de Lussy and Montel 2008, "Light aberration effect in HR geometric model"; the signs were found with
 WorldView-1 (`ortho_maxar.isd`).
@@ -31,11 +31,12 @@ LIGHT = 299_792_458.0
 
 @dataclass(frozen=True)
 class LightPath:
-    """Which of the two a model has of its own; a vendor's angles may have them already.
+    """Whether a model adds aberration and refraction; a vendor's angles may already include them.
 
     Parameters
     ----------
     aberration, refraction : bool
+        Default: both are in the angles.
     """
 
     aberration: bool = False
@@ -43,31 +44,32 @@ class LightPath:
 
     def __post_init__(self) -> None:
         if not (isinstance(self.aberration, bool) and isinstance(self.refraction, bool)):
-            raise InputError("aberration and refraction are true or false", field="light")
+            raise InputError("aberration and refraction must be true or false", field="light")
 
     @property
     def numbers(self) -> tuple[float, float]:
-        """What a compiled projection needs: bend (m) at the ellipsoid, seconds per metre of light; zero for none."""
+        """Bend (m) at the ellipsoid and seconds per metre of light, for the compiled projection; zero for none."""
         return SCALE_HEIGHT * REFRACTIVITY * self.refraction, self.aberration / LIGHT
 
     def lift(self, height: Array, cosine: Array) -> Array:
-        """Return by how much (m) points ``(N,)`` at heights appear higher under zenith angles with this cosine."""
+        """Return how much (m) higher points ``(N,)`` at a height appear, by the cosine of the zenith angle."""
         bend = self.numbers[0] * np.exp(-np.asarray(height) / SCALE_HEIGHT)
         return np.asarray(bend / np.maximum(cosine, FLATTEST) ** 2)
 
     def rise(self, height: Array, cosine: Array) -> Array:
-        """Return by how much ``(N,)`` the apparent height grows with the height."""
+        """Return the derivative ``(N,)`` of the apparent height by the height."""
         return np.asarray(1.0 - self.lift(height, cosine) / SCALE_HEIGHT)
 
     def apparent(self, line: Array, velocity: Array, up: Array, height: Array) -> Array:
-        """Return along what ``(N, 3)`` a camera sees points that lie at `line` ``(N, 3)`` from it.
+        """Return the vectors ``(N, 3)`` along which a camera sees points.
 
         Parameters
         ----------
         line, velocity, up : (N, 3)
-            From the camera to the points (m), of the camera over the Earth (m/s), upwards at the points; in any axes.
+            Vectors from the camera to the points (m), velocity of the camera over the Earth (m/s), up at the points; in
+            any axes.
         height : (N,)
-            Of the points (m).
+            Heights of the points (m).
         """
         if self.refraction:
             cosine = -(line * up).sum(axis=1) / np.linalg.norm(line, axis=1)
@@ -77,7 +79,7 @@ class LightPath:
         return line
 
     def straight(self, direction: Array, velocity: Array) -> Array:
-        """Return the unit vectors ``(N, 3)`` along which light came that is seen along unit vectors `direction`."""
+        """Return the unit vectors ``(N, 3)`` along which light arrived that is seen along unit vectors `direction`."""
         if not self.aberration:
             return direction
         slant = velocity / LIGHT
@@ -90,5 +92,5 @@ class LightPath:
         return asdict(self)
 
 
-#: Of angles that hold both, or of a vendor who locates without.
+#: For angles that include both, or a vendor that uses neither.
 AS_GIVEN = LightPath()

@@ -1,12 +1,12 @@
-r"""Refraction correction: how far above a point the straight line must end whose image is that of the bent ray.
+r"""Refraction correction: the height above a point at which a straight line has the same image as the bent ray.
 
-With refractivity :math:`\nu(h) = \nu_0 e^{-h/s}`, camera height H, point height h, and z the zenith angle of the ray at
-the point, that is :math:`B / \cos^2 z` with
+With refractivity :math:`\nu(h) = \nu_0 e^{-h/s}`, camera height H, point height h, and zenith angle z of the ray at the
+point, it is :math:`B / \cos^2 z` with
 
-.. math:: B = \int_h^H \nu\, dh - \nu(H) (H - h),
+.. math:: B = \int_h^H \nu\, dh - \nu(H) (H - h).
 
-which moves the image point outwards by the angle between chord and tangent of the bent ray. For 6 km over sea level
-that is 59 µrad per tan z, as Saastamoinen has it; from space it is 2.5 m of height.
+It moves the image point outwards by the angle between chord and tangent of the bent ray. From 6 km above sea level this
+is 59 µrad per tan z, as in Saastamoinen; from space it is 2.5 m of height.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 
 from ortho_pipeline.models.base import Array
 
-#: Refractivity of air at the ellipsoid, and the height (m) over which it falls by e.
+#: Refractivity of air at the ellipsoid, and the height (m) over which it decreases by a factor e.
 REFRACTIVITY, SCALE_HEIGHT = 2.77e-4, 9200.0
-#: Rays flatter than this (cosine of the zenith angle) belong to no useful part of the scene.
+#: Flatter rays (cosine of the zenith angle) see no useful part of the scene.
 FLATTEST = 0.17
 
 
@@ -38,18 +38,18 @@ class RefractionCorrection(NamedTuple):
 def refraction_correction(
     heights: Array, place: Array, up: Array, *, centre: Array, top: float, curvature: float
 ) -> RefractionCorrection:
-    """Return the correction of points as a camera sees them.
+    """Return the correction of points that a camera sees.
 
     Parameters
     ----------
     heights : (N,)
-        Of the points above the ellipsoid (m).
+        Ellipsoidal heights of the points (m).
     place, up : (N, 3)
         The points and the upward directions there, in a Cartesian frame (m).
     centre, top : (3,), float
         The camera in that frame, and its ellipsoidal height.
     curvature : float
-        How fast the upward direction turns with the place (1/m).
+        How fast the upward direction turns with the position (1/m).
     """
     line = centre - place
     distance = np.linalg.norm(line, axis=1)[:, None]
@@ -59,7 +59,7 @@ def refraction_correction(
     bend = SCALE_HEIGHT * (below - above) - above * (top - heights)
     by_cosine = (-2 * bend / cosine**3)[:, None]
     by_towards = (up - cosine[:, None] * towards) / distance
-    # The vertical at the point turns with it, by the curvature of the Earth.
+    # The vertical turns as the point moves, by the curvature of the Earth.
     by_point = by_cosine * (curvature * (towards - cosine[:, None] * up) - by_towards)
     by_centre = by_cosine * by_towards + (above / SCALE_HEIGHT * (top - heights) / cosine**2)[:, None] * up
     return RefractionCorrection(bend / cosine**2, (above - below) / cosine**2, by_point, by_centre)

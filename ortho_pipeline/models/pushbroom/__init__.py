@@ -1,4 +1,4 @@
-"""The line scanner: orbit and attitude as splines, lines of the camera, start from metadata, constraints."""
+"""The line scanner: orbit and attitude as splines, line camera, start values from metadata, constraints."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 r"""Prior knowledge of a satellite's path and attitude, as pseudo-observations.
 
-- `Observations`: tables of the vendor (positions, angles, or their rates), each value with its sigma.
-- `OrbitShape`: the soft constraints of an almost circular orbit about the Earth's centre. At times :math:`t_k`:
+- `Observations`: a vendor's tables (positions, angles, or their rates), each value with its sigma.
+- `OrbitShape`: soft constraints of an almost circular orbit about the Earth's centre. At times :math:`t_k`:
 
   - in a plane through the Earth's centre: :math:`n \cdot S(t_k) = 0` with
     :math:`n = S(t_F) \times S(t_L) / |S(t_F) \times S(t_L)|`, first and last row;
@@ -25,13 +25,13 @@ from ortho_pipeline.models.pushbroom.splines import Spline
 
 #: Position (or velocity: derivative 1) in ECEF ``(N, 3)`` at times ``(N,)``, and its partials ``(N, 3, P)``.
 Path = Callable[[Array, int], tuple[Array, Array]]
-#: Times at which the shape of an orbit is asked for: one scene needs two.
+#: Largest number of times for the shape of an orbit; one scene needs two.
 MOST_SAMPLES = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Values of a spline, or of its derivative, known at times beforehand.
+    """Known values of a spline, or of its derivative, at given times.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ class Observations:
     values, sigma : (k, 3)
         In the unit of the spline (per second for a derivative).
     derivative : {0, 1}
-        What is observed: the value or its rate.
+        0: the value is observed; 1: its rate.
     fictitious : bool
-        True if nobody measured it: the sigma is then a guess of how far off the spline may be.
+        True if they are not measured; the sigma is then an assumption.
     """
 
     times: Array
@@ -55,19 +55,19 @@ class Observations:
         times = np.array(self.times, dtype=np.float64)
         values, sigma = (np.array(value, dtype=np.float64) for value in (self.values, self.sigma))
         if times.ndim != 1 or values.shape != (len(times), 3) or sigma.shape != values.shape:
-            raise InputError("observations have k times and k x 3 values and sigmas", field="observations")
+            raise InputError("observations need k times, and k x 3 values and sigmas", field="observations")
         if not (np.isfinite(times).all() and np.isfinite(values).all() and np.isfinite(sigma).all()):
             raise InputError("an observation is not finite", field="observations")
         if not (sigma > 0).all() or self.derivative not in (0, 1):
-            raise InputError("sigmas are positive, and values or rates are observed", field="observations")
+            raise InputError("sigmas must be positive, and values or rates must be observed", field="observations")
         if not isinstance(self.fictitious, bool):
-            raise InputError(f"fictitious is true or false, not {self.fictitious!r}", field="fictitious")
+            raise InputError(f"fictitious must be true or false, not {self.fictitious!r}", field="fictitious")
         for name, value in (("times", times), ("values", values), ("sigma", sigma)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
     def of(self, spline: Spline, first: int, count: int) -> Constraints:
-        """Return the pseudo-observations of a spline whose coefficients are parameters `first` ... of `count`."""
+        """Return the pseudo-observations of a spline; its coefficients start at parameter `first` of `count`."""
         jacobian = np.zeros((len(self.times), 3, count))
         basis = spline.basis(self.times, self.derivative)
         for axis in range(3):
@@ -84,18 +84,18 @@ class Observations:
 
 @dataclass(frozen=True)
 class OrbitShape:
-    """Soft constraints of a path, fictitious observations all; None leaves one out.
+    """Soft constraints of a path: fictitious observations. None skips a constraint.
 
     Parameters
     ----------
     plane : float, optional
         Sigma (m) of the distance from the plane through the Earth's centre and both ends.
     circular : float, optional
-        Sigma (rad) of the angle between position and velocity beyond a right one.
+        Sigma (rad) of the deviation from a right angle between position and velocity.
     radius, radius_sigma : float, optional
-        Distance (m) from the Earth's centre in the middle of the scene.
+        Distance (m) from the Earth's centre in the middle of the scene, and its sigma.
     samples : int
-        At how many times plane and circle are asked for.
+        Number of times at which plane and circle are observed.
     """
 
     plane: float | None = None
@@ -105,13 +105,15 @@ class OrbitShape:
     samples: int = 2
 
     def __post_init__(self) -> None:
-        given = [value for value in (self.plane, self.circular, self.radius, self.radius_sigma) if value is not None]
-        if not all(np.isfinite(value) and value > 0 for value in given):
-            raise InputError("soft constraints have positive sigmas", field="shape")
+        numbers = [value for value in (self.plane, self.circular, self.radius, self.radius_sigma) if value is not None]
+        if not all(np.isfinite(value) and value > 0 for value in numbers):
+            raise InputError("sigmas of soft constraints must be positive", field="shape")
         if not (isinstance(self.samples, int) and 1 <= self.samples <= MOST_SAMPLES):
-            raise InputError(f"1 to {MOST_SAMPLES} times are asked for, not {self.samples!r}", field="samples")
+            raise InputError(
+                f"the number of samples must be 1 to {MOST_SAMPLES}, not {self.samples!r}", field="samples"
+            )
         if (self.radius is None) != (self.radius_sigma is None):
-            raise InputError("a radius comes with its sigma", field="radius_sigma")
+            raise InputError("a radius needs its sigma", field="radius_sigma")
 
     def of(self, path: Path, span: tuple[float, float]) -> Constraints:
         """Return the pseudo-observations of a path between the times of its first and last row."""
@@ -136,7 +138,7 @@ class OrbitShape:
 
 
 def joined(parts: Sequence[Constraints], count: int) -> Constraints:
-    """Return the pseudo-observations of all parts, of `count` parameters."""
+    """Return the pseudo-observations of all parts together, for `count` parameters."""
     return Constraints(
         np.concatenate([np.zeros(0), *(part.residuals for part in parts)]),
         np.concatenate([np.zeros((0, count)), *(part.jacobian for part in parts)]),
@@ -148,10 +150,10 @@ def joined(parts: Sequence[Constraints], count: int) -> Constraints:
 def _plane(path: Path, times: Array, sigma: float) -> Constraints:
     place, slopes = path(times, 0)
     ends = place[[0, -1]]
-    # With the short way between the ends, so that rounding stays at a nanometre.
+    # The difference of the ends keeps rounding errors at a nanometre.
     normal = np.cross(ends[0], ends[1] - ends[0])
     normal /= np.linalg.norm(normal)
-    # n is normal to both ends wherever they move, so the plane at a S_F + b S_L moves as they do.
+    # n is always normal to both ends, so the plane at a S_F + b S_L moves with them.
     shares = np.linalg.lstsq(ends.T, place[1:-1].T, rcond=None)[0]
     by = np.einsum("i,nip->np", normal, slopes)
     return Constraints(

@@ -1,4 +1,4 @@
-"""The flight of a line scanner: path and attitude at every moment, their lines included."""
+"""The flight of a line scanner: path and attitude at any time, with their offsets and drifts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Flight:
     path, attitude : Spline
         s (m) and roll, pitch, yaw (rad), with offset and drift.
     duration : float
-        Seconds from the upper edge of the image to the lower; negative where the lower was exposed first.
+        Seconds from the upper edge of the image to the lower one; negative if the lower one was exposed first.
     """
 
     origin: Array
@@ -35,12 +35,12 @@ class Flight:
 
     @property
     def middle(self) -> float:
-        """Time in the middle of the image, about which drifts count."""
+        """Time in the middle of the image, where drifts are zero."""
         return self.duration / 2
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Path and attitude as the compiled projection reads them: polynomials between all knots of both."""
+        """Path and attitude for the compiled projection: polynomials between all knots of both."""
         splines = (self.path, self.attitude)
         ends = np.unique(np.concatenate([spline.breaks for spline in splines]))
         # The first piece holds before the first knot.
@@ -52,7 +52,7 @@ class Flight:
         return Trajectory(self.orbital, self.origin, ends, origins, pieces)
 
     def basis(self, spline: Spline, times: Array, derivative: int = 0) -> Array:
-        """Return the weights ``(N, size + 2)`` of the coefficients of one of the splines, its offset and drift."""
+        """Return the weights ``(N, size + 2)`` of the coefficients of a spline, its offset and its drift."""
         line = [np.ones_like(times), times - self.middle] if not derivative else [0 * times, np.ones_like(times)]
         return np.column_stack([spline.basis(times, derivative), *line])
 
@@ -61,9 +61,9 @@ class Flight:
         return self.path(times, derivative) @ self.orbital.T + (0.0 if derivative else self.origin)
 
     def lines(self, times: Array, look: Array, lever: Array) -> tuple[Array, Array]:
-        """Return origins and directions ``(N, 3)`` in ECEF of what looks along `look` ``(N, 3)`` from `lever` ``(3,)``.
+        """Return origins and directions ``(N, 3)`` in ECEF of rays along `look` ``(N, 3)`` from `lever` ``(3,)``.
 
-        Both are in platform axes.
+        `look` and `lever` are in platform axes.
         """
         turn = rotations(self.attitude(times))
         direction = np.einsum("nij,nj->ni", turn, look) @ self.orbital.T

@@ -1,6 +1,6 @@
 """Compiled projection of ground points by a line scanner; `Pushbroom.rays` in NumPy is its tested inverse.
 
-Path and attitude come as pieces of polynomials in time, all six components together.
+Path and attitude are pieces of polynomials in time, with all six components together.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class Camera(NamedTuple):
     Parameters
     ----------
     mount, lever : (3, 3), (3,)
-        Its axes and its place in those of the platform.
+        Its axes and its position in platform axes.
     numbers : (10,)
-        x0, y0, F, columns, line period, semi-major axis, squared eccentricity, largest miss (px) when done; and of the
-        light its bend at the ellipsoid (m) and its seconds per metre (`LightPath.numbers`).
+        x0, y0, F, columns, line period, semi-major axis, squared eccentricity, largest final miss (px), and
+        `LightPath.numbers`.
     dx, dy : (n,), (m,)
         Polynomials of the distortion.
     """

@@ -1,16 +1,16 @@
-r"""Camera of a line scanner: which direction a column looks into.
+r"""Camera of a line scanner: the direction of each column.
 
 With c_F = (x0, y0, F), the position of the projection centre relative to the line, and corrections
-:math:`\delta x(x), \delta y(x)`, the column x looks in camera axes along (u, v, 1):
+:math:`\delta x(x), \delta y(x)`, the column x looks along (u, v, 1) in camera axes:
 
 .. math:: u = (x + \delta x - x_0) / F, \qquad v = (\delta y - y_0) / F .
 
-Both corrections are polynomials in :math:`\xi = 2 x / N - 1` (N columns), in pixels, so that look directions given as
-polynomials of the column (Pleiades: degree 1 and 0) are expressed without loss.
+Both corrections are polynomials in :math:`\xi = 2 x / N - 1` (N columns), in pixels. So look directions given as
+polynomials of the column (Pleiades: degree 1 and 0) convert without loss.
 
-Source: Willneff et al., equation 3, left side. There the third component of :math:`p_F - c_F` is -F with a scale
-:math:`\lambda` of any sign; here camera z points to the ground, and columns run along +x, the left of the flight, as in
-a picture that is not mirrored and has its first line on top. A negative F is a mirrored line.
+Source: Willneff et al., equation 3, left side. There the third component of :math:`p_F - c_F` is -F, with a scale
+:math:`\lambda` of any sign. Here camera z points to the ground, and columns increase along +x, the left of the flight,
+as in an image that is not mirrored and has its first line on top. A negative F is a mirrored line.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from ortho_pipeline.models.base import Array
 
 #: Names of c_F as parameters; the corrections are ``dx_0``, ``dx_1`` ... and ``dy_0`` ...
 PRINCIPAL = ("principal_column", "principal_line", "focal_length")
-#: A table of look angles is followed by polynomials of at most this degree, to this miss (px).
+#: Highest degree of polynomials that follow a table of look angles, and their largest error (px).
 TABLE_DEGREE, TABLE_MISS = 9, 0.005
-#: Columns or rows: more than any line scanner takes in one pass.
+#: Largest number of columns or rows: more than any line scanner records in one pass.
 MOST_PIXELS = 10_000_000
 
 
@@ -57,35 +57,41 @@ class LineCamera:
 
     def __post_init__(self) -> None:
         if not all(1 <= size <= MOST_PIXELS and size == int(size) for size in (self.width, self.height)):
-            raise InputError(f"{self.width} x {self.height} is not a size of an image", field="width, height")
+            raise InputError(f"{self.width} x {self.height} is not an image size", field="width, height")
         for name in ("dx", "dy"):
             value = np.array(getattr(self, name), dtype=np.float64).ravel()
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         numbers = [self.principal_column, self.principal_line, self.focal_length, *self.dx, *self.dy]
         if not np.isfinite(numbers).all() or self.focal_length == 0:
-            raise InputError("a camera has finite numbers and a focal length", field="focal_length")
+            raise InputError("a camera needs finite numbers, and a focal length that is not zero", field="focal_length")
 
     @classmethod
     def of_polynomials(cls, width: int, height: int, across: ArrayLike, along: ArrayLike) -> Self:
-        """Make the camera whose column x looks along (u, v, 1) with polynomials u(x), v(x) of the column.
+        """Make the camera whose column x looks along (u, v, 1), with polynomials u(x), v(x).
 
         Parameters
         ----------
         across, along : (k,)
-            Coefficients, lowest power first, of u and v in x, the column from the outer corner of the first pixel. u
-            has a linear term, which becomes the focal length.
+            Coefficients of u and v, lowest power first. x counts from the outer corner of the first pixel. The linear
+            term of u gives the focal length.
 
         Raises
         ------
         InputError
             If u does not change with the column.
+
+        Examples
+        --------
+        >>> camera = LineCamera.of_polynomials(1000, 2000, across=[-0.01, 2e-5], along=[0.0])
+        >>> round(camera.focal_length, 3)
+        50000.0
         """
         u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (across, along))
         if len(u) < 2 or u[1] == 0:
-            raise InputError("a line whose look angle does not change with the column is not an image", field="across")
+            raise InputError("the look angle does not change with the column", field="across")
         focal, half = 1.0 / float(u[1]), width / 2
-        # x = half (1 + xi): the polynomials in xi that the terms beyond the linear one make.
+        # x = half (1 + xi): convert the terms beyond the linear one to polynomials in xi.
         shifted = np.polynomial.Polynomial([half, half])
 
         def in_xi(terms: Array) -> Array:
@@ -100,27 +106,27 @@ class LineCamera:
     def of_table(
         cls, width: int, height: int, columns: ArrayLike, across: ArrayLike, along: ArrayLike, rounding: float = 0.0
     ) -> Self:
-        """Make the camera that follows look directions (u, v, 1) given at columns, one for each detector or fewer.
+        """Make the camera from look directions (u, v, 1) at some or all columns.
 
         Parameters
         ----------
         columns, across, along : (n,)
             Columns from the outer corner of the first pixel, and u and v there.
         rounding : float
-            What the digits of the table leave open (px), and no polynomial should follow.
+            Rounding error of the table (px), which polynomials should not follow.
 
         Raises
         ------
         InputError
-            If no polynomial of `TABLE_DEGREE` or less follows them within `TABLE_MISS` pixels.
+            If no polynomial up to `TABLE_DEGREE` follows them within `TABLE_MISS` pixels.
         """
         x, u, v = (np.asarray(value, dtype=np.float64).ravel() for value in (columns, across, along))
         xi = 2 * x / width - 1
         if len(x) < 2 or not np.isfinite([x, u, v]).all() or not (np.diff(x) > 0).all():
-            raise InputError("look angles are finite numbers at two or more growing columns", field="columns")
+            raise InputError("look angles must be finite numbers at two or more increasing columns", field="columns")
         start, slope = np.polynomial.polynomial.polyfit(xi, u, 1)
         if not abs(slope) > 1e-12:
-            raise InputError("a line whose look angle does not change with the column is not an image", field="across")
+            raise InputError("the look angle does not change with the column", field="across")
         half = width / 2
         focal = half / float(slope)
         x0, y0 = half - focal * float(start), -focal * float(v.mean())
@@ -188,17 +194,18 @@ class LineCamera:
 
 
 def _followed(xi: Array, wanted: Array, rounding: float) -> Array:
-    """Return the shortest polynomial in xi that follows values (px); empty where none is needed."""
+    """Return the shortest polynomial in xi that follows values (px); empty if none is needed."""
     enough = max(rounding, TABLE_MISS / 100)
     if np.abs(wanted).max() <= enough:
         return np.zeros(0)
     for degree in range(min(TABLE_DEGREE, len(xi) - 1) + 1):
         terms = np.asarray(np.polynomial.polynomial.polyfit(xi, wanted, degree), dtype=np.float64)
-        # Rather one degree more than a pattern that could be seen: the terms cost nothing.
+        # Prefer one degree more to a visible pattern: terms cost nothing.
         if (miss := np.abs(polyval(xi, terms) - wanted).max()) <= enough:
             return terms
     if not miss <= max(rounding, TABLE_MISS):
         raise InputError(
-            f"the look angles are up to {miss:.3g} px off any smooth line of detectors", field="across, along"
+            f"the look angles are not those of a smooth line of detectors; they differ by up to {miss:.3g} px",
+            field="across, along",
         )
     return terms

@@ -1,20 +1,19 @@
 r"""Line scanners from a few lines of metadata, with soft constraints.
 
-Given are the corners, flying height H, look angles :math:`\alpha` (along) and :math:`\beta` (across). The camera looks
-along :math:`Z_M` in the platform,
+The input is corners, flying height H, and look angles :math:`\alpha` (along) and :math:`\beta` (across). The camera
+looks along :math:`Z_M` in the platform,
 
 .. math::
 
     Z_M = Z_0 / |Z_0|, \quad Z_0 = (\tan\alpha, -\tan\beta, -1)^T, \quad X_M = (0, \cos\beta, -\sin\beta)^T, \quad
     Y_M = Z_M \times X_M ,
 
-where the paper prints :math:`\cos\alpha` in X_M, which is then neither of length one nor at a right angle to Z_M. From
-the middles :math:`M_F, M_L` of first and last row the positions :math:`S_j = M_j + \lambda_j g_j` on the sphere of the
-orbit and R_O follow in turn until they stay. Two things go beyond the paper. The platform follows the Earth, so g turns
-with the angle travelled and pitch begins as a straight line, where the paper has zeros and a path that is ten percent
-short. And the four corners tell the skew of the rows (the Earth turns below: four degrees at the equator, which zeros
-would miss by 400 pixels): the platform is yawed to meet it, :math:`g_j = R_O R_Z(yaw) R_Y(\theta_j) Z_M`, until that
-stays too; roll and pitch then take up what is left.
+The paper prints :math:`\cos\alpha` in X_M, which then has neither length one nor a right angle to Z_M. From the middles
+:math:`M_F, M_L` of first and last row, the positions :math:`S_j = M_j + \lambda_j g_j` on the sphere of the orbit and
+R_O are iterated. Two things go beyond the paper. The platform follows the Earth, so g turns with the angle travelled
+and pitch starts as a straight line; the paper has zeros, and a path that is ten percent short. The four corners show
+the skew of the rows (the Earth rotates below: four degrees at the equator, or 400 pixels): yaw is iterated to meet it,
+:math:`g_j = R_O R_Z(yaw) R_Y(\theta_j) Z_M`. Roll and pitch absorb the rest.
 
 Source: Willneff et al., equation 4 and section 3.3.1.
 """
@@ -45,21 +44,21 @@ _PARABOLAS = SplineForm(2)
 
 @dataclass(frozen=True)
 class SoftSigmas:
-    """How well a start from metadata is believed: the sigmas of its pseudo-observations; None leaves one out.
+    """Sigmas of the pseudo-observations of a start from metadata; None skips one.
 
-    Willneff et al. have the first two. Those of the flying height and of the attitude are ours: without them nine
-    control points do not determine the eighteen coefficients of a scene (docs/engineering/accuracy.md).
+    Willneff et al. have the first two. The others are ours: without them nine control points do not determine the
+    eighteen coefficients of a scene (docs/engineering/accuracy.md).
 
     Parameters
     ----------
     plane, circular : float, optional
-        Of the orbit's shape (m, rad), see `OrbitShape`.
+        Shape of the orbit (m, rad); see `OrbitShape`.
     radius : float, optional
-        Of the distance from the Earth's centre (m).
+        Distance from the Earth's centre (m).
     attitude : float, optional
-        Of roll, pitch and yaw in the middle of the scene (rad).
+        Roll, pitch and yaw in the middle of the scene (rad).
     rate : float, optional
-        Of their rates at first and last row (rad/s).
+        Their rates at first and last row (rad/s).
 
     Raises
     ------
@@ -96,23 +95,23 @@ def pushbroom_of_metadata(
     corrections: tuple[int, int] = (0, 0),
     sigmas: SoftSigmas | None = None,
 ) -> Pushbroom:
-    """Make the start of a line scanner, with its soft constraints, of metadata alone.
+    """Make the start model of a line scanner, with soft constraints, from metadata alone.
 
     Parameters
     ----------
     corners : (4, 2) or (4, 3)
-        Lon, lat (degrees) and perhaps height of: first row left and right, last row right and left. Without heights
-        the middle of `heights`.
+        Lon, lat (degrees) and optional height (m) of: first row left, right; last row right, left. Default height: the
+        middle of `heights`.
     altitude : float
-        Of the satellite above the ellipsoid, m.
+        Height of the satellite above the ellipsoid (m).
     along_deg, across_deg : float
-        Look angles: positive looks forward (where rows grow), to the right.
+        Look angles: positive is forward (increasing rows), and right.
     focal_length, pixel_size : float, optional
-        In one unit; without them the focal length follows from the length of the rows.
+        In the same unit. Default: the focal length follows from the length of the rows.
     splines : SplineForm
-        One polynomial each if it does not say how many; all their coefficients are free.
+        Default: one polynomial each. All coefficients are free.
     corrections : (int, int)
-        Numbers of coefficients of the camera's corrections along x and y, which begin at zero and are not free.
+        Numbers of coefficients of the camera's corrections along x and y; they are zero and not free.
 
     Raises
     ------
@@ -139,7 +138,7 @@ def pushbroom_of_metadata(
 
 
 def mounting_of_angles(along: float, across: float) -> Array:
-    """Return R_M ``(3, 3)`` of look angles (rad) along and across the track.
+    """Return R_M ``(3, 3)`` from look angles (rad) along and across the track.
 
     Source: Willneff et al., equation 4, with the cosine of beta in X_M.
     """
@@ -154,9 +153,9 @@ def _corner_points(corners: ArrayLike, heights: tuple[float, float]) -> Array:
     if points.shape == (4, 2):
         points = np.column_stack([points, np.full(4, sum(heights) / 2)])
     if points.shape != (4, 3) or not np.isfinite(points).all():
-        raise InputError(f"an image has four corners lon, lat (and height), not {points.shape}", field="corners")
+        raise InputError(f"the corners must be four of lon, lat (and height), not {points.shape}", field="corners")
     if (np.abs(points[:, 1]) > 90).any():
-        raise InputError("a latitude is beyond 90 degrees", field="corners", remedy="give lon, lat")
+        raise InputError("a latitude is larger than 90 degrees", field="corners", remedy="give lon, lat")
     return points
 
 
@@ -182,27 +181,29 @@ def _orbit_over(ground: Array, radius: float, view: Array, yaw: float) -> tuple[
         if np.abs(ends - before).max() < _SETTLED:
             return ends, orbital, 2 * half
     raise InputError(
-        "no orbit at this height sees these corners under these look angles",
+        "no orbit at this height sees these corners with these look angles",
         field="corners, altitude, along_deg, across_deg",
-        remedy="check the corners' order and the units: degrees, metres",
+        remedy="check the order of the corners and the units: degrees, metres",
     )
 
 
 def _focal_length(
     points: Array, ends: Array, orbital: Array, width: int, length: float | None, pixel: float | None
 ) -> float:
-    """Return the focal length in pixels, negative where columns run to the right of the flight."""
+    """Return the focal length in pixels, negative if columns increase to the right of the flight."""
     ground = geocentric(points)
     rows = np.stack([ground[1] - ground[0], ground[2] - ground[3]])
     sign = np.sign(rows @ orbital[:, 1])
     if sign[0] * sign[1] <= 0:
         raise InputError(
-            "first and last row do not run the same way", field="corners", remedy="go around: UL, UR, LR, LL"
+            "first and last row have opposite directions",
+            field="corners",
+            remedy="give them in the order UL, UR, LR, LL",
         )
     if length is not None and pixel:
         focal = length / pixel
     elif length is not None or pixel is not None:
-        raise InputError("focal length and pixel size come together", field="focal_length, pixel_size")
+        raise InputError("focal length and pixel size must both be given, or neither", field="focal_length, pixel_size")
     else:
         lines = np.stack([ground[:2].mean(axis=0), ground[2:].mean(axis=0)]) - ends
         distance = np.linalg.norm(lines, axis=1)
@@ -224,7 +225,7 @@ def _level_flight(
     heights: tuple[float, float],
     form: SplineForm,
 ) -> Pushbroom:
-    """Return a line scanner on a circle about the Earth's centre, in a platform that follows the circle."""
+    """Return a line scanner on a circle about the Earth's centre, with a platform that follows the circle."""
     degree, pieces = form.degree, [form.path or 1, form.attitude or 1]
     duration = travelled / math.sqrt(EARTH_GM / radius**3)
     times = np.linspace(0.0, duration, 6 * (degree + max(pieces)))
@@ -250,14 +251,16 @@ def _level_flight(
 
 
 def _met(model: Pushbroom, corners: Array) -> Pushbroom:
-    """Return the model with roll, pitch and yaw turned so that the corners are met best."""
+    """Return the model with the roll, pitch and yaw that fit the corners best."""
     image = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) * (model.camera.width, model.camera.height)
     turned = model.freed("attitude_offset")
     for _ in range(10):
         miss = image - turned.ground_to_image(corners)
         slopes = turned.param_partials(corners).reshape(8, 3)
         if not np.isfinite(miss).all():
-            raise InputError("the start does not see the corners", field="corners, altitude, along_deg, across_deg")
+            raise InputError(
+                "the start model does not see the corners", field="corners, altitude, along_deg, across_deg"
+            )
         step = np.linalg.lstsq(slopes, miss.ravel(), rcond=None)[0]
         turned = turned.with_params(turned.params + step)
         if np.abs(step).max() < 1e-9:

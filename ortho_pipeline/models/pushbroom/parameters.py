@@ -43,22 +43,22 @@ class Parameters:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of all."""
+        """Names of all parameters."""
         return tuple(name for names in self.groups.values() for name in names)
 
     @cached_property
     def first(self) -> dict[str, int]:
-        """Place of the first parameter of each group."""
+        """Index of the first parameter of each group."""
         ends = np.cumsum([0, *(len(names) for names in self.groups.values())])
         return dict(zip(self.groups, ends[:-1].tolist(), strict=True))
 
     def places(self, names: tuple[str, ...]) -> list[int]:
-        """Return the places of parameters among all."""
+        """Return the indices of parameters among all."""
         place = {name: k for k, name in enumerate(self.names)}
         return [place[name] for name in names]
 
     def triples(self, group: str, basis: Array) -> list[tuple[int, Array]]:
-        """Return, for each three parameters that move along the three axes, the first one and weights ``(N,)``.
+        """Return the first of each three parameters that belong to the three axes, and its weights ``(N,)``.
 
         `basis` ``(N, size + 2)`` has the weights of the coefficients of `group`, of its offset and of its drift.
         """
@@ -67,7 +67,7 @@ class Parameters:
         return [(first, basis[:, k]) for k, first in enumerate(firsts)]
 
     def split(self, values: Array) -> list[Array]:
-        """Return the values of path, attitude ``(size, 3)``, path line, attitude line ``(2, 3)`` and camera."""
+        """Return the values of path and attitude ``(size, 3)``, their lines ``(2, 3)``, and the camera."""
         sizes = np.cumsum([3 * self.path, 3 * self.attitude, 6, 6])
         *moving, camera = np.split(values, sizes)
         return [*(part.reshape(-1, 3) for part in moving), camera]

@@ -9,22 +9,28 @@ from ortho_pipeline.models.base import Array
 
 
 def are_rotations(turns: Array) -> bool:
-    """Tell whether all matrices ``(N, 3, 3)`` are rotations, rounded to six digits or better."""
+    """Return whether all matrices ``(N, 3, 3)`` are rotations, to six digits.
+
+    Examples
+    --------
+    >>> are_rotations(np.eye(3)[None])
+    True
+    """
     miss = np.swapaxes(turns, 1, 2) @ turns - np.eye(3)
     return bool(np.abs(miss).max(initial=0.0) <= 3e-6 and (np.linalg.det(turns) > 0).all())
 
 
 def exact_rotation(matrix: Array, field: str) -> Array:
-    """Return a rotation ``(3, 3)`` whose inverse is its transpose, of one that may have been rounded; not writeable.
+    """Return the exact rotation ``(3, 3)``, read-only, of a matrix that may be rounded.
 
     Raises
     ------
     InputError
-        If it is not a rotation, with the name of the field.
+        If it is not a rotation; the error names the field.
     """
     if not are_rotations(matrix[None]):
         raise InputError("this matrix is not a rotation", field=field)
-    # A matrix with printed digits is none exactly, and its inverse would be another than its transpose.
+    # Rounding makes the inverse differ from the transpose.
     if np.abs(matrix.T @ matrix - np.eye(3)).max() > 1e-12:
         left, _, right = np.linalg.svd(matrix)
         matrix = left @ right
@@ -33,7 +39,13 @@ def exact_rotation(matrix: Array, field: str) -> Array:
 
 
 def rotations(angles: Array) -> Array:
-    """Return R_P ``(N, 3, 3)`` of roll, pitch, yaw ``(N, 3)``."""
+    """Return the rotations R_P ``(N, 3, 3)`` of roll, pitch, yaw ``(N, 3)`` (rad).
+
+    Examples
+    --------
+    >>> rotations(np.zeros((1, 3)))[0].tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.0, 0.0, 1.0]]
+    """
     (sr, sp, sy), (cr, cp, cy) = np.sin(angles).T, np.cos(angles).T
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -52,14 +64,14 @@ def angles_of(turns: Array) -> Array:
 
 
 def turning_axes(angles: Array) -> Array:
-    """Return what roll, pitch and yaw turn about, in platform axes, as columns ``(N, 3, 3)``."""
+    """Return the axes of roll, pitch and yaw, in platform axes, as columns ``(N, 3, 3)``."""
     (sr, sp, _), (cr, cp, _) = np.sin(angles).T, np.cos(angles).T
     zero, one = np.zeros_like(sr), np.ones_like(sr)
     return np.moveaxis(np.array([[one, zero, -sp], [zero, cr, cp * sr], [zero, -sr, cp * cr]]), -1, 0)
 
 
 def orbital_axes(position: Array, velocity: Array) -> Array:
-    """Return R_O ``(3, 3)``: forward, left, up in ECEF as columns."""
+    """Return R_O ``(3, 3)``: the axes forward, left, up in ECEF as columns."""
     up = position / np.linalg.norm(position)
     left = np.cross(up, velocity)
     left /= np.linalg.norm(left)

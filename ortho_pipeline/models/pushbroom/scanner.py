@@ -1,31 +1,30 @@
 r"""Rigorous line scanner (pushbroom): every row has its own position and attitude.
 
-The row coordinate r is exposed at :math:`t = r\,\Delta t`, so t counts seconds from the upper edge of the image. Where
-the last row was exposed first (agile satellites also scan against their flight), :math:`\Delta t` is negative. A ground
-point P (ECEF) is seen in column x and row r where
+The row coordinate r is exposed at :math:`t = r\,\Delta t`, so t is in seconds from the upper edge of the image. If the
+last row was exposed first (agile satellites also scan against their flight), :math:`\Delta t` is negative. A ground
+point P (ECEF) is seen at column x and row r where
 
 .. math::
 
     \lambda\,(u(x), v(x), 1)^T = R_M^T \{ R_P^T(t)\, R_O^T\, [P - S(t)] - C_M \}, \qquad \lambda > 0 .
 
-Axes, which the paper leaves to its references:
+The paper refers to others for the axes:
 
 - **orbital** (:math:`R_O`: its axes in ECEF as columns, constant): X forward, along the path in the middle of the
-  scene; Z up, away from the Earth's centre; Y to the left. The path is :math:`S(t) = S_O + R_O\, s(t)` with `s`
-  (along, across, radial; metres) a spline, which keeps its parameters small and physical.
-- **platform**: :math:`R_P = R_Z(yaw) R_Y(pitch) R_X(roll)` turns it into the orbital axes; at zero they are parallel.
-  Right-handed: positive roll looks to the left, positive pitch backwards, positive yaw turns forward to the left.
+  scene; Z up, away from the Earth's centre; Y left. The path is :math:`S(t) = S_O + R_O\, s(t)`. `s` is a spline
+  (along, across, radial; metres), so its parameters are small and physical.
+- **platform**: :math:`R_P = R_Z(yaw) R_Y(pitch) R_X(roll)` rotates it to the orbital axes; at zero both are parallel.
+  Right-handed: positive roll looks left, positive pitch backwards, positive yaw turns forward to the left.
 - **camera** (:math:`R_M`): x along the line to the left of the flight, y forward, z to the ground; see
-  `ortho_pipeline.models.pushbroom.line_camera` for u, v. :math:`C_M` is the camera's place in the platform (metres).
+  `ortho_pipeline.models.pushbroom.line_camera` for u, v. :math:`C_M` is the camera's position in the platform (metres).
 
-Aberration and refraction, where the attitude does not hold them already, are those of
-`ortho_pipeline.models.light.path` (`light`).
+If the attitude does not include aberration and refraction, `light` adds those of `ortho_pipeline.models.light.path`.
 
-Path and attitude are the splines plus an offset and a drift per second about the middle of the scene: the systematic
-part of a vendor's tables, which those observe without. Beyond its knots the path goes on with its curvature, the
-attitude with its slope.
+Path and attitude are the splines, plus an offset and a drift per second about the middle of the scene. These are the
+systematic errors of a vendor's tables; the observations are without them. Beyond its knots the path continues with its
+curvature, the attitude with its slope.
 
-R_O is constant in ECEF, so the platform of a camera that points to the ground turns against it by the orbital rate:
+R_O is constant in ECEF. The platform of a camera that points to the ground turns relative to it at the orbital rate, so
 pitch grows by a milliradian per second.
 
 Source: Willneff et al., equations 3 and 4 and section 3.3; Weser et al. 2007.
@@ -69,23 +68,23 @@ from ortho_pipeline.models.pushbroom.parameters import Parameters
 from ortho_pipeline.models.pushbroom.rotations import exact_rotation, rotations, turning_axes
 from ortho_pipeline.models.pushbroom.splines import Spline
 
-#: Newton's last step (pixels): what it leaves is far smaller.
+#: Newton's last step (px); the remaining error is far smaller.
 _LAST_STEP = 1e-5
-#: Image points are found as far as this many half-sizes from the middle of the image.
+#: Distance from the middle of the image, in half-sizes, up to which image points are computed.
 _REACH = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Pushbroom(SensorModel):
-    """A line scanner; `pushbroom.tables` and `pushbroom.metadata` make one of what a vendor delivers.
+    """A line scanner. `pushbroom_of_tables` and `pushbroom_of_metadata` make one from a vendor's data.
 
     Parameters
     ----------
     camera : LineCamera
     line_period : float
-        Seconds from row to row; negative where the last row was exposed first.
+        Seconds from row to row; negative if the last row was exposed first.
     origin : (3,)
-        S_O, the place (ECEF, m) about which the path is given.
+        S_O, the origin (ECEF, m) of the path.
     orbital, mounting : (3, 3)
         R_O and R_M.
     path, attitude : Spline
@@ -100,9 +99,9 @@ class Pushbroom(SensorModel):
         Names of the parameters that an adjustment may change; see `freed`.
     shape : OrbitShape
     path_observations, attitude_observations : tuple of Observations
-        What is known beforehand: `constraints` brings it into an adjustment.
+        Prior knowledge, which `constraints` adds to an adjustment.
     light : LightPath
-        What the attitude does not have of aberration and refraction.
+        Aberration and refraction that the attitude does not include.
     """
 
     kind: ClassVar[str] = "pushbroom"
@@ -132,7 +131,7 @@ class Pushbroom(SensorModel):
             object.__setattr__(self, name, exact_rotation(getattr(self, name), name))
         object.__setattr__(self, "line_period", float(self.line_period))
         if not (math.isfinite(self.line_period) and self.line_period):
-            raise InputError(f"{self.line_period} s is not a time from row to row", field="line_period")
+            raise InputError(f"{self.line_period} s is not a line period", field="line_period")
         low, high = (float(value) for value in self.heights)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise InputError(f"heights from {low} to {high} are not a range", field="heights")
@@ -170,7 +169,7 @@ class Pushbroom(SensorModel):
 
     @property
     def detail(self) -> float:
-        """Shortest distance (px) of two knots of path or attitude."""
+        """Shortest distance (px) between two knots of path or attitude."""
         shortest = min(np.diff(spline.breaks).min() for spline in (self.path, self.attitude))
         return float(shortest / abs(self.line_period))
 
@@ -188,15 +187,15 @@ class Pushbroom(SensorModel):
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """Names of all parameters, by the group under which `freed` takes them.
+        """Names of all parameters, by group.
 
-        The groups: path, attitude (coefficients of the splines), path_offset, path_drift, attitude_offset,
+        The groups are path, attitude (coefficients of the splines), path_offset, path_drift, attitude_offset,
         attitude_drift, camera.
         """
         return self.parameters.groups
 
     def freed(self, *names: str) -> Self:
-        """Return this model with these parameters free, and no others; a name is of a group or of a parameter."""
+        """Return this model with only these parameters free; a name is that of a group or of a parameter."""
         free = [single for name in names for single in self.groups.get(name, (name,))]
         return self._replace(free=tuple(dict.fromkeys(free)))
 
@@ -258,19 +257,19 @@ class Pushbroom(SensorModel):
 
     @cached_property
     def _limits(self) -> Array:
-        """Lowest and highest column and time ``(2, 2)`` that are answered."""
+        """Lowest and highest column and time ``(2, 2)`` of computed points."""
         size = np.array([self.camera.width, self.flight.duration])
         return np.sort(np.stack([size * (1 - _REACH) / 2, size * (1 + _REACH) / 2], axis=1), axis=1)
 
     def ground_to_image(self, ground: ArrayLike) -> Array:
-        """Project ground points ``(N, 3)``; NaN behind the Earth and beyond three half-sizes of the image."""
+        """Project ground points ``(N, 3)``; NaN behind the Earth, and beyond three half-sizes of the image."""
         ground = as_ground(ground)
         image = np.empty((len(ground), 2))
         pushbroom_kernel.project(ground, self.flight.trajectory, _compiled_camera(self), self._limits, image)
         return image
 
     def rays(self, image: ArrayLike) -> tuple[Array, Array]:
-        """Return origin and unit direction ``(N, 3)`` in ECEF of the rays of image points ``(N, 2)`` in space."""
+        """Return origins and unit directions ``(N, 3)`` in ECEF of the rays of image points ``(N, 2)``, in space."""
         image = as_image(image)
         low, high = self._limits.T
         times = image[:, 1] * self.line_period
@@ -283,20 +282,20 @@ class Pushbroom(SensorModel):
         return origin, self.light.straight(direction, self.flight.positions(times, 1))
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
-        """Follow the rays of image points ``(N, 2)`` to an ellipsoidal height; NaN where they do not get there."""
+        """Intersect the rays of image points ``(N, 2)`` with an ellipsoidal height; NaN where they miss."""
         origin, direction = self.rays(image)
-        wanted = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(origin),))
+        heights = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(origin),))
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            ground = meet_height(origin, direction, wanted)
+            ground = meet_height(origin, direction, heights)
             if self.light.refraction:
                 cosine = -(enu_from_ecef(ground)[:, 2] * direction).sum(axis=1)
-                ground = meet_height(origin, direction, wanted + self.light.lift(wanted, cosine))
-            # Beside the antimeridian, stay on the side of the sub-satellite point.
+                ground = meet_height(origin, direction, heights + self.light.lift(heights, cosine))
+            # Near the antimeridian, stay on the side of the sub-satellite point.
             foot = math.degrees(math.atan2(self.origin[1], self.origin[0]))
             ground[:, 0] = foot + np.remainder(ground[:, 0] - foot + 180.0, 360.0) - 180.0
-            # Beyond the satellite's own height the ray is only met where it leaves the Earth again.
+            # Above the satellite a ray meets the height only where it leaves the Earth again.
             good = (enu_from_ecef(ground)[:, 2] * direction).sum(axis=1) < 0
-        ground[good, 2] = wanted[good]
+        ground[good, 2] = heights[good]
         ground[~good] = np.nan
         return ground
 
@@ -317,29 +316,29 @@ class Pushbroom(SensorModel):
             data[name] = getattr(self, name).to_dict()
         for name in ("path_observations", "attitude_observations"):
             data[name] = [table.to_dict() for table in getattr(self, name)]
-        # Files of cameras without it are as they were before there was any.
+        # Without `light`, files are the same as those of older versions.
         data.pop("light", None)
         return data | ({} if self.light == AS_GIVEN else {"light": self.light.to_dict()})
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Make the model from what `to_dict` returned."""
+        """Make the model from the result of `to_dict`."""
         return super().from_dict({**data, **_parts(data)})
 
 
 def _parts(data: dict[str, Any]) -> dict[str, Any]:
-    """Return what is more than numbers in the plain data of a model."""
+    """Return the parts of a model from its plain data."""
     parts: dict[str, Any] = {}
     for name, make in (("camera", LineCamera), ("path", Spline), ("attitude", Spline), ("shape", OrbitShape)):
         if not isinstance(data.get(name), dict):
-            raise InputError(f"a pushbroom has its {name}", field=name)
+            raise InputError(f"a pushbroom model needs its {name}", field=name)
         parts[name] = make(**data[name])
     for name in ("path_observations", "attitude_observations"):
         if not isinstance(data.get(name), list | tuple):
-            raise InputError("a list of tables belongs here, which may be empty", field=name)
+            raise InputError("this must be a list of tables; it may be empty", field=name)
         parts[name] = tuple(Observations(**table) for table in data[name])
     if not isinstance(light := data.get("light", {}), dict):
-        raise InputError("aberration and refraction belong here", field="light")
+        raise InputError("this must be aberration and refraction", field="light")
     parts["light"] = LightPath(**light)
     return parts
 
@@ -353,7 +352,7 @@ def _finite(value: Array, shape: tuple[int, ...], field: str) -> Array:
 
 
 def _compiled_camera(model: Pushbroom) -> pushbroom_kernel.Camera:
-    """Return the camera as the compiled projection reads it."""
+    """Return the camera for the compiled projection."""
     camera = model.camera
     numbers = np.array(
         [
@@ -422,16 +421,14 @@ def _pseudo_observations(model: Pushbroom) -> Constraints:
         (model.attitude, "attitude", model.attitude_observations),
     ):
         parts += [table.of(spline, parameters.first[group], count) for table in tables]
-    found = joined(parts, count)
-    # What no free parameter can change is not an observation of one.
-    kept = found.jacobian[:, columns].any(axis=1)
-    return Constraints(
-        found.residuals[kept], found.jacobian[kept][:, columns], found.sigma[kept], found.fictitious[kept]
-    )
+    soft = joined(parts, count)
+    # Drop observations that no free parameter can change.
+    kept = soft.jacobian[:, columns].any(axis=1)
+    return Constraints(soft.residuals[kept], soft.jacobian[kept][:, columns], soft.sigma[kept], soft.fictitious[kept])
 
 
 class _State:
-    """Ground points as the camera sees them, and how their image follows from a change of what it sees."""
+    """Vectors of ground points in camera axes, and the derivatives of the image by them."""
 
     def __init__(self, model: Pushbroom, ground: Array) -> None:
         image, flight = model.ground_to_image(ground), model.flight
@@ -440,7 +437,7 @@ class _State:
         self.turn = rotations(angles)
         rate, up = flight.path(self.times, 1), enu_from_ecef(ground)[:, 2] @ flight.orbital
         line = (geocentric(ground) - flight.origin) @ flight.orbital - flight.path(self.times)
-        #: Of the zenith angle at the point.
+        #: Cosine of the zenith angle at the point.
         self.cosine = -(line * up).sum(axis=1) / np.linalg.norm(line, axis=1)
         line = model.light.apparent(line, rate, up, ground[:, 2])
         back = np.swapaxes(self.turn, 1, 2)
@@ -466,6 +463,6 @@ class _State:
         self.solved[:, 1] /= model.line_period
 
     def image_by(self, vector: Array, look: Array | float = 0.0) -> Array:
-        """Return d(image) ``(N, 2, P)`` of changes of the vector ``(N, 3, P)`` and of u, v themselves ``(N, 2, P)``."""
+        """Return d(image) ``(N, 2, P)`` for changes of the vector ``(N, 3, P)`` and of u, v ``(N, 2, P)``."""
         changed: Array = self.solved @ (self.by_vector @ vector - look)
         return changed

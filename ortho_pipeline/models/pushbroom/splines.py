@@ -1,4 +1,4 @@
-"""Vector-valued B-splines of time: satellite path and attitude of a line scanner."""
+"""Vector-valued B-splines of time: path and attitude of a line scanner."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Spline:
     degree : int
         1 to 5.
     breaks : (m + 1,)
-        Times at which the m polynomials meet, ends included: the knots, each counted once.
+        Knots, each once: the times at which the m polynomials meet, and both ends.
     coefficients : (m + degree, 3)
-        Of the B-splines on these knots, the outer ones repeated so that first and last coefficient are the end values.
+        Coefficients of the B-splines. Outer knots are repeated, so first and last coefficient are the end values.
     beyond : int
-        Degree of the Taylor polynomial with which the spline goes on before its first and after its last knot.
+        Degree of the Taylor polynomial that continues the spline before its first and after its last knot.
     """
 
     degree: int
@@ -39,14 +39,16 @@ class Spline:
     def __post_init__(self) -> None:
         breaks, coefficients = (np.array(value, dtype=np.float64) for value in (self.breaks, self.coefficients))
         if not (isinstance(self.degree, int) and isinstance(self.beyond, int)):
-            raise InputError(f"degrees {self.degree} and {self.beyond} are not whole numbers", field="degree, beyond")
+            raise InputError(f"degrees {self.degree} and {self.beyond} are not integers", field="degree, beyond")
         if not 1 <= self.degree <= 5 or not 0 <= self.beyond <= self.degree:
-            raise InputError(f"degree {self.degree}, continued with {self.beyond}, is not a spline", field="degree")
+            raise InputError(
+                f"a spline cannot have degree {self.degree} and {self.beyond} beyond its ends", field="degree"
+            )
         if breaks.ndim != 1 or len(breaks) < 2 or not np.isfinite(breaks).all() or not (np.diff(breaks) > 0).all():
-            raise InputError("the knots of a spline are at least two increasing times", field="breaks")
+            raise InputError("the knots of a spline must be at least two increasing times", field="breaks")
         if coefficients.shape != (len(breaks) - 1 + self.degree, 3) or not np.isfinite(coefficients).all():
             raise InputError(
-                f"a spline of degree {self.degree} with {len(breaks)} knots has {len(breaks) - 1 + self.degree} x 3 "
+                f"a spline of degree {self.degree} with {len(breaks)} knots needs {len(breaks) - 1 + self.degree} x 3 "
                 f"finite coefficients, not {coefficients.shape}",
                 field="coefficients",
             )
@@ -67,23 +69,23 @@ class Spline:
         values = np.asarray(values, dtype=np.float64)
         count = len(breaks) - 1 + degree
         empty = cls(degree, breaks, np.zeros((count, 3)), beyond)
-        # About the mean, so that positions in space keep all their digits.
+        # Relative to the mean, so positions in space keep all digits.
         middle = values.mean(axis=0)
         basis = empty.basis(times)
         if not (np.isfinite(basis).all() and np.isfinite(values).all()):
             raise InputError(
-                "times or values of a table are so far apart that no spline follows them",
+                "no spline can follow this table: its times or values are too far apart",
                 field="breaks",
                 remedy="the file is damaged: copy it again",
             )
-        found, _, rank, _ = np.linalg.lstsq(basis, values - middle, rcond=1e-10)
+        solution, _, rank, _ = np.linalg.lstsq(basis, values - middle, rcond=1e-10)
         if rank < count:
             raise InputError(
                 f"{counted(len(values), 'time does', 'times do')} not determine {counted(count, 'spline coefficient')}",
                 field="breaks",
                 remedy="use fewer knots, or a table that covers all of them",
             )
-        return cls(degree, breaks, found + middle, beyond)
+        return cls(degree, breaks, solution + middle, beyond)
 
     @property
     def size(self) -> int:
@@ -92,15 +94,15 @@ class Spline:
 
     @property
     def sites(self) -> Array:
-        """Times ``(size,)`` that the coefficients belong to (Greville); coefficients linear there make a line."""
+        """Greville times ``(size,)`` of the coefficients; coefficients that are linear there give a line."""
         return self._unit.sites
 
     def __call__(self, times: ArrayLike, derivative: int = 0) -> Array:
-        """Return values ``(N, 3)`` at times ``(N,)``, or a derivative by time."""
+        """Return values ``(N, 3)`` at times ``(N,)``, or their derivative by time."""
         return self.basis(times, derivative) @ self.coefficients
 
     def basis(self, times: ArrayLike, derivative: int = 0) -> Array:
-        """Return the B-splines (or a derivative of theirs) at times ``(N,)``, as ``(N, size)``; NaN stays NaN."""
+        """Return the B-splines (or their derivative) at times ``(N,)`` as ``(N, size)``; NaN stays NaN."""
         times = np.asarray(times, dtype=np.float64)
         unit = self._unit
         out = np.full((len(times), self.size), np.nan)
@@ -118,7 +120,7 @@ class Spline:
         return out
 
     def pieces(self, origins: Array) -> Array:
-        """Return Taylor coefficients ``(k, degree + 1, 3)`` at times ``(k,)``: of the polynomials that begin there."""
+        """Return Taylor coefficients ``(k, degree + 1, 3)`` of the polynomials that begin at times ``(k,)``."""
         terms = [self(origins, order) / math.factorial(order) for order in range(self.degree + 1)]
         return np.stack(terms, axis=1)
 
@@ -146,7 +148,7 @@ class Spline:
 
 @dataclass(frozen=True)
 class SplineForm:
-    """Degree of the splines of path and attitude, and how many polynomials each has; None leaves that to the table."""
+    """Degree of the splines of path and attitude, and their numbers of polynomials; None: the table decides."""
 
     degree: int
     path: int | None = None
@@ -154,16 +156,16 @@ class SplineForm:
 
 
 class _Unit:
-    """The B-splines themselves, which splines on the same knots share."""
+    """The B-splines, shared by splines with the same knots."""
 
     def __init__(self, degree: int, breaks: tuple[float, ...], beyond: int) -> None:
         knots = np.array([breaks[0]] * degree + list(breaks) + [breaks[-1]] * degree)
-        from scipy.interpolate import BSpline  # takes half of the start-up of a command
+        from scipy.interpolate import BSpline  # takes half of the start-up time of a command
 
-        whole = BSpline(knots, np.eye(len(breaks) - 1 + degree), degree)
-        self.inside = [whole, *(whole.derivative(order) for order in range(1, degree + 1))]
+        basis = BSpline(knots, np.eye(len(breaks) - 1 + degree), degree)
+        self.inside = [basis, *(basis.derivative(order) for order in range(1, degree + 1))]
         self.sites = np.array([knots[i + 1 : i + 1 + degree].mean() for i in range(len(breaks) - 1 + degree)])
-        #: Values and derivatives at both ends, as far as they go on.
+        #: Values and derivatives at both ends, for the continuation.
         self.ends = {
             end: [self.inside[order](np.array([end]))[0] for order in range(beyond + 1)]
             for end in (breaks[0], breaks[-1])

@@ -1,8 +1,8 @@
 """Line scanners from a vendor's tables of orbit and attitude.
 
-Positions and rotations with times, in any convention that a `(N, 3, 3)` array of rotations to ECEF can express
-(`rotations_of_quaternions`, `rotations_of_angles`), and a `LineCamera`. The splines fit the tables, which are also kept
-as observations if their sigma is known.
+The input is positions and rotations with times, and a `LineCamera`. Rotations are ``(N, 3, 3)`` to ECEF;
+`rotations_of_quaternions` and `rotations_of_angles` convert other conventions. Splines fit the tables. If the sigma of
+a table is known, its values are also observations.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from ortho_pipeline.models.pushbroom.rotations import angles_of, are_rotations, 
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
 
-#: Positions between those of a table: Lagrange's polynomial through so many neighbours.
+#: Number of neighbours for Lagrange's polynomial between positions of a table.
 _NEIGHBOURS = 8
-#: A cubic polynomial follows an orbit for so long (seconds) to a micrometre.
+#: Time (s) over which a cubic polynomial follows an orbit to a micrometre.
 _PATH_PIECE = 2.5
 _CUBIC = SplineForm(3)
-#: By which part of an image's duration tables may be too short: orbits are smooth, and Pleiades Neo's begin some rows
-#: after the image.
+#: Part of an image's duration by which a table may be too short: orbits are smooth, and those of Pleiades Neo begin
+#: some rows after the image.
 _BEYOND = {"orbit": 0.01, "attitude": 0.001}
-#: Positions (m) beyond this are damaged, and those between which nothing in an orbit gets so fast (m/s: twice what
-#: escapes from the Earth; metres by which tables are rounded).
+#: Limits of undamaged tables: distance (m) from the Earth's centre, speed (m/s, twice the escape velocity), rounding of
+#: positions (m).
 _FARTHEST, _FASTEST, _ROUNDED = 1e9, 22e3, 10.0
 
 
@@ -49,45 +49,43 @@ def pushbroom_of_tables(
     angle_sigma: float | None = None,
     free: tuple[str, ...] = ("attitude_offset", "attitude_drift"),
 ) -> Pushbroom:
-    """Make a line scanner of a vendor's orbit and attitude.
+    """Make a line scanner from a vendor's orbit and attitude.
 
     Parameters
     ----------
     line_period, first_time : float
-        Seconds per row (negative where the last row was exposed first), and the time of the upper edge of the first
-        row, half a period before its centre.
+        Seconds per row (negative if the last row was exposed first), and the time of the upper edge of the first row,
+        half a period before its centre.
     orbit : (N,), (N, 3)
-        Times and positions (ECEF, m); at least one row more than the degree of the splines, around the image.
+        Times and positions (ECEF, m) that cover the image; N is larger than the degree of the splines.
     attitude : (N,), (N, 3, 3)
-        Times and rotations from the platform to ECEF, as dense as the attitude changes.
+        Times and rotations from the platform to ECEF.
     mounting, lever : (3, 3), (3,)
-        R_M and C_M. Without `mounting` the rotations are of the camera itself (x along growing columns, y forward,
-        z to the ground) and R_M is its attitude in the middle of the image.
+        R_M and C_M. Without `mounting`, the rotations are those of the camera (x along increasing columns, y forward,
+        z to the ground).
     splines : SplineForm
-        If it does not say how many polynomials, path has enough for any orbit, and attitude goes through every row of
-        its table.
+        By default the path has enough polynomials for any orbit, and the attitude passes through every row.
     position_sigma, angle_sigma : float, optional
-        Sigmas (m, rad) of the tables' random errors: their values then are observations, which hold the coefficients
-        when those are freed. Systematic errors are the offsets and drifts.
+        Sigmas (m, rad) of the random errors of the tables, whose values then are observations of the coefficients.
     free : tuple of str
-        Free parameters or groups of them, see `Pushbroom.freed`.
+        Free parameters, or groups of them; see `Pushbroom.freed`.
 
     Raises
     ------
     InputError
-        If a table is not ordered in time, too short, or does not cover the image.
+        If a table is not in order of time, too short, or does not cover the image.
     """
     degree, last = splines.degree, camera.height * line_period
     needed = (first_time, last, abs(line_period))
     times, positions = _table(orbit, (3,), needed, degree, "orbit")
     if not (np.abs(positions) < _FARTHEST).all():
-        raise InputError("a position of this table is no place of a satellite (ECEF metres)", field="orbit")
+        raise InputError("this table has a position where no satellite can be (ECEF metres)", field="orbit")
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     if not (steps <= _FASTEST * np.diff(times) + _ROUNDED).all():
         raise InputError(
-            f"between two positions of this table lie {steps.max():.4g} m: no satellite is so fast",
+            f"two successive positions are {steps.max():.4g} m apart: no satellite is that fast",
             field="orbit",
-            remedy="the file is damaged: copy it again; or give positions in ECEF metres at times in seconds",
+            remedy="give ECEF metres and seconds; if they are, the file is damaged: copy it again",
         )
     turn_times, turns = _table(attitude, (3, 3), needed, degree, "attitude")
     if not are_rotations(turns):
@@ -101,10 +99,10 @@ def pushbroom_of_tables(
         sites, (lagrange(times, positions, sites)[0] - origin) @ orbital, degree, path_breaks, min(degree, 2)
     )
     body = orbital.T @ turns
-    mounted = None if mounting is None else np.asarray(mounting, dtype=np.float64)
-    if mounted is None:
-        mounted = body[int(np.argmin(np.abs(turn_times - last / 2)))]
-        body = body @ mounted.T
+    camera_axes = None if mounting is None else np.asarray(mounting, dtype=np.float64)
+    if camera_axes is None:
+        camera_axes = body[int(np.argmin(np.abs(turn_times - last / 2)))]
+        body = body @ camera_axes.T
     angles = np.unwrap(angles_of(body), axis=0)
     turned = _attitude_spline(turn_times, angles, (low, high), splines)
     near = (turn_times >= turned.breaks[0]) & (turn_times <= turned.breaks[-1])
@@ -114,7 +112,7 @@ def pushbroom_of_tables(
         line_period=line_period,
         origin=origin[0],
         orbital=orbital,
-        mounting=mounted,
+        mounting=camera_axes,
         path=path,
         attitude=turned,
         lever=np.asarray(lever, dtype=np.float64),
@@ -130,16 +128,26 @@ def pushbroom_of_tables(
 
 
 def rotations_of_quaternions(quaternions: ArrayLike, *, scalar: str = "first") -> Array:
-    """Return rotations ``(N, 3, 3)`` of quaternions ``(N, 4)``, which need not be normalised.
+    """Return rotations ``(N, 3, 3)`` from quaternions ``(N, 4)``, which need not be normalised.
 
     Parameters
     ----------
     scalar : {'first', 'last'}
-        Where the scalar part stands (Pleiades: first; WorldView and QuickBird: last).
+        Position of the scalar part (Pleiades: first; WorldView and QuickBird: last).
+
+    Raises
+    ------
+    InputError
+        If the shape is wrong, or a quaternion is zero or not finite.
+
+    Examples
+    --------
+    >>> rotations_of_quaternions([[2.0, 0.0, 0.0, 0.0]])[0].tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     q = np.asarray(quaternions, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != 4 or scalar not in ("first", "last"):
-        raise InputError("quaternions are N x 4 numbers, their scalar first or last", field="quaternions")
+        raise InputError("quaternions must be N x 4 numbers, with the scalar first or last", field="quaternions")
     if not (np.linalg.norm(q, axis=1) > 0).all():
         raise InputError("a quaternion is zero or not finite", field="quaternions")
     from scipy.spatial.transform import Rotation
@@ -149,15 +157,16 @@ def rotations_of_quaternions(quaternions: ArrayLike, *, scalar: str = "first") -
 
 
 def rotations_of_angles(angles: ArrayLike, positions: ArrayLike, velocities: ArrayLike) -> Array:
-    """Return rotations ``(N, 3, 3)`` to ECEF of roll, pitch, yaw (rad) against the orbital axes of every moment.
+    """Return rotations ``(N, 3, 3)`` to ECEF from roll, pitch, yaw (rad) relative to the orbital axes of each time.
 
-    Signs and sequence are those of `ortho_pipeline.models.pushbroom.scanner`; X is along the inertial velocity, Z away
-    from the Earth's centre. A vendor who counts from forward, right, down has pitch and yaw of the other sign.
+    Signs and sequence are those of `ortho_pipeline.models.pushbroom.scanner`. X is along the inertial velocity, Z away
+    from the Earth's centre. Negate pitch and yaw of a vendor whose axes are forward, right, down.
 
     Parameters
     ----------
+    angles : (N, 3)
     positions, velocities : (N, 3)
-        In ECEF (m, m/s), at the times of the angles; velocities relative to the turning Earth.
+        In ECEF (m, m/s) at the times of the angles; velocities relative to the rotating Earth.
     """
     pairs = zip(np.asarray(positions, dtype=float), np.asarray(velocities, dtype=float), strict=True)
     down = np.array([orbital_from_ecef(position, velocity) for position, velocity in pairs])
@@ -172,20 +181,23 @@ def _table(
     degree: int,
     name: str,
 ) -> tuple[Array, Array]:
-    """Return times after the first row and values of a table, checked; `needed`: first time, last after it, row (s)."""
+    """Return checked times (after the first row) and values of a table.
+
+    `needed` are the first time, the time of the last row after it, and the time of a row (s).
+    """
     first, last, row = needed
     slack = max(row, _BEYOND[name] * abs(last))
     times, values = (np.asarray(part, dtype=np.float64) for part in table)
     if times.ndim != 1 or values.shape != (len(times), *shape) or len(times) <= degree:
         raise InputError(f"more than {degree} times with {shape} values each are needed", field=name)
     if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
-        raise InputError("a table has finite values at increasing times", field=name)
+        raise InputError("a table needs finite values at increasing times", field=name)
     times = times - first
     earliest, latest = sorted((0.0, last))
-    # The rim of a row more or less is not a reason to refuse a table: vendors' tables end at centres of rows.
+    # Tolerate a missing row: vendors' tables end at centres of rows.
     if times[0] > earliest + slack or times[-1] < latest - slack:
         raise InputError(
-            f"this table is from {times[0]:.6g} to {times[-1]:.6g} s after the first row, the image from"
+            f"this table covers {times[0]:.6g} to {times[-1]:.6g} s after the first row, but the image needs"
             f" {earliest:.6g} to {latest:.6g} s",
             field=name,
             remedy="give a table that covers the image, in the time system of first_time",
@@ -194,38 +206,56 @@ def _table(
 
 
 def _followed(last: float, *tables: Array) -> tuple[float, float]:
-    """Return the times for which path and attitude are made: half an image beyond both ends, as far as the tables go.
+    """Return the time range of path and attitude: half an image beyond both ends, within the tables.
 
-    Points outside of the image are legal.
+    Points outside the image are allowed.
     """
     before, after = sorted((-0.5 * last, 1.5 * last))
     return max(before, *(times[0] for times in tables)), min(after, *(times[-1] for times in tables))
 
 
 def lagrange(times: Array, values: Array, wanted: Array) -> tuple[Array, Array]:
-    """Return values and rates ``(n, 3)`` at `wanted` ``(n,)`` by Lagrange's polynomial through eight neighbours."""
+    """Interpolate a table with Lagrange's polynomial through eight neighbours.
+
+    Parameters
+    ----------
+    times, values : (N,), (N, 3)
+    wanted : (n,)
+        Times of the results.
+
+    Returns
+    -------
+    (n, 3), (n, 3)
+        Values and rates.
+
+    Examples
+    --------
+    >>> times = np.arange(9.0)
+    >>> lagrange(times, np.outer(times**2, np.ones(3)), np.array([2.5]))[0].round(6)
+    array([[6.25, 6.25, 6.25]])
+    """
     count = min(_NEIGHBOURS, len(times))
-    found, rates = np.empty((len(wanted), 3)), np.empty((len(wanted), 3))
+    interpolated, rates = np.empty((len(wanted), 3)), np.empty((len(wanted), 3))
     for k, time in enumerate(wanted):
         first = int(np.clip(np.searchsorted(times, time) - count // 2, 0, len(times) - count))
         near = times[first : first + count]
-        # Divided by their span, so that the powers stay near one.
+        # Scaled by their span, so that powers stay near one.
         span = near[-1] - near[0]
         nodes, middle = (near - time) / span, values[first + count // 2]
         terms = np.linalg.solve(np.vander(nodes, increasing=True), values[first : first + count] - middle)
-        found[k], rates[k] = middle + terms[0], terms[1] / span
-    return found, rates
+        interpolated[k], rates[k] = middle + terms[0], terms[1] / span
+    return interpolated, rates
 
 
 def _attitude_spline(times: Array, angles: Array, span: tuple[float, float], form: SplineForm) -> Spline:
-    """Return a spline through the rows of a table around the image, or that fits them with fewer polynomials."""
+    """Return a spline through the rows of a table around the image, or one that fits them with fewer polynomials."""
     (low, high), degree = span, form.degree
     first = int(np.clip(np.searchsorted(times, low, side="right") - 1, 0, len(times) - degree - 1))
     last = max(int(np.searchsorted(times, high)), first + degree)
     near, values = times[first : last + 1], angles[first : last + 1]
     if form.attitude:
         return Spline.fitted(near, values, degree, np.linspace(near[0], near[-1], form.attitude + 1), 1)
-    from scipy.interpolate import make_interp_spline  # takes half of the start-up of a command
+    from scipy.interpolate import make_interp_spline  # takes half of the start-up time of a command
 
     through = make_interp_spline(near, values, degree)
     return Spline(degree, np.unique(through.t), through.c, 1)
