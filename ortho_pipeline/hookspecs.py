@@ -196,10 +196,12 @@ class Scene:
 
         if correction not in CORRECTIONS:
             raise InputError(
-                f"there is no correction {correction!r}", field="correction", remedy=f"one of {', '.join(CORRECTIONS)}"
+                f"unknown correction {correction!r}", field="correction", remedy=f"use one of {', '.join(CORRECTIONS)}"
             )
         if not self.models:
-            raise InputError("this image has no model", file=self.path, field="model", remedy="open it with a sensor")
+            raise InputError(
+                "this image has no sensor model", file=self.path, field="model", remedy="open it with a sensor"
+            )
         if correction == OWN:
             own = self.model if self.adjustable is None else self.models[self.adjustable]
             return fit_own(own, points, self.priors)

@@ -95,14 +95,14 @@ def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> S
     from ortho_pipeline.raster.source import open_dataset
 
     _assert_none(sensor_faults(sensor))
-    assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names are in lower case, without blanks"
-    assert sensor.description.strip(), "a sensor has a description"
-    assert all(text.strip() for text in sensor.options.values()), "every option has a line of help"
+    assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names must be lower case, without blanks"
+    assert sensor.description.strip(), "a sensor needs a description"
+    assert all(text.strip() for text in sensor.options.values()), "every option needs a line of help"
     undeclared = set(options) - set(sensor.options)
     assert not undeclared, f"the sensor does not declare the options {sorted(undeclared)}"
     dataset = open_dataset(path)
     recognised = sensor.recognises(dataset)
-    assert isinstance(recognised, bool), f"recognises returns True or False, not {recognised!r}"
+    assert isinstance(recognised, bool), f"recognises must return True or False, not {recognised!r}"
     assert recognised or options, f"the sensor does not recognise {path}"
     _check_foreign(sensor)
     scene = sensor.open_scene(dataset, **options)
@@ -133,30 +133,32 @@ def _check_foreign(sensor: Sensor) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "foreign.tif"))
-        made = {"MEM": "a raster in memory (without a file name)", "GTiff": "a TIFF with nothing beside it"}
-        for driver, what in made.items():
+        foreign = {"MEM": "a raster in memory (without a file name)", "GTiff": "a TIFF without other files"}
+        for driver, what in foreign.items():
             dataset = gdal.GetDriverByName(driver).Create("" if driver == "MEM" else path, 4, 4)
             try:
                 recognised = sensor.recognises(dataset)
             except Exception as error:
                 text = described(error, sensor.recognises)
-                raise AssertionError(f"recognises of {what} failed ({text}): False, not an exception") from error
-            assert not recognised, f"recognises returns {recognised!r} for {what}, which is not of this sensor"
+                raise AssertionError(
+                    f"recognises failed for {what} ({text}); it must return False, not raise an exception"
+                ) from error
+            assert not recognised, f"recognises returns {recognised!r} for {what}, which is not from this sensor"
             dataset = None
 
 
 def _check_near(model: SensorModel, size: tuple[int, int]) -> None:
     """Check that domain and image are of one place: a box in other units is the commonest mistake."""
-    asked = "domain must be (centre, half-size), not (low, high), in the units of crs and x (longitude) first"
+    rule = "domain must be (centre, half-size), not (low, high), in the units of crs and x (longitude) first"
     image = model.ground_to_image(_points_in(model))
     middle = np.array(size) / 2
     apart = np.abs((image - middle) / np.maximum(size, _SMALL)).max(axis=1)
-    assert np.isfinite(apart).any(), f"no point of the domain has an image: {asked}"
-    assert np.nanmin(apart) <= WIDEST, f"the domain lies {np.nanmin(apart):.0f} image sizes off the image: {asked}"
-    assert np.nanmax(apart) <= WIDEST, f"the domain reaches {np.nanmax(apart):.0f} image sizes off the image: {asked}"
+    assert np.isfinite(apart).any(), f"the model projects no point of its domain into the image; {rule}"
+    assert np.nanmin(apart) <= WIDEST, f"the domain is {np.nanmin(apart):.0f} image sizes away from the image; {rule}"
+    assert np.nanmax(apart) <= WIDEST, f"the domain extends {np.nanmax(apart):.0f} image sizes beyond the image; {rule}"
     ground = model.image_to_ground(middle[None], model.reference_height)
     assert np.isfinite(ground).all(), (
-        f"the middle of the image meets no ground within the domain at the height {model.reference_height:g} m: {asked}"
+        f"the middle of the image has no ground within the domain at the height {model.reference_height:g} m; {rule}"
     )
 
 
@@ -170,26 +172,26 @@ def _points_in(model: SensorModel) -> NDArray[np.float64]:
 def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[np.float64]:
     image = model.ground_to_image(ground)
     n = len(ground)
-    assert isinstance(image, np.ndarray), f"ground_to_image returns an array, not {type(image).__name__}"
-    assert image.shape == (n, 2), f"ground_to_image of {counted(n, 'point')} returns ({n}, 2), not {image.shape}"
-    assert image.dtype == np.float64, f"image points are float64, not {image.dtype}"
-    assert np.isfinite(image).all(), f"{np.isnan(image).any(axis=1).sum()} of the points given do not project"
+    assert isinstance(image, np.ndarray), f"ground_to_image must return an array, not {type(image).__name__}"
+    assert image.shape == (n, 2), f"ground_to_image of {counted(n, 'point')} must return ({n}, 2), not {image.shape}"
+    assert image.dtype == np.float64, f"image points must be float64, not {image.dtype}"
+    assert np.isfinite(image).all(), f"the model does not project {np.isnan(image).any(axis=1).sum()} of the points"
     singles = np.concatenate([model.ground_to_image(point[None]) for point in ground])
     worst = np.abs(singles - image).max()
-    assert worst < 1e-7, f"{n} points at once and one at a time differ by {worst:g} px"
-    assert model.ground_to_image(np.empty((0, 3))).shape == (0, 2), "no points give an empty (0, 2)"
+    assert worst < 1e-7, f"{n} points together and each alone differ by {worst:g} px"
+    assert model.ground_to_image(np.empty((0, 3))).shape == (0, 2), "for no points, the result must be empty (0, 2)"
     holed = ground.copy()
     for axis in range(3):
         holed[axis, axis] = np.nan
     result = model.ground_to_image(holed)
-    assert np.isnan(result[:3]).all(), "a point with a NaN in any coordinate projects to a row of NaN"
+    assert np.isnan(result[:3]).all(), "a point with a NaN coordinate must project to a row of NaN"
     assert np.allclose(result[3:], image[3:], rtol=0, atol=1e-7), "a NaN in one point changes other points"
     before = ground.copy()
     model.ground_to_image(ground)
     assert np.array_equal(before, ground), "ground_to_image changes its argument"
     lo, hi = model.height_range
-    assert lo < hi, f"height_range goes from {lo} to {hi}"
-    assert lo <= model.reference_height <= hi, "reference_height lies within height_range"
+    assert lo < hi, f"height_range must increase, not go from {lo} to {hi}"
+    assert lo <= model.reference_height <= hi, "reference_height must be within height_range"
     return image
 
 
@@ -207,36 +209,36 @@ def _check_far(model: SensorModel) -> None:
     ):
         try:
             with np.errstate(all="ignore"):
-                found = method(points)
+                result = method(points)
         except Exception as error:
             raise AssertionError(
-                f"{name} of points far away failed ({described(error, type(model))}): must be NaN where there is none"
+                f"{name} of distant points failed ({described(error, type(model))}); it must return NaN there"
             ) from error
-        assert not np.isinf(found).any(), f"{name} of points far away returned inf: must be NaN where there is none"
+        assert not np.isinf(result).any(), f"{name} of distant points returned inf; it must return NaN there"
 
 
 def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
     back = model.image_to_ground(image, ground[:, 2])
-    assert back.shape == ground.shape, f"image_to_ground returns {ground.shape}, not {back.shape}"
+    assert back.shape == ground.shape, f"image_to_ground must return {ground.shape}, not {back.shape}"
     assert np.isfinite(back).all(), (
         f"{counted(np.isnan(back).any(axis=1).sum(), 'point has', 'points have')} no inverse"
     )
-    assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground returns the height that it was given"
+    assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground must return the given heights"
     worst = np.abs(model.ground_to_image(back) - image).max()
-    assert worst < CLOSURE, f"ground to image to ground to image closes only to {worst:g} px, not {CLOSURE:g}"
+    assert worst < CLOSURE, f"image to ground and back differs by {worst:g} px; at most {CLOSURE:g} px are allowed"
     # A second root of the same image point would close as well.
     apart = np.abs((back - ground) / model.domain[1]).max()
-    assert apart < 1e-6, f"image_to_ground found another point, {apart:g} half-sizes of the domain away"
+    assert apart < 1e-6, f"image_to_ground returned another point, {apart:g} half-sizes of the domain away"
     broken = image.copy()
     broken[0, 0] = np.nan
     result = model.image_to_ground(broken, ground[:, 2])
-    assert np.isnan(result[0]).all(), "an image point with a NaN has a row of NaN for its ground"
-    assert np.isfinite(result[1:]).all(), "a NaN in one image point harms the others"
+    assert np.isnan(result[0]).all(), "the ground of an image point with NaN must be a row of NaN"
+    assert np.isfinite(result[1:]).all(), "a NaN in one image point changes other points"
 
 
 def _check_ground_partials(model: SensorModel, ground: NDArray[np.float64]) -> None:
     partials = model.ground_partials(ground)
-    assert partials.shape == (len(ground), 2, 3), f"ground_partials returns (N, 2, 3), not {partials.shape}"
+    assert partials.shape == (len(ground), 2, 3), f"ground_partials must return (N, 2, 3), not {partials.shape}"
     image, also = model.projected(ground)
     np.testing.assert_allclose(image, model.ground_to_image(ground), rtol=1e-12, err_msg="projected")
     np.testing.assert_allclose(also, partials, rtol=1e-9, atol=1e-12, err_msg="partials of projected")
@@ -253,12 +255,12 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     params = np.asarray(model.params, dtype=np.float64)
     n = len(model.param_names)
     assert params.shape == (n,), f"params has the shape {params.shape}, but there are {n} param_names"
-    assert len(set(model.param_names)) == n, "param_names has a name twice"
+    assert len(set(model.param_names)) == n, "a name appears twice in param_names"
     same = model.with_params(params)
     assert np.array_equal(same.params, params), "with_params(params) does not give the parameters back"
     assert np.allclose(same.ground_to_image(ground), image, rtol=0, atol=1e-9), "with_params(params) is another model"
     partials = model.param_partials(ground)
-    assert partials.shape == (len(ground), 2, n), f"param_partials returns (N, 2, {n}), not {partials.shape}"
+    assert partials.shape == (len(ground), 2, n), f"param_partials must return (N, 2, {n}), not {partials.shape}"
     shared = model.linearised(ground)
     np.testing.assert_allclose(shared[0], model.ground_to_image(ground), rtol=1e-12, err_msg="linearised")
     np.testing.assert_allclose(shared[2], partials, rtol=1e-9, atol=1e-12, err_msg="param_partials of linearised")
@@ -278,9 +280,9 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
 def _check_order(model: SensorModel, params: NDArray[np.float64], partials: NDArray[np.float64]) -> None:
     """Check that `with_params` takes values in the order of `params`, by values that all differ."""
     steps = 0.01 * np.arange(1, len(params) + 1) / np.abs(partials).max(axis=(0, 1), initial=0.0)
-    found = model.with_params(params + steps).params
-    assert (np.abs(found - params - steps) <= 1e-6 * steps + 1e-15 * np.abs(params)).all(), (
-        "with_params(values).params are other values: they come in the order of param_names"
+    values = model.with_params(params + steps).params
+    assert (np.abs(values - params - steps) <= 1e-6 * steps + 1e-15 * np.abs(params)).all(), (
+        "with_params(values).params differ from values; values are in the order of param_names"
     )
 
 
@@ -290,12 +292,12 @@ def _assert_predicts(
     miss = np.abs(predicted - moved).max()
     # Differences of image coordinates of some 1e5 px carry rounding of 1e-9 px.
     allowed = PARTIALS * np.abs(moved).max() + 1e-8 * max(1.0, np.abs(image).max() / 1e5)
-    assert miss <= allowed, f"{what} misses a nudge by {miss:g} px (allowed {allowed:g})"
+    assert miss <= allowed, f"{what} differs from finite differences by {miss:g} px (allowed {allowed:g})"
 
 
 def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
     data = model.to_dict()
-    assert data.get("kind") == model.kind, f"to_dict has the kind {data.get('kind')!r}, the class {model.kind!r}"
+    assert data.get("kind") == model.kind, f"kind is {data.get('kind')!r} in to_dict, but {model.kind!r} in the class"
     try:
         text = json.dumps(data, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -309,12 +311,12 @@ def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     try:
         pickled = pickle.loads(pickle.dumps(model))
     except (pickle.PickleError, AttributeError, TypeError) as error:
-        raise AssertionError(f"models go to other processes, so they can be pickled: {error}") from error
+        raise AssertionError(f"the model cannot be pickled, which other processes need: {error}") from error
     _check_copy(pickled, model, ground, image, "pickle")
 
 
 def _check_copy(
     copy: SensorModel, model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64], how: str
 ) -> None:
-    assert type(copy) is type(model), f"{how} gives a {type(copy).__name__} back"
-    assert np.array_equal(copy.ground_to_image(ground), image), f"{how} gives another model back"
+    assert type(copy) is type(model), f"{how} returns a {type(copy).__name__}"
+    assert np.array_equal(copy.ground_to_image(ground), image), f"{how} returns another model"

@@ -102,8 +102,8 @@ def refuse_many(names: Sequence[str], count: int, what: str, source: str, remedy
     if len(names) > REJECTED_LIMIT * count:
         some = ", ".join(names[:NAMED]) + (" ..." if len(names) > NAMED else "")
         raise DegeneratePoints(
-            f"{len(names)} of {counted(count, what)} contradict the others ({some}): which of them are wrong cannot be "
-            "decided",
+            f"{len(names)} of {counted(count, what)} contradict the others ({some}), too many "
+            "to decide which are wrong",
             file=source or None,
             remedy=remedy,
         )
@@ -131,8 +131,8 @@ def _restarted(problem: Problem, keep: np.ndarray) -> Problem:
 
 def _reason(size: float) -> str:
     if not math.isfinite(size):
-        return "gross error, for the other points put it outside of the model"
-    return f"gross error, {size:.1f} px from where the other points put it"
+        return "gross error: the fit to the other points does not project it"
+    return f"gross error: {size:.1f} px from where the other points predict it"
 
 
 def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
@@ -285,13 +285,15 @@ class OutlyingPoint(Record):
     @classmethod
     def of(cls, name: str, role: Role, distance: float, expected: float, chance: float, leverage: float = 0.0) -> Self:
         """Return it with the sentence about it, without its name."""
-        said = f"{distance:.3g} px from where the others put it, {expected:.2g} px expected: measure it again, for it "
+        text = (
+            f"{distance:.3g} px from where the other points predict it ({expected:.2g} px expected). Measure it again: "
+        )
         if role == "check":
-            said += "counts in the RMSE of the check points all the same"
+            text += "it still counts in the RMSE of the check points"
         else:
-            said += f"stays in the adjustment (leverage {leverage:.2f})"
+            text += f"it still takes part in the adjustment (leverage {leverage:.2f})"
         return cls(
-            id=name, role=role, distance=distance, expected=expected, chance=chance, leverage=leverage, reason=said
+            id=name, role=role, distance=distance, expected=expected, chance=chance, leverage=leverage, reason=text
         )
 
 
@@ -435,11 +437,12 @@ def checks_apart(
     far = np.lexsort((-sizes, ~off))[: min(NAMED, int(off.sum()) or 3)]
     beyond = outside_of_hull(points.image[used], checks.problem.image[off])
     without = "" if rest is None else f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
-    agree = "check points are wrong, or the model is poor between the control points"
+    cause = "Either check points are wrong, or the model is poor between the control points"
     text = (
-        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}: RMSE {rms(sizes):.3g} px"
-        f"{'' if len(ids) == 1 else f' over all {len(ids)}'}{without}, where {rms(usual):.2g} px was to be expected "
-        f"from the control points; {agree if apart or rest is None else 'the others agree with them'}"
+        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}. "
+        f"RMSE {rms(sizes):.3g} px{'' if len(ids) == 1 else f' of all {len(ids)}'}{without}; "
+        f"{rms(usual):.2g} px expected from the control points. "
+        f"{cause if apart or rest is None else 'The other check points agree with the control points'}"
     )
     return [
         Notice(
@@ -476,7 +479,7 @@ def contradicting(
 ) -> str:
     """Say how many points of a role contradict `what`: `off` of `count`, or all together; and the farthest by name."""
     shown = points[:3]
-    named = f"({'farthest ' if (off or count) > len(shown) else ''}{', '.join(shown)})"
+    named = f"({'worst: ' if (off or count) > len(shown) else ''}{', '.join(shown)})"
     if not off:
         return f"{counted(count, f'{role} point')} together contradict {what} {named}"
     of = "" if off == count else f"{off} of "

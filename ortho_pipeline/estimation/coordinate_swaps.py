@@ -27,19 +27,19 @@ Swap = Callable[[Array, Array, float], tuple[Array, Array]]
 
 #: What is wrong with the file, how the corrected image and ground points are made, and what to do.
 SWAPS: dict[str, tuple[Swap, str]] = {
-    "x and y of the ground are exchanged (latitude before longitude?)": (
+    "ground x and y are swapped (latitude before longitude?)": (
         lambda image, ground, rows: (image, ground[:, [1, 0, 2]]),
         "give x (longitude, easting) before y (latitude, northing)",
     ),
-    "column and row are exchanged": (
+    "column and row are swapped": (
         lambda image, ground, rows: (image[:, ::-1], ground),
         "give the column before the row",
     ),
-    "x and y, and column and row, are exchanged": (
+    "x and y, and column and row, are swapped": (
         lambda image, ground, rows: (image[:, ::-1], ground[:, [1, 0, 2]]),
         "give x before y and the column before the row",
     ),
-    "the sign of the rows is negative": (
+    "the rows are negative": (
         lambda image, ground, rows: (image * [1.0, -1.0], ground),
         "give rows downwards from the top of the image, as positive numbers",
     ),
@@ -90,19 +90,19 @@ def refuse_swapped(model: SensorModel, points: Points, rows: int) -> None:
         found[what] = _misfit(model, replace(points, image=image, ground=ground))
     best = min(found, key=lambda what: found[what])
     if found[best] * BETTER < as_given and np.isfinite(found[best]):
-        now = f"{as_given:.0f} px off" if np.isfinite(as_given) else "outside of the model's domain"
+        now = f"{as_given:.0f} px off" if np.isfinite(as_given) else "outside the model's domain"
         raise InputError(
-            f"the points are {now} as given, and {found[best]:.1f} px with one change: {best}",
+            f"{best}. As given, the points are {now}; with this corrected, they are {found[best]:.1f} px off",
             file=points.source,
             remedy=SWAPS[best][1],
         )
     if not np.isfinite(as_given):
         raise InputError(
-            "most points lie outside of the model's domain",
+            "most points are outside the model's domain",
             file=points.source,
             field="CRS",
             remedy=Text(
-                "check the coordinate system of the points (",
+                "check the CRS of the points (",
                 Setting("points.crs"),
                 ") and that they belong to this scene",
             ),

@@ -39,19 +39,19 @@ def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> 
     factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.errors.sigma))
     if np.isnan(spread).all() and strength is None:
         raise DegeneratePoints(
-            "how certain the model is cannot be said: no corner of the ground that it is meant for has an image",
+            "the uncertainty of the model is unknown: it projects no corner of its domain into the image",
             file=source,
             field="domain",
-            remedy="check the metadata of the scene; of a plugin, that domain is (centre, half-size) in units of crs",
+            remedy="check the metadata of the scene. In a plugin: domain must be (centre, half-size) in units of crs",
         )
     if np.isnan(spread).all():
         factor = math.inf
     if factor > EXTRAPOLATION_LIMIT and strength is None:
         raise DegeneratePoints(
-            f"the control points do not determine the whole scene: at a corner the model is {factor:.0f} times less "
-            "certain than a measured point",
+            "the control points do not determine the model over the whole scene: at a corner, its uncertainty is "
+            f"{factor:.0f} times that of a measured point",
             file=source,
-            remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
+            remedy="spread the points over the image (for 3D models also over height), or use a simpler model",
         )
     return factor
 
@@ -59,7 +59,7 @@ def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> 
 def uncertain_edge(factor: float) -> list[Notice]:
     if factor <= EXTRAPOLATION_WARNING:
         return []
-    text = f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"
+    text = f"uncertain at the edge: at a corner, the model's uncertainty is {factor:.0f} times that of a measured point"
     return [Notice("uncertain-at-edge", text, factor=factor)]
 
 
@@ -69,8 +69,9 @@ def unstable(solution: Solution, strength: float | None) -> list[Notice]:
         if solution.condition <= UNSTABLE:
             return []
         text = (
-            f"unstable: the points determine {solution.effective:.1f} of {counted(len(names), 'parameter')} (condition "
-            f"{solution.condition:.0e}); regularisation ({strength:.1e}) decides the others: trust check points only"
+            f"unstable: the points determine only {solution.effective:.1f} of {counted(len(names), 'parameter')} "
+            f"(condition number {solution.condition:.0e}). Regularisation ({strength:.1e}) sets the others. "
+            "Trust only check points"
         )
         return [Notice("unstable", text, condition=solution.condition)]
     if solution.condition <= UNSTABLE or len(names) < 2:
@@ -79,12 +80,11 @@ def unstable(solution: Solution, strength: float | None) -> list[Notice]:
             return []
         first, second = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
         text = (
-            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters is', 'pairs of parameters are')} "
-            f"correlated beyond {_INSEPARABLE} "
-            f"({names[first]} and {names[second]} the most): they cannot be told apart"
+            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters', 'pairs of parameters')} cannot be "
+            f"separated: correlation above {_INSEPARABLE} (highest: {names[first]} and {names[second]})"
         )
         return [Notice("inseparable-parameters", text, parameters=[names[first], names[second]])]
-    text = f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"
+    text = f"unstable: the condition number of the adjustment is {solution.condition:.0e}. A simpler model is safer"
     return [Notice("unstable", text, condition=solution.condition)]
 
 
@@ -93,7 +93,7 @@ def nothing_adjusted(model: SensorModel, points: Points) -> list[Notice]:
     if model.param_names or isinstance(model, ImageCorrection) or not points.control.any():
         return []
     text = (
-        f"nothing was adjusted: a model {model.kind!r} has no parameters of its own; "
-        'scene.fit(points, "shift") adjusts a correction over it'
+        f"nothing was adjusted: the model {model.kind!r} has no parameters of its own. "
+        'Adjust a correction: scene.fit(points, "shift")'
     )
     return [Notice("nothing-adjusted", text)]

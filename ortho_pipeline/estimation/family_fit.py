@@ -40,9 +40,9 @@ def fit_own(
     """
     if not model.param_names:
         raise InputError(
-            f"a model {model.kind!r} has no parameters of its own to adjust",
+            f"the model {model.kind!r} has no parameters of its own to adjust",
             field="points.correction",
-            remedy="take shift, shift-drift or affine",
+            remedy="use shift, shift-drift or affine",
         )
     return fit(model, points, priors=priors, robust=robust, name=f"{model.kind}+{OWN}")
 
@@ -115,7 +115,7 @@ def fit_family(
             Text(f"{family}: ", error.message),
             file=error.file,
             field=error.field,
-            remedy=Text(error.remedy or "", f"; these points do determine {simpler}"),
+            remedy=Text(error.remedy or "", f"; these points are enough for {simpler}"),
         ) from error
 
 
@@ -132,9 +132,11 @@ def restricted(model: SensorModelT, params: Sequence[str] | None) -> SensorModel
     unknown = [name for name in params if name not in model.param_names]
     if unknown or not params:
         raise InputError(
-            f"no parameter is called {', '.join(unknown)}" if unknown else "no parameter is named",
+            f"unknown parameter {', '.join(unknown)}" if unknown else "no parameter given",
             field="points.params",
-            remedy=f"some of {', '.join(model.param_names) or 'none: this model has no parameters'}",
+            remedy=f"use some of {', '.join(model.param_names)}"
+            if model.param_names
+            else "this model has no parameters",
         )
     rest = [name for name in model.param_names if name not in params]
     return model.without(rest) if rest else model
@@ -155,9 +157,9 @@ def ridge_of(text: str) -> float | str | None:
     weight = number_of(text)
     if not weight > 0:
         raise InputError(
-            f"{text!r} is not a regularisation",
+            f"unknown regularisation {text!r}",
             field="points.ridge",
-            remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
+            remedy=f"use auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
         )
     return weight
 
@@ -232,10 +234,10 @@ def prune(found: Fit, *, significance: float | None = None) -> Pruned:
     """
     significance = found.significance if significance is None else significance
     if not 0 < significance < 1:
-        raise InputError("a significance lies between 0 and 1", field="significance")
+        raise InputError("the significance must be between 0 and 1", field="significance")
     if found.sigma0 is None:
         raise InputError(
-            "without redundancy no parameter can be tested", field="points.prune", remedy="give more control points"
+            "there is no redundancy, so parameters cannot be tested", field="points.prune", remedy="add control points"
         )
     removed: list[Removed] = []
     while True:

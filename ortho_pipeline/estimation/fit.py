@@ -296,9 +296,9 @@ def fit(
     """
     if not isinstance(model, SensorModel):
         raise InputError(
-            f"a {type(model).__name__} is no sensor model, and has nothing to adjust",
+            f"a {type(model).__name__} is not a sensor model",
             field="model",
-            remedy='give a model; of a scene: scene.fit(points, "shift")',
+            remedy='pass a model; for a scene, use scene.fit(points, "shift")',
         )
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
@@ -381,11 +381,10 @@ def _posed(
     projected = np.asarray(np.isfinite(raw).all(axis=1))
     if len(points) and not projected.any():
         raise InputError(
-            f"none of the {counted(len(points), 'point')} has an image by the model {model.kind!r}: no height, or "
-            "outside of "
-            "where the model is defined",
+            f"the model {model.kind!r} projects none of the points ({len(points)}): they have no height, or are "
+            "outside its domain",
             file=points.source or None,
-            remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
+            remedy="check CRS and heights of the points, and that points and model belong to this scene",
         )
     usable = points.control & projected
     wrong = np.zeros(len(points), dtype=bool)
@@ -478,7 +477,7 @@ def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list
             found.append(
                 Notice(
                     "no-projection",
-                    f"{role} points without a projection (no height, or outside the model's domain): "
+                    f"the model cannot project these {role} points (no height, or outside its domain): "
                     f"{', '.join(names)}",
                     role=role,
                     points=names,

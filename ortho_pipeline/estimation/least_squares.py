@@ -138,7 +138,7 @@ def minimise(
     # In a valley without a bottom the caller tells what is undetermined by the condition of the design.
     if arrived or condition_of(slopes(params)) > singular:
         return params
-    raise NotConverged("the adjustment did not converge", remedy="give better start values or fewer parameters")
+    raise NotConverged("the adjustment did not converge", remedy="give better start values, or adjust fewer parameters")
 
 
 def _gauss_newton(residuals: Callable[[Array], Array], slopes: Callable[[Array], Array], params: Array) -> Array | None:

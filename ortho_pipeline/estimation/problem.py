@@ -112,9 +112,9 @@ class Problem:
         unknown = sorted(set(priors) - set(model.param_names))
         if unknown:
             raise InputError(
-                f"a prior names parameters that the model does not have: {', '.join(unknown)}",
+                f"priors for parameters that the model does not have: {', '.join(unknown)}",
                 field="priors",
-                remedy=f"its parameters are {', '.join(model.param_names) or 'none'}",
+                remedy=f"the model has these parameters: {', '.join(model.param_names) or 'none'}",
             )
         rows = np.flatnonzero(usable)
         chosen = points.select(rows)
@@ -186,18 +186,18 @@ class Problem:
         least = self.model.minimum_points if not known else math.ceil((count - known) / 2)
         if points < least:
             raise TooFewPoints(
-                f"{counted(points, 'control point does', 'control points do')} not determine "
+                f"{counted(points, 'control point is', 'control points are')} not enough for "
                 f"{counted(count, 'parameter')}",
                 file=self.points.source,
-                remedy=f"give at least {counted(least, 'control point')}, or a simpler model",
+                remedy=f"give at least {counted(least, 'control point')}, or use a simpler model",
             )
 
     def _determined(self, condition: float) -> None:
         if condition > CONDITION_LIMIT:
             raise DegeneratePoints(
-                f"the control points do not determine all parameters (condition {condition:.1e})",
+                f"the control points do not determine all parameters (condition number {condition:.1e})",
                 file=self.points.source,
-                remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
+                remedy="spread the points over the image (for 3D models also over height), or use a simpler model",
             )
 
     def _pseudo(self, model: SensorModel) -> tuple[Array, Array, np.ndarray]:

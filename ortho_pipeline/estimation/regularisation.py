@@ -51,15 +51,15 @@ def regularised(
     """
     model = problem.model
     if not isinstance(model, Rational) or not model.penalised:
-        raise InputError("only models with higher terms can be regularised", field="ridge")
+        raise InputError("only models with higher-order terms can be regularised", field="ridge")
     if isinstance(ridge, str):
         if ridge not in METHODS:
             raise InputError(
-                f"{ridge!r} chooses no regularisation", field="ridge", remedy=f"{', '.join(METHODS)} or a number"
+                f"unknown regularisation {ridge!r}", field="ridge", remedy=f"use {', '.join(METHODS)} or a number"
             )
         return _chosen(problem, keep, ridge, model, 1 if linear else _ROUNDS)
     if not (math.isfinite(ridge) and ridge > 0):
-        raise InputError("a regularisation is a positive number", field="ridge")
+        raise InputError("the weight of the regularisation must be a positive number", field="ridge")
     return problem.with_ridge(_sigmas(problem, model, ridge)), float(ridge)
 
 

@@ -22,15 +22,15 @@ from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import open_dataset
 
-_COPY_IT = "correct what the file says there, or copy it again from the delivery"
+_COPY_IT = "correct this field, or copy the file again from the delivery"
 _COPY_AGAIN = Text(
-    "copy the metadata again from the delivery, or give a sound model (",
+    "copy the metadata again from the delivery, or give another model (",
     Setting("scene.rpc", "FILE"),
     ", ",
     Setting("scene.model", "FILE"),
     ")",
 )
-_TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
+_TEST_IT = "report it to the author of the plugin; authors: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
 
@@ -178,7 +178,7 @@ class Host:
             if name not in chosen.options:
                 declared = ", ".join(chosen.options) or "none"
                 raise InputError(
-                    f"the sensor {chosen.name!r} has no option {name!r} (its options: {declared})",
+                    f"the sensor {chosen.name!r} has no option {name!r}; its options: {declared}",
                     file=path,
                     field=name,
                     remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
@@ -192,11 +192,14 @@ class Host:
             raise
         except (Exception, SystemExit) as error:
             text = described(error, chosen.open_scene)
-            raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
+            raise PluginError(f"{self._name(chosen)} could not open it ({text})", file=path) from error
         if fault and self.provenance(chosen.name).bundled:
             # The plugins that come along keep the contract with sound files: it is the file that is damaged.
             raise InputError(
-                f"this is not a possible {fault}", file=scene.model_source, field="model", remedy=_COPY_AGAIN
+                f"the metadata give an impossible geometry: {fault}",
+                file=scene.model_source,
+                field="model",
+                remedy=_COPY_AGAIN,
             )
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, field="scene", remedy=_TEST_IT)
@@ -208,11 +211,9 @@ class Host:
             return bool(sensor.recognises(dataset))
         except (Exception, SystemExit) as error:
             raise PluginError(
-                f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",
+                f"{self._name(sensor)} failed to check this dataset ({described(error, sensor.recognises)})",
                 file=dataset.GetDescription(),
-                remedy=Text(
-                    "choose the sensor yourself with ", Setting("scene.sensor", "NAME"), ", or uninstall that plugin"
-                ),
+                remedy=Text("choose a sensor with ", Setting("scene.sensor", "NAME"), ", or uninstall this plugin"),
             ) from error
 
     def _name(self, sensor: Sensor) -> str:
@@ -268,7 +269,9 @@ def _discovered() -> Host:
 def _unknown_sensor(name: str, sensors: Iterable[str]) -> InputError:
     names = ", ".join(sensors) or "none"
     return InputError(
-        f"there is no sensor {name!r} (installed: {names})", field="scene.sensor", remedy="see `ortho sensors`"
+        f"unknown sensor {name!r} (installed: {names})",
+        field="scene.sensor",
+        remedy="list sensors with `ortho sensors`",
     )
 
 
@@ -277,24 +280,24 @@ def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> In
     if found:
         names = ", ".join(item.name for item in found)
         return InputError(
-            f"several sensors recognise it: {names}",
+            f"several sensors recognise this image: {names}",
             file=path,
             remedy=Text("choose one with ", Setting("scene.sensor", "NAME")),
         )
     if beside := unread(dataset):
         return InputError(
-            f"{beside.what}, which no sensor opens by itself", file=path, field="scene.sensor", remedy=beside.remedy
+            f"{beside.what}; no sensor opens it automatically", file=path, field="scene.sensor", remedy=beside.remedy
         )
     names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
-    hint = f" (for images in general: {general})" if general else ""
+    hint = f" (general ones: {general})" if general else ""
     return InputError(
-        f"no sensor recognises it (installed: {names})",
+        f"no sensor recognises this image (installed: {names})",
         file=path,
         remedy=Text(
-            "choose one with ",
+            "choose a sensor with ",
             Setting("scene.sensor", "NAME"),
-            f", which says what it needs{hint}, or give the RPC file with ",
+            f"{hint}; its error message then says what is missing. Or give an RPC file with ",
             Setting("scene.rpc", "FILE"),
         ),
     )

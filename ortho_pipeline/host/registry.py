@@ -60,7 +60,7 @@ class Broken:
     error: str
 
     def __str__(self) -> str:
-        return f"plugin {self.plugin!r} of {self.distribution} {self.version} is left out: {self.error}"
+        return f"plugin {self.plugin!r} of {self.distribution} {self.version} is skipped: {self.error}"
 
 
 class Registry:
@@ -151,9 +151,9 @@ class Registry:
                     taken = KINDS.get(name, family)
                     if taken is not family:
                         raise PluginError(
-                            f"plugin {plugin} offers the model family {name!r}, but that name is taken by "
+                            f"plugin {plugin} offers the model family {name!r}, but this name belongs to "
                             f"{taken.__module__}.{taken.__qualname__}",
-                            remedy=f"give {family.__qualname__} another kind; or uninstall that plugin",
+                            remedy=f"give {family.__qualname__} another kind, or uninstall the plugin",
                         )
                     self._claim(plugin, name, "model family")
                     families[name] = family
@@ -221,8 +221,8 @@ class Registry:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
                 marker = "ortho_pipeline.plugin" if self._specs is hookspecs else self._specs.__name__
                 raise PluginError(
-                    f"plugin {name}: {hook} is not marked with @hookimpl",
-                    remedy=f"write @hookimpl of {marker} above it",
+                    f"plugin {name}: {hook} has no decorator @hookimpl",
+                    remedy=f"write @hookimpl (from {marker}) above it",
                 )
         for hook in dir(plugin):
             if hook in hooks or self._manager.parse_hookimpl_opts(plugin, hook) is None:
@@ -230,11 +230,11 @@ class Registry:
             for group, others in self._specs.GROUPS.items():
                 if hook in others:
                     raise PluginError(
-                        f"plugin {name}: {hook} is not called in plugins of the entry-point group {self._group}",
-                        remedy=f"its author: name its module in the group {group}",
+                        f"plugin {name}: {hook} has no effect in the entry-point group {self._group}",
+                        remedy=f"authors: declare its module in the group {group}",
                     )
             meant = difflib.get_close_matches(hook, hooks, 1) or hooks
-            raise PluginError(f"plugin {name}: there is no hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
+            raise PluginError(f"plugin {name}: unknown hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
 
     def _returned(self, hook: str, wanted: type, collect: type, advice: str) -> Iterator[tuple[str, Any]]:
         # pluggy calls the hook once for each plugin, wrappers around it: so an error can name its plugin.
@@ -253,21 +253,21 @@ class Registry:
                     raise PluginError(f"plugin {plugin}: {hook} failed ({text})") from error
                 if returned is None:
                     what = type(offered).__name__
-                    raise PluginError(f"plugin {plugin}: {hook} returned {what}", remedy=f"its author: {advice}")
+                    raise PluginError(f"plugin {plugin}: {hook} returned {what}", remedy=f"authors: {advice}")
                 yield plugin, returned
 
     def _claim(self, plugin: str, name: str, what: str) -> None:
         bundled = {key for key, origin in self.origin.items() if origin.bundled}
         if plugin not in bundled and (name in self._reserved or self.owner.get(name) in bundled):
             raise PluginError(
-                f"plugin {plugin} offers the {what} {name!r}, but that name belongs to {BUNDLED}",
-                remedy=f"its author: rename the {what}; its users: uninstall that plugin",
+                f"plugin {plugin} offers the {what} {name!r}, but this name belongs to {BUNDLED}",
+                remedy=f"authors: rename the {what}; users: uninstall the plugin",
             )
         # A sensor and a model family of one plugin may share a name.
         if self.owner.get(name, plugin) != plugin:
             raise PluginError(
                 f"two plugins offer the {what} {name!r}: {self.owner[name]} and {plugin}",
-                remedy=f"an author: rename the {what}; a user: uninstall one of the two",
+                remedy=f"authors: rename the {what}; users: uninstall one of the two",
             )
         self.owner[name] = plugin
 
@@ -275,15 +275,15 @@ class Registry:
 def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
     """Yield what is wrong with an offered format; `endings` are those that are taken, with the formats' names."""
     if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
-        yield f"{offer.name!r} is not a name of a format: lower case, digits and dashes"
+        yield f"{offer.name!r} is not a valid format name; use lower case, digits and dashes"
     elif not isinstance(offer.title, str) or not offer.title.strip():
-        yield f"format {offer.name!r}: its title is empty"
+        yield f"format {offer.name!r}: the title is empty"
     elif not isinstance(offer.ending, str) or not _ENDING.fullmatch(offer.ending):
-        yield f"format {offer.name!r}: its ending {offer.ending!r} is not like '_name.json'"
+        yield f"format {offer.name!r}: the ending must be like '_name.json', not {offer.ending!r}"
     elif not callable(offer.write):
         yield f"format {offer.name!r}: write must be callable"
     elif (other := endings.setdefault(offer.ending.casefold(), offer.name)) != offer.name:
-        yield f"format {offer.name!r}: the files of the format {other!r} end with {offer.ending!r} too"
+        yield f"format {offer.name!r}: the format {other!r} has the same ending {offer.ending!r}"
 
 
 def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
@@ -292,21 +292,21 @@ def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
     def write(export: Any, path: Path) -> float:
         from ortho_pipeline.files import whole_or_nothing
 
-        said = f"format {offer.name!r} of plugin {plugin}"
+        label = f"format {offer.name!r} of plugin {plugin}"
         with whole_or_nothing(path) as temporary:
             try:
                 worst = offer.write(export, temporary)
             except OrthoError:
                 raise
             except (Exception, SystemExit) as error:
-                raise PluginError(f"{said} failed ({described(error, offer.write)})", file=path) from error
+                raise PluginError(f"{label} failed ({described(error, offer.write)})", file=path) from error
             if not temporary.stat().st_size:
-                raise PluginError(f"{said} wrote nothing", file=path, remedy="its author: write to the path by open()")
+                raise PluginError(f"{label} wrote nothing", file=path, remedy="authors: write to the given path")
             if isinstance(worst, bool) or not isinstance(worst, int | float) or not worst >= 0:
                 raise PluginError(
-                    f"{said}: write returned {worst!r}",
+                    f"{label}: write returned {worst!r}",
                     file=path,
-                    remedy="its author: return the largest distance in pixels between the file and the model",
+                    remedy="authors: return the largest distance between file and model, in pixels",
                 )
         return float(worst)
 
@@ -316,8 +316,8 @@ def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
 def _command_faults(command: Subcommand) -> Iterator[str]:
     texts = (command.name, command.summary, command.target)
     if not all(isinstance(text, str) for text in texts) or not _TYPED.fullmatch(command.name):
-        yield f"{command.name!r} is not a name of a command: lower case, digits and dashes"
+        yield f"{command.name!r} is not a valid command name; use lower case, digits and dashes"
     elif not _TARGET.fullmatch(command.target):
-        yield f"command {command.name!r}: its target {command.target!r} is not 'package.module:name'"
+        yield f"command {command.name!r}: the target must be 'package.module:name', not {command.target!r}"
     elif not command.summary.strip():
-        yield f"command {command.name!r}: its summary is empty"
+        yield f"command {command.name!r}: the summary is empty"

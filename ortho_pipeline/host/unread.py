@@ -20,8 +20,7 @@ _INTERIOR, _EXTERIOR = re.compile(r"int_param.*\.ya?ml$", re.I), re.compile(r"ex
 _NUMBERS = r"(?:[\s,;]+[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?){6}"
 _TABLE_BYTES = 1_000_000
 _BY_HAND = Text(
-    "this version reads a camera file (JSON) and a table of orientations (CSV): write them as ",
-    "docs/formats/frame.md shows, and give ",
+    "write a camera file (JSON) and a table of orientations (CSV) as in docs/formats/frame.md, and give ",
     Setting("scene.sensor_options", "FILE", key="camera"),
     " ",
     Setting("scene.sensor_options", "FILE", key="exterior"),
@@ -49,17 +48,17 @@ def unread(dataset: Any) -> Unread | None:
                     Setting("scene.sensor_options", "ellipsoid", key="vertical"),
                 )
                 return Unread(
-                    f"it lies in an OpenDroneMap or OpenSfM project ({file})",
-                    Text("name the reconstruction: ", options, ", or the datum of its altitudes in place of ellipsoid"),
+                    f"this image belongs to an OpenDroneMap or OpenSfM project ({file})",
+                    Text("give ", options, " (replace ellipsoid if its altitudes have another datum)"),
                 )
         if files := list(_of_orthority(image.parent)):
-            return Unread(f"it lies in an orthority project ({', '.join(files)})", _BY_HAND)
+            return Unread(f"this image belongs to an orthority project ({', '.join(files)})", _BY_HAND)
         if table := _table_of(image):
-            return Unread(f"{table} has six numbers for it, which look like an exterior orientation", _BY_HAND)
+            return Unread(f"{table} seems to have an exterior orientation for this image (six numbers)", _BY_HAND)
     tags = {**(dataset.GetMetadata() or {}), **(dataset.GetMetadata("EXIF") or {})}
     if "EXIF_GPSLatitude" in tags:
         camera = " ".join(str(tags[key]).strip() for key in ("EXIF_Make", "EXIF_Model") if tags.get(key))
-        return Unread(f"it is a photo with its GPS position in EXIF{f' ({camera})' if camera else ''}", _BY_HAND)
+        return Unread(f"this is a photo with a GPS position in EXIF{f' ({camera})' if camera else ''}", _BY_HAND)
     return None
 
 

@@ -54,11 +54,11 @@ def ortho_sensors() -> Iterable[Sensor]:
         recognises,
         open_scene,
         options={
-            "rpc": "which RPC to use: tag, sidecar, or an RPC file; by itself the first readable one of the delivery",
-            "rpc_origin": "line and sample that the RPC gives to the centre of the first pixel: 0 (default) or 1",
-            "view": "fore or aft, where neither name nor metadata say it",
+            "rpc": "which RPC to use: tag, sidecar, or an RPC file; default: the first readable one of the delivery",
+            "rpc_origin": "line and sample of the first pixel's centre in the RPC: 0 (default) or 1",
+            "view": "fore or aft, if neither file name nor metadata say it",
             **{
-                option: f"soft constraint of the pushbroom: sigma of the {what}, or none; by itself"
+                option: f"soft constraint of the pushbroom: sigma of the {what}, or none; default:"
                 f" {soft_facts(DEFAULT)[option]:g}"
                 for option, (_, _, what) in SOFT.items()
             },
@@ -94,7 +94,7 @@ def open_scene(
         raise InputError("there is no metadata beside this image", file=name, remedy=f"add {Path(name).stem}_MET.TXT")
     if rpc_origin not in ("0", "1") or view not in (None, "fore", "aft"):
         field, allowed = ("rpc_origin", "0 or 1") if rpc_origin not in ("0", "1") else ("view", "fore or aft")
-        raise InputError("there is no such choice", field=field, remedy=f"give {allowed}")
+        raise InputError(f"unknown value for {field}", field=field, remedy=f"give {allowed}")
     sigmas = soft_sigmas(
         {
             "sigma_plane_m": sigma_plane_m,
@@ -114,12 +114,14 @@ def open_scene(
     except InputError as error:
         if not models:
             raise
-        warnings.append(Notice("no-pushbroom", f"there is no pushbroom model: {error.message}"))
+        warnings.append(Notice("no-pushbroom", f"no pushbroom model, only the RPC: {error.message}"))
     if metadata.size not in (None, size):
-        text = "the metadata is for {} x {} pixels, this image has {} x {}: is it a crop?".format(*metadata.size, *size)
+        text = "the metadata are for {} x {} pixels, but this image has {} x {}. Is it a crop?".format(
+            *metadata.size, *size
+        )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=metadata.size))
     if found is None:
-        text = "there is no readable RPC: the model only starts an adjustment to at least nine control points"
+        text = "there is no readable RPC. The model is only a start: adjust it to at least nine control points"
         warnings.append(Notice("only-a-start", text))
     facts = _facts(name, metadata, warnings) | ({} if found is None else {"rpc_origin": int(rpc_origin)})
     facts = {"view": view} | facts if view else facts
@@ -166,5 +168,5 @@ def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[
     apart = float(np.abs(other.ground_to_image(centre) - found.ground_to_image(centre)).max())
     if apart <= DISAGREEMENT:
         return []
-    text = f"GDAL reads another RPC for this image than {Path(source).name}; they differ by {apart:.1f} px"
+    text = f"this image uses the RPC in {Path(source).name}; GDAL reads another one, which differs by {apart:.1f} px"
     return [Notice("rpcs-differ", text, difference_px=apart)]

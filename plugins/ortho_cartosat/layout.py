@@ -59,7 +59,7 @@ def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[No
             return read_rpc_text(path), path, warnings
         except InputError as error:
             what = error.message if error.field is None else f"{error.field}: {error.message}"
-            text = f"{path.name} is not used, it may be encrypted or damaged ({what})"
+            text = f"{path.name} cannot be read; it may be encrypted or damaged ({what})"
             warnings.append(Notice("rpc-not-used", text, file=path.name))
     return None, None, warnings
 
@@ -76,10 +76,10 @@ def view_of(image: str | PathLike[str], metadata: Metadata) -> str | None:
     by_name, by_text = None if named is None else _VIEW[named[2].lower()], metadata.view
     if by_name and by_text and by_name != by_text:
         raise InputError(
-            f"the name of the image says {by_name}, the metadata {by_text}",
+            f"this is the {by_name} image by its file name, but the {by_text} image by its metadata",
             file=metadata.path,
             field="Sensor",
-            remedy="put the files of each image together again, or say which one it is with the option view",
+            remedy="keep the files of each image together, or state fore or aft with the sensor option view",
         )
     return by_text or by_name
 

@@ -80,7 +80,7 @@ def pushbroom(
     corners, altitude = metadata.corners, metadata.altitude
     if corners is None or altitude is None or view is None:
         field = "ImageULLat" if corners is None else "SatelliteAltitude" if altitude is None else "Sensor"
-        raise InputError("the metadata do not tell this", file=metadata.path, field=field)
+        raise InputError("the metadata do not state this", file=metadata.path, field=field)
     # The images are 12000 columns; one that is not was reduced (or cut), and then its own swath tells the scale.
     nominal = size[0] == COLUMNS
     middle = np.full((4, 1), min(max(0.0, heights[0]), heights[1]))

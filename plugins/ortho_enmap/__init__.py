@@ -65,7 +65,7 @@ def ortho_sensors() -> Iterable[Sensor]:
         "EnMAP level 1B: ...SPECTRAL_IMAGE_VNIR.TIF or _SWIR.TIF with ...METADATA.XML",
         recognises,
         open_scene,
-        options={"band": "the band whose RPC is taken, counted from 1 in this image; by itself the middle one"},
+        options={"band": "number of the band whose RPC is used, from 1; default: the middle band"},
     )
 
 
@@ -108,13 +108,13 @@ def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
     model = its[number - 1]
     warnings = []
     if facts["size"] != list(size):
-        text = "the metadata are for {} x {} pixels, this image has {} x {}: is it a crop?".format(
+        text = "the metadata are for {} x {} pixels, but this image has {} x {}. Is it a crop?".format(
             *facts["size"], *size
         )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=facts["size"]))
     apart = max(apart_of(one, model) for one in its)
     if apart > _SAME:
-        text = f"bands of this image lie up to {apart:.2f} px from band {number}, whose RPC is taken for all"
+        text = f"the RPC of band {number} is used for all bands; other bands are up to {apart:.2f} px away from it"
         warnings.append(Notice("bands-differ", text, difference_px=round(apart, 3)))
     other = rpcs[facts["bands_vnir"] + facts["bands_swir"] // 2 if detector == "VNIR" else facts["bands_vnir"] // 2]
     facts |= {"detector": detector, "band": number, "parallax_to_other_detector_px_per_km": parallax(model, other)}
@@ -133,10 +133,10 @@ def read_enmap(path: Path) -> tuple[tuple[RPC, ...], dict[str, Any]]:
     file = XmlFields(path, remedy=_REMEDY, limit=MAX_SIZE)
     level = file.said("base/level") or "none"
     if level != "L1B":
-        raise file.error(f"a product of level {level[:10]} has no RPCs", "base/level", "take level 1B")
+        raise file.error(f"a product of level {level[:10]} has no RPCs", "base/level", "use level 1B")
     entries = file.all("product/navigation/RPC/bandID", MOST_BANDS) or file.all(".//RPC/bandID", MOST_BANDS)
     if not entries:
-        raise file.error("there are no RPCs", "RPC")
+        raise file.error("the metadata have no RPCs", "RPC")
     rpcs = []
     for entry in entries:
         fields = {gdals: file.text(name, entry) for name, gdals in _SCALARS.items()}
@@ -170,13 +170,11 @@ def _of_detector(
     """Return the RPCs of the bands of a detector, which the image has to have all."""
     visible, infrared = facts["bands_vnir"], facts["bands_swir"]
     if visible + infrared != len(rpcs):
-        raise InputError(
-            f"{len(rpcs)} RPCs are not those of {visible} and {infrared} bands", file=path, field="RPC", remedy=_REMEDY
-        )
+        raise InputError(f"{len(rpcs)} RPCs for {visible} + {infrared} bands", file=path, field="RPC", remedy=_REMEDY)
     its = rpcs[:visible] if detector == "VNIR" else rpcs[visible:]
     if bands != len(its):
         raise InputError(
-            f"the image has {bands} bands, the metadata {len(its)} of {detector}",
+            f"the image has {bands} bands, but the metadata describe {len(its)} {detector} bands",
             file=path,
             field="channels",
             remedy="give the image with all its bands",
@@ -188,5 +186,5 @@ def _chosen(band: str | None, count: int) -> int:
     if band is None:
         return (count + 1) // 2
     if not band.isascii() or not band.isdigit() or not 1 <= int(band[:9]) <= count:
-        raise InputError(f"there is no band {band[:20]!r}", field="band", remedy=f"give a number from 1 to {count}")
+        raise InputError(f"unknown band {band[:20]!r}", field="band", remedy=f"give a number from 1 to {count}")
     return int(band)

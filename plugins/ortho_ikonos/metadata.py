@@ -61,7 +61,7 @@ class SectionRecord:
             if len({entry.value for entry in found}) > 1:
                 lines = ", ".join(str(entry.line) for entry in found)
                 raise InputError(
-                    f"this key stands in lines {lines} with different values",
+                    f"this key has different values in lines {lines}",
                     file=self.file,
                     field=f"{self.name}: {key}",
                     remedy="remove the wrong one",
@@ -100,7 +100,7 @@ class SectionRecord:
         value = self.number(*keys, units=units, low=0, high=1e7)
         if value is not None and value != int(value):
             raise InputError(
-                f"{value} is not whole number",
+                f"{value} is not a whole number",
                 file=self.file,
                 field=f"{self.name}: {keys[0]}",
                 remedy="correct the file",
@@ -194,7 +194,7 @@ class Delivery:
             raise InputError(
                 f"{problem} is called {name} (there are {known or 'none'})"
                 if name is not None
-                else f"the name of the image does not say which component it is (there are {known or 'none'})",
+                else f"the file name does not state the component (there are {known or 'none'})",
                 file=self.file,
                 field=f"{COMPONENTS}: Component ID",
                 remedy="give the metadata file that belongs to this image"
@@ -218,7 +218,7 @@ class Delivery:
                 f"{'no source image has' if not found else 'several source images have'}",
                 file=self.file,
                 field=f"{SOURCES}: Product Image ID",
-                remedy="ask for the whole metadata file",
+                remedy="get the complete metadata file",
             )
         return found[0]
 
@@ -248,7 +248,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
             raise InputError(
                 "the file is cut off: its last line does not end", file=path, field=COMPONENTS, remedy="copy it again"
             )
-        end = "the metadata file does not end with a line of =: was it cut off?"
+        end = "the metadata file does not end with a line of '='. Was it cut off?"
         notes.append(Notice("maybe-cut-off", end, file=str(path)))
     projection, crs = _projection(order)
     return Delivery(
@@ -284,14 +284,14 @@ def read_header(path: str | PathLike[str]) -> MapPlacement:
 
 
 def _text(path: str | PathLike[str]) -> str:
-    data = read_bounded(path, MAX_BYTES, field="metadata", remedy="give the option metadata=FILE")
+    data = read_bounded(path, MAX_BYTES, field="metadata", remedy="give the sensor option metadata=FILE")
     problem = None
     if len(data) > MAX_BYTES:
-        problem = f"a metadata file has not more than {MAX_BYTES // 1_000_000} MB"
+        problem = f"this file is larger than {MAX_BYTES // 1_000_000} MB, too large for metadata"
     elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
         problem = "this file is UTF-16 text"
     elif b"\0" in data:
-        problem = "this is a binary file, no metadata text"
+        problem = "this is a binary file, not metadata text"
     if problem:
         raise InputError(problem, file=path, field="metadata", remedy="give the _metadata.txt of the delivery")
     return decoded(data)
@@ -301,7 +301,10 @@ def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(text.splitlines(), start=1):
         if len(line) > MAX_LINE:
             raise InputError(
-                f"a line of {len(line)} characters", file=path, field=f"line {number}", remedy="copy the file again"
+                f"this line is too long ({len(line)} characters)",
+                file=path,
+                field=f"line {number}",
+                remedy="copy the file again",
             )
         if line.strip():
             yield number, line.expandtabs(3)
@@ -323,7 +326,7 @@ def _sections(path: str, text: str) -> dict[str, list[SectionRecord]]:
         number, title = block[0][0], " ".join(block[0][1].split())
         if title in sections:
             raise InputError(
-                f"this section stands there twice, again in line {number}",
+                f"this section appears again in line {number}",
                 file=path,
                 field=title[:60],
                 remedy="remove one of them",
@@ -359,7 +362,7 @@ def _records(path: str | PathLike[str], sections: dict[str, list[SectionRecord]]
             "this section is missing",
             file=path,
             field=title,
-            remedy="give the whole _metadata.txt of the delivery; a file that was cut off lacks the last sections",
+            remedy="give the complete _metadata.txt of the delivery",
         )
     return sections[title]
 
@@ -382,10 +385,11 @@ def _check_counts(
         stated = _head(path, sections, title, needed=False).count(key, units=("",))
         if found == 0 or (stated is not None and stated != found):
             raise InputError(
-                f"{found} are described, {'at least one' if stated is None else stated} should be",
+                f"the file describes {found} of these, but {'at least one' if stated is None else stated} "
+                f"should be there",
                 file=path,
                 field=f"{title}: {key}",
-                remedy="the file is cut off or was edited: copy it again",
+                remedy="the file was cut off or edited; copy it again",
             )
 
 
@@ -424,7 +428,7 @@ def _identity(record: SectionRecord, *keys: str) -> str:
             "this key is missing",
             file=record.file,
             field=f"{record.name}: {keys[0]}",
-            remedy="it links components with acquisitions: give the whole metadata file",
+            remedy="this key links components with acquisitions; give the complete metadata file",
         )
     return value
 
@@ -442,10 +446,10 @@ def _placement(record: SectionRecord) -> MapPlacement:
     ):
         if (first is None) != (second is None):
             raise InputError(
-                "one of the two is missing",
+                "give both values; one is missing",
                 file=record.file,
                 field=f"{record.name}: {key}",
-                remedy="the file is cut off or was edited: copy it again",
+                remedy="the file was cut off or edited; copy it again",
             )
     return MapPlacement(
         upper_left=None if x is None or y is None else (x, y),

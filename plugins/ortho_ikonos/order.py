@@ -91,10 +91,12 @@ def bands_of(image: OrderImage, wanted: str) -> tuple[Path, ...]:
     missing = [name for name in names if name not in there]
     if missing or image.band not in names:
         raise InputError(
-            f"there is no band {missing[0]!r} beside it" if missing else f"band {image.band!r} is not one of them",
+            f"no file found for band {missing[0]!r}"
+            if missing
+            else f"the choice lacks this image's own band {image.band!r}",
             file=image.path,
             field="bands",
-            remedy=f"all, one, or some of {', '.join(sorted(there))} with the band of this image among them",
+            remedy=f"use all, one, or some of {', '.join(sorted(there))}, including the band of this image",
         )
     return tuple(there[name] for name in names)
 
@@ -153,13 +155,13 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
         own_crs, own_corner, own_pixel = own
         crs = crs or own_crs.to_string()
         if not same_crs(parse_crs(crs), own_crs):
-            text = f"the image says it is in {own_crs.name}, the metadata {delivery.projection}"
+            text = f"the CRS is {own_crs.name} in the image, but {delivery.projection} in the metadata"
             warnings.append(Notice("metadata-contradict", text))
         elif corner is not None and pixel is not None:
             off = _difference(corner, pixel, own_corner, own_pixel, size)
             if off > _SAME:
                 text = (
-                    f"the georeferencing of the image is {off:.2f} px off the metadata, which are believed "
+                    f"the georeferencing of the image is {off:.2f} px off the metadata; the metadata are used "
                     "(UL Map X and Y are the centre of the first pixel)"
                 )
                 warnings.append(Notice("metadata-contradict", text, difference_px=off))
@@ -188,10 +190,10 @@ def _factor(stated: MapPlacement, size: tuple[int, int], path: Path, own_pixel: 
         fits &= factor == COARSER and not (image is not None and image.grid == "pan")
     if not fits:
         raise InputError(
-            f"the image has {size[0]} x {size[1]} pixels, the metadata are of {stated.size[0]} x {stated.size[1]}",
+            f"the image has {size[0]} x {size[1]} pixels, but the metadata are for {stated.size[0]} x {stated.size[1]}",
             file=path,
             field="Columns, Rows",
-            remedy="give the whole image as delivered, and its own metadata",
+            remedy="use the complete image as delivered, with its own metadata",
         )
     return factor
 

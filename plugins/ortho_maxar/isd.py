@@ -80,7 +80,7 @@ class Isd:
         self.path = path
         self.file = XmlFields(path, remedy="use the RPC", limit=MAX_SIZE)
         if not self.file.has("IMD"):
-            raise self.file.error("this is not the ISD XML of an image", "IMD", "give the XML beside the image")
+            raise self.file.error("this file is not the ISD XML of an image", "IMD", "give the XML beside the image")
 
     @cached_property
     def size(self) -> tuple[int, int]:
@@ -102,7 +102,7 @@ class Isd:
             ]
             left, top, right, bottom = edges
             if any(edge != int(edge) or not 0 <= edge < 1e7 for edge in edges) or right < left or bottom < top:
-                raise self.file.error("this is not a place of a tile", "TIL/TILE")
+                raise self.file.error("this is not a possible tile position", "TIL/TILE")
             name = self.file.text("FILENAME", entry).replace("\\", "/").rpartition("/")[2]
             found.append(Tile(name, int(left), int(top), int(right - left) + 1, int(bottom - top) + 1))
         return tuple(found)
@@ -121,13 +121,13 @@ class Isd:
         steps, times = np.diff(pairs, axis=0).T
         if len(pairs) < 2 or not (steps > 0).all() or not ((times > 0).all() or (times < 0).all()):
             raise self.file.error(
-                "TLCLIST needs at least two pairs, with rows that increase and times that all increase or all decrease",
+                "TLCLIST needs at least two pairs; rows must increase, and times must all increase or all decrease",
                 "TLCLISTList",
             )
         period = float((pairs[-1, 1] - pairs[0, 1]) / (pairs[-1, 0] - pairs[0, 0]))
         uneven = np.abs(pairs[:, 1] - pairs[0, 1] - (pairs[:, 0] - pairs[0, 0]) * period).max() / abs(period)
         if not (0 < abs(period) < 1 and uneven <= _EVEN):
-            raise self.file.error(f"the rows are {uneven:.2g} rows off any one rate", "TLCLISTList")
+            raise self.file.error(f"the line rate is not constant (by {uneven:.2g} rows)", "TLCLISTList")
         return start + float(pairs[0, 1] - pairs[0, 0] * period), period
 
     @property
@@ -188,7 +188,7 @@ def read_isd_pushbroom(
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quaternions[:, :4], axis=1)
     if not (np.abs(length - 1) <= _UNIT_LENGTH).all():
-        raise file.error("the quaternions of the attitude are not of length one", "ATTLISTList")
+        raise file.error("the quaternions of the attitude do not have length one", "ATTLISTList")
     try:
         model = pushbroom_of_tables(
             LineCamera.of_polynomials(columns, rows, shifted, along),
@@ -211,23 +211,25 @@ def read_isd_pushbroom(
 def _look(file: XmlFields, band: str) -> tuple[Array, Array]:
     """Return u and v (`LineCamera.of_polynomials`) of the column counted from 0 at the first centre."""
     if file.has("GEO/OPTICAL_DISTORTION/POLYORDER") and file.number("GEO/OPTICAL_DISTORTION/POLYORDER") >= 0:
-        raise file.error("an optical distortion, whose terms are not known", "OPTICAL_DISTORTION/POLYORDER")
+        raise file.error("optical distortion is not supported", "OPTICAL_DISTORTION/POLYORDER")
     turned = [file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in (1, 2, 3, 4)]
     if np.abs(np.subtract(turned, (0.0, 0.0, 0.0, 1.0))).max() > 1e-9:
-        raise file.error("a camera that is turned in its platform, of which the sense is not known", "CAMERA_ATTITUDE")
+        raise file.error("a camera that is rotated in its platform is not supported", "CAMERA_ATTITUDE")
     if any(file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"):
-        raise file.error("a camera away from the middle of its platform", "PERSPECTIVE_CENTER")
+        raise file.error("a camera that is off the centre of its platform is not supported", "PERSPECTIVE_CENTER")
     mounted = file.all(f"GEO/DETECTOR_MOUNTING/BAND_{band}/DETECTOR_ARRAY", 100) if band.isalnum() else []
     if len(mounted) != 1:
-        raise file.error(f"{len(mounted)} arrays of detectors of the band {band!r}, not one", "DETECTOR_MOUNTING")
+        raise file.error(
+            f"{len(mounted)} detector arrays for band {band!r}; exactly one is supported", "DETECTOR_MOUNTING"
+        )
     x, y, angle, pitch = (
         file.number(name, mounted[0]) for name in ("DETORIGINX", "DETORIGINY", "DETROTANGLE", "DETPITCH")
     )
     distance = file.number("GEO/PRINCIPAL_DISTANCE/PD")
     if angle:
-        raise file.error("turned detectors, of which the sense is not known", "DETROTANGLE")
+        raise file.error("rotated detectors are not supported", "DETROTANGLE")
     if not (distance > 0 and 1e-8 < pitch / distance < 1e-3):
-        raise file.error(f"{pitch} mm seen from {distance} mm is not a pixel", "PD, DETPITCH")
+        raise file.error(f"a detector pitch of {pitch} mm at {distance} mm is not possible", "PD, DETPITCH")
     return np.array([-y, pitch]) / distance, np.array([x]) / distance
 
 
@@ -237,7 +239,7 @@ def _rows_of(file: XmlFields, part: str, name: str, count: int) -> tuple[Array, 
     entries = file.all(f"{part}/{name}List/{name}")
     values = np.array([file.numbers_of(one.text or "", f"{name}List", count + 1) for one in entries])
     if len(values) < 4 or not 0 < step < 1000:
-        raise file.error(f"{len(values)} rows, {step} s apart, are not a table", f"{name}List")
+        raise file.error(f"{len(values)} rows, {step} s apart, are not a valid table", f"{name}List")
     if (np.abs(values[:, 0]) > 1e6).any():
-        raise file.error("the rows are not numbered", f"{name}List")
+        raise file.error("the rows are not numbered in order", f"{name}List")
     return file.time(f"{part}/STARTTIME") + step * (values[:, 0] - 1), values[:, 1:]

@@ -98,7 +98,7 @@ def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], li
             if model is not None:
                 pieces.append(Piece(there, (0.0, round((its - start) / period, 3)), other.size, model))
         except InputError as error:
-            text = f"the part {path.name} is left out: {error.message}"
+            text = f"the part {path.name} is not used: {error.message}"
             notices.append(Notice("part-left-out", text, file=path.name))
     return pieces, notices
 

@@ -30,7 +30,7 @@ from ortho_pipeline.plugin import (
 
 MAX_SIZE = 5_000_000
 _METADATA = re.compile(r".*_metadata\.json$", re.IGNORECASE | re.DOTALL)
-_REMEDY = "download the item's metadata again"
+_REMEDY = "download the metadata of this item again"
 #: What of an item is worth showing, and what it is called here.
 _TEXTS = {
     "acquired": "acquired",
@@ -88,18 +88,20 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     name = dataset.GetDescription()
     path = metadata_of(name)
     if path is None:
-        raise InputError("there is no <id>_metadata.json beside this image", file=name, remedy="download it")
+        raise InputError("no <id>_metadata.json found beside this image", file=name, remedy="download it")
     facts = read_item(path)
     if rpc is None and not has_rpc(dataset):
         raise InputError(
-            "there is no RPC: orthorectified assets have none, and are orthoimages already",
+            "there is no RPC. Orthorectified assets have none, because they are already orthoimages",
             file=name,
-            remedy="take the basic product (level 1B, or SkySat's 1A) with its RPC",
+            remedy="use the basic product (level 1B, or SkySat level 1A) with its RPC",
         )
     model, source = rpc_of_dataset(dataset, rpc)
     warnings = []
     if not str(facts.get("item_type", "PS")).startswith(("PS", "SkySat")):
-        text = f"items of the type {facts['item_type']} were not at hand to check this reader with"
+        text = (
+            f"this reader was never tested with an item of the type {facts['item_type']}. Compare with control points"
+        )
         warnings.append(Notice("unchecked-product", text))
     return Scene(
         "planet",
@@ -126,7 +128,7 @@ def read_item(path: Path) -> dict[str, Any]:
     document = read_json(path, MAX_SIZE, _REMEDY)
     properties = document.get("properties") if isinstance(document, dict) else None
     if not isinstance(properties, dict):
-        raise InputError("this is not the metadata of an item", file=path, field="properties", remedy=_REMEDY)
+        raise InputError("this file is not the metadata of an item", file=path, field="properties", remedy=_REMEDY)
     texts = {ours: properties.get(theirs) for theirs, ours in _TEXTS.items()}
     facts: dict[str, Any] = {name: text[:200] for name, text in texts.items() if isinstance(text, str)}
     for theirs, ours in _NUMBERS.items():

@@ -34,7 +34,7 @@ def ortho_sensors() -> Iterable[Sensor]:
     )
     yield Sensor(
         "geolocation",
-        "images with geolocation arrays (GDAL's domain, or files of longitudes and latitudes), as a start for matching",
+        "images with geolocation arrays (GDAL's domain, or files of longitudes and latitudes), to start matching",
         lambda dataset: geolocation.has_arrays(dataset) and not has_rpc(dataset),
         geolocation.open_scene,
         options=geolocation.OPTIONS,
@@ -98,6 +98,6 @@ def _facts_of(rigorous: Rigorous) -> dict[str, Any]:
 def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[Notice, ...]:
     warnings = []
     if dataset.GetGCPCount():
-        text = f"the file also has {dataset.GetGCPCount()} GCPs of its own, which GDAL programs prefer to RPC"
+        text = f"the file also has {dataset.GetGCPCount()} GCPs; GDAL programs use these instead of the RPC"
         warnings.append(Notice("gcps-beside-rpc", text, count=dataset.GetGCPCount()))
     return tuple(warnings)

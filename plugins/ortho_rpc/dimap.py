@@ -87,7 +87,7 @@ def read_dimap_pushbroom(
     elif file.has(SECOND):
         scan = second_version(file)
     else:
-        raise file.error("there is no rigorous model in this file", SECOND, "use its RPC instead")
+        raise file.error("this file has no rigorous model", SECOND, "use the RPC")
     left, top, columns, rows = tile_of(file, image) or (0, 0, scan.columns, scan.rows)
     # Their columns count from 0 at the first centre of the whole.
     across, along = (Polynomial(psi)(Polynomial([left - 0.5, 1.0])).coef for psi in (scan.psi_x, scan.psi_y))
@@ -129,18 +129,18 @@ def tile_of(file: DimapFile, image: str | None) -> tuple[int, int, int, int] | N
         return None
     field = "Tile_Set/Regular_Tiling"
     if any((tiling.findtext(f"OVERLAP_{name}") or "0").strip() not in ("0", "0.0") for name in ("ROW", "COL")):
-        raise file.error("the tiles overlap, and how they then count is not known", field)
+        raise file.error("the tiles overlap; such products are not supported", field)
     size = tiling.find("NTILES_SIZE")
     texts = [] if size is None else [size.get("ncols"), size.get("nrows")]
     texts += [entry.get("tile_C"), entry.get("tile_R")]
     if len(texts) != 4 or not all(text and re.fullmatch(r"\d{1,8}", text, re.ASCII) for text in texts):
-        raise file.error("size or place of the tiles is missing", field)
+        raise file.error("size or position of the tiles is missing", field)
     columns, rows, column, row = (int(text or 0) for text in texts)
     left, top = columns * (column - 1), rows * (row - 1)
     width = min(columns, file.integer("Raster_Data/Raster_Dimensions/NCOLS") - left)
     height = min(rows, file.integer("Raster_Data/Raster_Dimensions/NROWS") - top)
     if min(left, top) < 0 or min(width, height) < 1:
-        raise file.error(f"tile {row}, {column} lies outside of the scene", field)
+        raise file.error(f"tile {row}, {column} is outside the scene", field)
     return left, top, width, height
 
 

@@ -42,7 +42,7 @@ class Rigorous:
     def warnings(self) -> tuple[Notice, ...]:
         """A sentence for each model that was not read."""
         return tuple(
-            Notice("rigorous-left-out", f"{name} has a rigorous model that is left out: {reason}", file=name)
+            Notice("rigorous-left-out", f"the rigorous model in {name} is not used: {reason}", file=name)
             for name, reason in self.left.items()
         )
 
@@ -79,16 +79,20 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
         if its == size:
             found[file.path] = model, UNSEEN.get(file.said("Metadata_Identification/METADATA_PROFILE") or "")
         else:
-            others[file.path.name] = "it is of {} x {} pixels, this image has {} x {}".format(*its, *size)
+            others[file.path.name] = "it is for {} x {} pixels, but this image has {} x {}".format(*its, *size)
     if len(found) > 1:
         several = ", ".join(path.name for path in found)
-        reason = f"several rigorous models of this size lie beside the image, none is taken: {several}"
+        reason = f"there are several rigorous models of this size beside the image, so none is used: {several}"
         return Rigorous(left=left | {path.name: reason for path in found})
     for path, (model, limit) in found.items():
         apart = _apart(model, rpc, _MIDDLE if limit is None else _WITHIN)
         if apart > (DISAGREEMENT if limit is None else limit):
             place = "in the middle of" if limit is None else "within"
-            why = "they are of two images" if limit is None else "no look angles of this product were at hand to check"
+            why = (
+                "they belong to different images"
+                if limit is None
+                else "the reader of its look angles was never tested with a real product"
+            )
             left[path.name] = f"it is {apart:.3g} px off the RPC {place} the image: {why}"
             return Rigorous(left=left)
         return Rigorous(model, path, left)

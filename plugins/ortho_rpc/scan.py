@@ -84,7 +84,7 @@ def second_version(file: DimapFile) -> Scan:
     profile = file.text("Metadata_Identification/METADATA_PROFILE")
     if profile not in PROFILES:
         raise file.error(
-            f"the conventions of {profile[:40]} could not be checked against numbers of the vendor; read are"
+            f"products of {profile[:40]} are not supported, because they could not be tested. Supported are"
             f" {', '.join(PROFILES)}",
             "METADATA_PROFILE",
         )
@@ -94,7 +94,7 @@ def second_version(file: DimapFile) -> Scan:
     value, element = file.number(stamp), file.root.find(stamp)
     unit = None if element is None else element.get("unit")
     if unit not in _UNITS:
-        raise file.error(f"{unit[:20]!r} is an unknown unit", "LINE_PERIOD")
+        raise file.error(f"{unit[:20]!r} is not a known unit", "LINE_PERIOD")
     period = _possible_period(file, value * _UNITS[unit], "LINE_PERIOD")
     start = file.time(f"{SECOND}/Time/Time_Range/START")
     _refuse_other_duration(file, f"{SECOND}/Time/Time_Range", start, rows * period)
@@ -115,7 +115,7 @@ def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
     for name in ("YAW", "PITCH", "ROLL"):
         field = f"{base}/Instrument_Biases/{name}"
         if file.has(field) and file.number(field) != 0:
-            raise file.error("a bias of the instrument, of which the sense of turning is not known", field)
+            raise file.error("an instrument bias with an unknown direction of rotation is not supported", field)
     bands = file.all(f"{base}/Band_Calibration_List/Band_Calibration", 100)
     places = [f"{base}/Band_Calibration_List/Band_Calibration[{k + 1}]" for k in range(len(bands))] or [base]
     found = []
@@ -123,7 +123,7 @@ def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
         _refuse_part_of_a_line(file, f"{one}/Swath_Range", columns)
         found.append([_angle(file, f"{one}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
     if any(not np.array_equal(*pair) for other in found for pair in zip(other, found[0], strict=True)):
-        raise file.error("the bands have look angles of their own, an image has one model", "Band_Calibration_List")
+        raise file.error("each band has its own look angles; this is not supported", "Band_Calibration_List")
     return found[0][0], found[0][1]
 
 
@@ -134,13 +134,13 @@ def _angle(file: DimapFile, base: str, name: str) -> Array:
         terms.append(file.number(f"{base}/{name}_{len(terms)}"))
     listed = sum(element.tag.startswith(f"{name}_") for element in file.all(f"{base}/*"))
     if listed != len(terms):
-        raise file.error("the coefficients are not those of one polynomial", f"{base}/{name}_{len(terms)}")
+        raise file.error("the coefficients do not form one polynomial", f"{base}/{name}_{len(terms)}")
     return np.array(terms)
 
 
 def _possible_period(file: DimapFile, period: float, field: str) -> float:
     if not 0 < period < 1:
-        raise file.error(f"{period} s is not a time for a row", field)
+        raise file.error(f"{period} s is not a possible line period", field)
     return period
 
 
@@ -151,11 +151,9 @@ def _refuse_part_of_a_line(file: DimapFile, field: str, columns: int) -> None:
     first = file.number(f"{field}/FIRST_COL")
     last = file.number(f"{field}/LAST_COL") if file.has(f"{field}/LAST_COL") else columns
     if first != 1:
-        raise file.error(
-            f"the image begins in column {first:g} of the line: from where its look angles count is not known", field
-        )
+        raise file.error(f"the image begins at column {first:g} of the line; such images are not supported", field)
     if field.endswith("Swath_Range") and last != columns:
-        raise file.error(f"the look angles are of {last:g} columns, the image has {columns}", field)
+        raise file.error(f"there are look angles for {last:g} columns, but the image has {columns}", field)
 
 
 def _refuse_other_duration(file: DimapFile, field: str, start: float, duration: float) -> None:
@@ -164,14 +162,14 @@ def _refuse_other_duration(file: DimapFile, field: str, start: float, duration: 
         return
     taken = file.time(f"{field}/END") - start
     if abs(taken - duration) > 0.01 * duration:
-        raise file.error(f"the rows take {duration:.6g} s, from START to END there are {taken:.6g} s", field)
+        raise file.error(f"the rows take {duration:.6g} s, but START and END are {taken:.6g} s apart", field)
 
 
 def _polynomial_attitude(file: DimapFile, scaled: str, parts: str) -> Callable[[float, float], tuple[Array, Array]]:
     """Return polynomials, sampled as far as half an image beyond both ends."""
     offset, scale = file.number(f"{scaled}/OFFSET"), file.number(f"{scaled}/SCALE")
     if scale == 0:
-        raise file.error("a scale of zero", f"{scaled}/SCALE")
+        raise file.error("a scale is zero", f"{scaled}/SCALE")
     terms = [file.polynomial(f"{parts}/Q{k}") for k in range(4)]
 
     def sampled(first: float, duration: float) -> tuple[Array, Array]:
@@ -186,7 +184,7 @@ def _polynomial_attitude(file: DimapFile, scaled: str, parts: str) -> Callable[[
 def _listed_attitude(file: DimapFile, field: str) -> Callable[[float, float], tuple[Array, Array]]:
     rows = file.all(f"{field}/Quaternion")
     if not rows:
-        raise file.error("there is neither a polynomial nor a list of quaternions", field)
+        raise file.error("the attitude has neither a polynomial nor a list of quaternions", field)
     times = np.array([file.time("TIME", row) for row in rows])
     quaternions = np.array([[file.number(f"Q{k}", row) for k in range(4)] for row in rows])
     turns = _turns(file, quaternions, field)
@@ -197,7 +195,7 @@ def _turns(file: DimapFile, quaternions: Array, field: str) -> Array:
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     if not (np.abs(length - 1) <= _UNIT_LENGTH).all():
-        raise file.error("the quaternions of the attitude are not of length one", field)
+        raise file.error("the quaternions of the attitude do not have length one", field)
     return np.asarray(rotations_of_quaternions(quaternions) @ _VENDOR_FROM_CAMERA)
 
 

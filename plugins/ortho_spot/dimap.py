@@ -115,18 +115,18 @@ def read_spot(path: PathLike[str], *, attitude: str = "vendor", heights: tuple[f
     level = file.text("Data_Processing/PROCESSING_LEVEL")
     if level != "1A":
         raise file.error(
-            f"a product of level {level[:10]} has been resampled, and its metadata are not those of its pixels",
+            f"this product of level {level[:10]} is resampled, so its metadata do not describe its pixels",
             "Data_Processing/PROCESSING_LEVEL",
-            "take the scene of level 1A",
+            "use the scene at level 1A",
         )
     columns, rows = (file.integer(f"Raster_Dimensions/{name}") for name in ("NCOLS", "NROWS"))
     lines = file.all(f"{_CONFIGURATION}/Instrument_Look_Angles_List/Instrument_Look_Angles", 20)
     if not lines:
-        raise file.error("there are no look angles", "Instrument_Look_Angles_List")
+        raise file.error("the metadata have no look angles", "Instrument_Look_Angles_List")
     psi_x, psi_y = _look_angles(file, lines[0], columns)
     period = file.number(f"{_CONFIGURATION}/Time_Stamp/LINE_PERIOD")
     if not 0 < period < 1:
-        raise file.error(f"{period} s is not a time for a row", "LINE_PERIOD")
+        raise file.error(f"{period} s is not a possible line period", "LINE_PERIOD")
     centre = file.number(f"{_CONFIGURATION}/Time_Stamp/SCENE_CENTER_LINE")
     first = file.time(f"{_CONFIGURATION}/Time_Stamp/SCENE_CENTER_TIME") + (0.5 - centre) * period
     orbit = _orbit(file)
@@ -188,12 +188,12 @@ def _look_angles(file: XmlFields, line: Element, columns: int) -> tuple[Array, A
     detectors = np.array([file.number("DETECTOR_ID", entry) for entry in entries])
     angles = np.array([[file.number(name, entry) for name in ("PSI_X", "PSI_Y")] for entry in entries]).reshape(-1, 2)
     if not (np.abs(angles) < 1.2).all():
-        raise file.error("a look angle is beyond any mirror", field)
+        raise file.error("a look angle is out of range", field)
     whole = len(detectors) >= 2 and detectors[0] == 1 and detectors[-1] == columns
     if not whole or len(detectors) not in (2, columns) or not (np.diff(detectors) > 0).all():
         raise file.error(
-            f"{len(detectors)} detectors do not belong to the {columns} columns of this image, of which the first has"
-            " to be detector 1",
+            f"{len(detectors)} detectors do not match the {columns} columns of this image; the first must be "
+            f"detector 1",
             field,
         )
     if len(detectors) == 2:
@@ -211,7 +211,9 @@ def _orbit(file: XmlFields) -> tuple[Array, Array, Array]:
         for part in ("Location", "Velocity")
     )
     if len(times) < 4 or not (np.diff(times) > 0).all():
-        raise file.error(f"{len(times)} positions, at times that may not grow, are not an orbit", "Ephemeris/Points")
+        raise file.error(
+            f"{len(times)} positions do not give an orbit (at least 4, at increasing times)", "Ephemeris/Points"
+        )
     return times, places, rates
 
 
@@ -226,9 +228,9 @@ def _attitude(
     corrected = file.has(f"{_ATTITUDES}/Corrected_Attitudes")
     if corrected and kind == "speeds":
         raise file.error(
-            "this scene has a corrected attitude, which is better than angular speeds",
+            "this scene has a corrected attitude, which is more accurate than angular speeds",
             "Corrected_Attitudes",
-            "leave the attitude to the vendor",
+            "use attitude=vendor",
         )
     if corrected:
         times, angles = _rows(file, f"{_ATTITUDES}/Corrected_Attitudes/Corrected_Attitude//Angles")
@@ -248,7 +250,7 @@ def _attitude(
         x = np.cross(rates, z)
         x /= np.linalg.norm(x, axis=1)[:, None]
     if not np.isfinite(x).all():
-        raise file.error("positions and velocities are not those of a flight", "Ephemeris/Points")
+        raise file.error("positions and velocities do not match a satellite orbit", "Ephemeris/Points")
     orbital = np.stack([x, np.cross(z, x), z], axis=2)
     return times, orbital @ _on_board(*angles.T) @ _VENDOR_FROM_CAMERA
 
@@ -270,11 +272,11 @@ def _rows(file: XmlFields, field: str) -> tuple[Array, Array]:
     """Return times and yaw, pitch, roll ``(N, 3)`` of a list, without what the file calls out of range."""
     entries = [one for one in file.all(field) if (one.findtext("OUT_OF_RANGE") or "N").strip() != "Y"]
     if len(entries) < 4:
-        raise file.error(f"{len(entries)} of these are not an attitude", field)
+        raise file.error(f"{len(entries)} of these do not give an attitude", field)
     times = np.array([file.time("TIME", entry) for entry in entries])
     angles = np.array([[file.number(name, entry) for name in ("YAW", "PITCH", "ROLL")] for entry in entries])
     if not (np.abs(angles) < 0.1).all():
-        raise file.error("an angle of the attitude is beyond 0.1 rad", field)
+        raise file.error("an attitude angle is larger than 0.1 rad", field)
     return times, angles
 
 

@@ -109,6 +109,6 @@ def test_points_of_a_file_stay_what_they_are() -> None:
 
 @pytest.mark.parametrize("document", [[], "P1", None, 7])
 def test_what_is_no_object_is_refused_by_name(document):
-    with pytest.raises(InputError, match="not a mark") as caught:
+    with pytest.raises(InputError, match="not a point") as caught:
         mark_of(document)
     assert caught.value.field == "mark"

@@ -123,9 +123,9 @@ def choose_models(text: str, own: SensorModel | None = None) -> tuple[str, ...]:
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise InputError(
-            f"no model is called {', '.join(unknown)}" if unknown else "no model is named",
+            f"unknown model {', '.join(unknown)}" if unknown else "no model given",
             field="models",
-            remedy=f"all, or some of {', '.join(known)}",
+            remedy=f"use all, or some of {', '.join(known)}",
         )
     return names
 

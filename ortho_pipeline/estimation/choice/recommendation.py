@@ -60,20 +60,20 @@ def recommend(
     by_name = {row.model: row for row in rows if row.fit is not None}
     squares, tests, checks = _tests(list(by_name.values()))
     if not squares:
-        return None, "no model leaves redundancy: nothing can be tested on these points", "none"
+        return None, "no model has redundancy on these points, so none can be tested", "none"
     count = int(tests.sum())
     if count < 3:
-        return None, "fewer than three points test every model: too few to choose by", "none"
+        return None, "fewer than three points test all models, too few for a recommendation", "none"
     doubts = {name: _doubts(by_name[name], unsuited) for name in squares}
     sound = {name: values for name, values in squares.items() if not doubts[name]}
     smallest = min(squares, key=lambda name: (squares[name].mean(), by_name[name].parameters))
     if not sound:
-        return None, f"every model that can be tested is doubtful; {smallest} is {doubts[smallest]}", "none"
+        return None, f"no model that can be tested is reliable; {smallest} is {doubts[smallest]}", "none"
     expected = {name: expectation(by_name[name].fit, tests, size) for name in sound}  # type: ignore[arg-type]
     errors = expected_errors(sound, expected)
     chosen = _choose(sound, errors, by_name, [name for name in preferred if name in errors])
-    reason = f"{chosen}: {errors[chosen]:.3g} px expected over the scene, {_shown(squares[chosen])} at "
-    reason += f"{_what(checks, count - checks)}, with {counted(by_name[chosen].parameters, 'parameter')}"
+    reason = f"{chosen}: expected error {errors[chosen]:.3g} px over the scene; RMSE {_shown(squares[chosen])} at "
+    reason += f"{_what(checks, count - checks)}; {counted(by_name[chosen].parameters, 'parameter')}"
     reason += _but(chosen, smallest, squares, errors, doubts, by_name)
     return chosen, reason, "check" if checks else "leave-one-out"
 
@@ -95,16 +95,17 @@ def _but(
     """Return in words why the model with the smallest error at the points is not taken, and what to mind."""
     text = ""
     if smallest != chosen:
-        text = f"; {smallest} has {_shown(squares[smallest])} with {counted(rows[smallest].parameters, 'parameter')}, "
+        text = f". {smallest} has RMSE {_shown(squares[smallest])} with "
+        text += f"{counted(rows[smallest].parameters, 'parameter')}, "
         if doubts[smallest]:
-            text += f"and is {doubts[smallest]}"
+            text += f"but is {doubts[smallest]}"
         elif smallest not in errors:
-            text += "and these points do not support it"
+            text += "but these points do not support it"
         else:
-            text += f"and {errors[smallest]:.3g} px are expected over the scene"
+            text += f"but its expected error over the scene is {errors[smallest]:.3g} px"
     found = rows[chosen].fit
     weak = ", ".join(found.reservations) if found else ""
-    return text + (f"; it is {weak}: measure points there" if weak else "")
+    return text + (f". {chosen} is {weak}: measure points there" if weak else "")
 
 
 def _shown(squares: Array) -> str:
@@ -179,7 +180,7 @@ def _significantly_worse(squares: Array, best: Array) -> bool:
 
 def _what(checks: int, control: int) -> str:
     """Return in words what points tested the models."""
-    left_out = f"{counted(control, 'control point')}, each left out in turn"
+    left_out = f"{counted(control, 'control point')} (leave-one-out)"
     if not checks:
         return left_out
     return counted(checks, "check point") + (f" and {left_out}" if control else "")

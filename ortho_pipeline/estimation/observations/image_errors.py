@@ -49,7 +49,7 @@ class ImageErrors:
         if exact.any():
             name = points.ids[int(np.flatnonzero(exact)[0])]
             raise InputError(
-                f"the point {name} has no error in some direction of the image",
+                f"the point {name} has a standard deviation of zero in one direction of the image",
                 file=points.source or None,
                 field="sigma_image",
                 remedy="give each measurement a positive standard deviation",

@@ -20,7 +20,7 @@ class Prior:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and self.sigma > 0):
             raise InputError(
-                f"a prior has a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
+                f"a prior needs a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
             )
 
 

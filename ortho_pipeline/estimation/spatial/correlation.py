@@ -232,11 +232,11 @@ def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tu
     """Return positions, residuals and design of the points that have all, at most `MOST_POINTS`, and how many had."""
     where, values = np.asarray(xy, dtype=np.float64), np.asarray(residuals, dtype=np.float64)
     if where.ndim != 2 or where.shape[1:] != (2,) or where.shape != values.shape:
-        raise InputError(f"positions and residuals are both (N, 2), not {where.shape} and {values.shape}")
+        raise InputError(f"positions and residuals must both be (N, 2), not {where.shape} and {values.shape}")
     mean = np.broadcast_to(np.eye(2), (len(values), 2, 2))
     partials = mean if design is None else np.asarray(design, dtype=np.float64)
     if partials.ndim != 3 or partials.shape[:2] != values.shape:
-        raise InputError(f"a design of {counted(len(values), 'point')} is (N, 2, P), not {partials.shape}")
+        raise InputError(f"the design of {counted(len(values), 'point')} must be (N, 2, P), not {partials.shape}")
     whole = np.isfinite(where).all(axis=1) & np.isfinite(values).all(axis=1) & np.isfinite(partials).all(axis=(1, 2))
     rows = np.flatnonzero(whole)
     given = len(rows)
@@ -247,14 +247,14 @@ def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tu
 
 def _positive(near: float) -> float:
     if not (math.isfinite(near) and near > 0):
-        raise InputError(f"neighbours are closer than a positive distance, not {near!r}", field="near")
+        raise InputError(f"near must be a positive distance, not {near!r}", field="near")
     return float(near)
 
 
 def _checked_edges(classes: Sequence[float]) -> Array:
     edges = np.asarray(classes, dtype=np.float64)
     if edges.ndim != 1 or len(edges) < 2 or not np.isfinite(edges).all() or (np.diff(edges) <= 0).any() or edges[0] < 0:
-        raise InputError("the edges of classes are ascending distances from 0 on", field="classes")
+        raise InputError("the edges of classes must be ascending distances, not negative", field="classes")
     return edges
 
 
@@ -444,22 +444,24 @@ def _moran(values: Array, first: NDArray[Any], second: NDArray[Any]) -> Array:
 def _sentences(found: Covariance) -> list[str]:
     if found.moran is None or found.critical is None:
         return [
-            f"{counted(found.n, 'point')}: too few to tell a systematic error from chance (it takes "
-            f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters)."
+            f"{counted(found.n, 'point')}: too few to distinguish systematic errors from chance. The test needs "
+            f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*found.moran)
-    chance = f"chance alone gives more than {found.critical:+.2f} one time in {round(1 / SIGNIFICANCE)}"
-    begin = "Systematic errors remain" if found.verdict == "systematic" else "No systematic error was found"
-    said = [f"{begin}: residuals are correlated with those of the {NEIGHBOURS} nearest points by {alike}; {chance}."]
+    chance = f"chance alone exceeds {found.critical:+.2f} in 1 of {round(1 / SIGNIFICANCE)} cases"
+    result = "Systematic errors remain" if found.verdict == "systematic" else "No systematic error was found"
+    sentences = [
+        f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) are correlated by {alike}; {chance}."
+    ]
     if found.verdict != "systematic" and found.n < _SHARP:
-        said.append(f"With {found.n} points only a strong one would show.")
+        sentences.append(f"With {found.n} points, only a strong systematic error would show.")
     if found.relative is not None:
         numbers = "{:.2f} and {:.2f}".format(*found.relative), "{:.2f} and {:.2f}".format(*found.absolute)
-        said.append(
-            f"Points closer than {found.near_m:g} m are accurate to each other to {numbers[0]} {found.unit} "
-            f"({counted(found.pairs_near, 'pair')}), all to {numbers[1]} {found.unit}."
+        sentences.append(
+            f"Relative to each other, points closer than {found.near_m:g} m are accurate to {numbers[0]} {found.unit} "
+            f"({counted(found.pairs_near, 'pair')}). All points are accurate to {numbers[1]} {found.unit}."
         )
     if found.mean_p and min(found.mean_p) < SIGNIFICANCE / 2:
         off = "{:+.2f} and {:+.2f}".format(*found.mean)
-        said.append(f"On average they are off by {off} {found.unit}, more than chance explains.")
-    return [text.replace(" -", " −") for text in said]
+        sentences.append(f"The mean residual is {off} {found.unit}, more than chance explains.")
+    return [text.replace(" -", " −") for text in sentences]
