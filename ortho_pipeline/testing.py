@@ -1,4 +1,4 @@
-"""The contract of sensor models and sensors, as checks that a test calls: ours, and those of plugin authors.
+"""The contract of sensor models and sensors, as checks for tests: ours and those of plugin authors.
 
 ::
 
@@ -6,7 +6,7 @@
         scene = check_sensor(next(iter(tinysat_plugin.ortho_sensors())), "tests/data/tinysat.tif")
         assert scene.facts["band"] == 1
 
-Every check raises `AssertionError` with a text that says what the contract asks for.
+Every check raises `AssertionError` with the requirement of the contract.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground
 from ortho_pipeline.options.texts import counted
 
-#: Ground to image to ground to image has to close within this (pixels).
+#: Image to ground and back must close within this (pixels).
 CLOSURE = 1e-5
-#: Partial derivatives have to agree with differences of the model to this part of their largest.
+#: Partial derivatives must agree with finite differences, relative to the largest one.
 PARTIALS = 1e-4
-#: A domain reaches no farther from its image than so many image sizes: a crop of a scene may have the domain of it all.
+#: Largest distance of a domain from its image, in image sizes: a crop may have the domain of the whole scene.
 WIDEST = 20.0
-#: Images smaller than this (pixels) are tests, and their domains wider than they.
+#: Images smaller than this (pixels) are tests, with larger domains.
 _SMALL = 1000
 
 
 def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
     """Check that a sensor model keeps the contract.
 
-    Shapes; N points as N single points; rows of NaN stay NaN and harm no other row; points far away raise nothing;
-    ground to image to ground closes; `ground_partials` and `param_partials` predict a nudge; `with_params` and
-    `to_dict` give the same model again; it can be pickled.
+    It checks: shapes; N points give the same as N single points; rows of NaN stay NaN and do not change others; distant
+    points raise nothing; image to ground and back closes; `ground_partials` and `param_partials` agree with finite
+    differences; `with_params` and `to_dict` restore the same model; pickling works.
 
     Parameters
     ----------
     model : SensorModel
     ground : (N, 3)
-        Points in `model.crs` (EPSG:4979: lon, lat, ellipsoidal height) that it is meant for, at different heights; at
-        least 3.
+        At least 3 points in `model.crs` (EPSG:4979: lon, lat, ellipsoidal height), within its domain and at different
+        heights.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
 def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> Scene:
     """Check that a sensor recognises and opens `path`, and that every model of the scene keeps the contract.
 
-    It must recognise neither a raster in memory nor a TIFF with nothing beside it; the domain of its models must lie
-    near the image, and the middle of the image meet the ground.
+    The sensor must recognise neither a raster in memory nor a TIFF without other files. The domain of its models must
+    be near the image, and the middle of the image must have ground.
 
     Parameters
     ----------
@@ -80,18 +80,18 @@ def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> S
     path : path
         A file of this sensor.
     **options
-        Options of the sensor; if there are some, the file need not be recognised without them.
+        Options of the sensor. With options, the sensor need not recognise the file.
 
     Returns
     -------
     Scene
-        For checks of its facts.
+        For further checks, such as of its facts.
 
     Raises
     ------
     AssertionError
     """
-    # Here, because models and estimation are tested without GDAL.
+    # Imported here, because models and estimation are tested without GDAL.
     from ortho_pipeline.raster.source import open_dataset
 
     _assert_none(sensor_faults(sensor))
@@ -128,7 +128,7 @@ def _assert_none(faults: Iterator[str]) -> None:
 
 
 def _check_foreign(sensor: Sensor) -> None:
-    """Check that a sensor leaves datasets alone that nobody can take for its own."""
+    """Check that a sensor does not recognise datasets that are clearly not its own."""
     from osgeo import gdal
 
     with tempfile.TemporaryDirectory() as folder:
@@ -148,7 +148,7 @@ def _check_foreign(sensor: Sensor) -> None:
 
 
 def _check_near(model: SensorModel, size: tuple[int, int]) -> None:
-    """Check that domain and image are of one place: a box in other units is the commonest mistake."""
+    """Check that domain and image are at the same place: a domain in other units is the most common mistake."""
     rule = "domain must be (centre, half-size), not (low, high), in the units of crs and x (longitude) first"
     image = model.ground_to_image(_points_in(model))
     middle = np.array(size) / 2
@@ -196,7 +196,7 @@ def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[n
 
 
 def _check_far(model: SensorModel) -> None:
-    """Check that points far from the scene have an image or NaN, and that points far from the image do no harm."""
+    """Check that ground far from the scene and image points far from the image give results or NaN."""
     centre, half = model.domain
     far = centre + 1000 * half * np.concatenate([np.eye(3), -np.eye(3)])
     for name, method, points in (
@@ -226,7 +226,7 @@ def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArr
     assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground must return the given heights"
     worst = np.abs(model.ground_to_image(back) - image).max()
     assert worst < CLOSURE, f"image to ground and back differs by {worst:g} px; at most {CLOSURE:g} px are allowed"
-    # A second root of the same image point would close as well.
+    # A second solution for the same image point would also close.
     apart = np.abs((back - ground) / model.domain[1]).max()
     assert apart < 1e-6, f"image_to_ground returned another point, {apart:g} half-sizes of the domain away"
     broken = image.copy()
@@ -267,7 +267,7 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     for k, name in enumerate(model.param_names):
         reach = np.abs(partials[:, :, k]).max()
         assert reach > 0, f"the parameter {name!r} moves no point"
-        # A hundredth of a pixel: small enough to be linear, large enough to be above rounding.
+        # A hundredth of a pixel: small enough to be linear, large enough to exceed rounding.
         step = np.zeros(n)
         step[k] = 0.01 / reach
         ahead, behind = model.with_params(params + step), model.with_params(params - step)
@@ -278,7 +278,7 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
 
 
 def _check_order(model: SensorModel, params: NDArray[np.float64], partials: NDArray[np.float64]) -> None:
-    """Check that `with_params` takes values in the order of `params`, by values that all differ."""
+    """Check that `with_params` takes values in the order of `params`, with values that all differ."""
     steps = 0.01 * np.arange(1, len(params) + 1) / np.abs(partials).max(axis=(0, 1), initial=0.0)
     values = model.with_params(params + steps).params
     assert (np.abs(values - params - steps) <= 1e-6 * steps + 1e-15 * np.abs(params)).all(), (
@@ -290,7 +290,7 @@ def _assert_predicts(
     predicted: NDArray[np.float64], moved: NDArray[np.float64], what: str, image: NDArray[np.float64]
 ) -> None:
     miss = np.abs(predicted - moved).max()
-    # Differences of image coordinates of some 1e5 px carry rounding of 1e-9 px.
+    # Image coordinates of about 1e5 px have rounding errors of 1e-9 px.
     allowed = PARTIALS * np.abs(moved).max() + 1e-8 * max(1.0, np.abs(image).max() / 1e5)
     assert miss <= allowed, f"{what} differs from finite differences by {miss:g} px (allowed {allowed:g})"
 
@@ -303,7 +303,7 @@ def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     except (TypeError, ValueError) as error:
         raise AssertionError(f"to_dict must be plain JSON values: {error}") from error
     if data["kind"] not in KINDS:
-        # A kind that a plugin brings is known once the plugin is found.
+        # A kind of a plugin is known after the plugin is found.
         from ortho_pipeline.host import Host
 
         Host.discover()

@@ -1,8 +1,7 @@
-"""Swapped coordinates: the mistakes of point files that are not errors of measurement.
+"""Swapped coordinates: mistakes in point files that are not measurement errors.
 
-Latitude given first, row given first, rows counted upwards, heights in feet: the points then miss the model by hundreds
-of pixels or fall off the Earth. Each swap is tried; one that brings the points more than twenty times closer is not a
-coincidence.
+Examples are latitude first, row first, rows counted upwards, heights in feet. Then the points are hundreds of pixels
+off or not on Earth. Each swap is tried; if one reduces the error by more than a factor of twenty, it is reported.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 
-#: Residuals (px, median) above this are absurd: no vendor's model is so far off.
+#: Larger median residuals (px) are absurd: no vendor's model is so inaccurate.
 ABSURD = 50.0
-#: A swap has to be this many times better to be named.
+#: A swap is reported if it reduces the error by this factor.
 BETTER = 20.0
 _FOOT = 0.3048
 
 Swap = Callable[[Array, Array, float], tuple[Array, Array]]
 
-#: What is wrong with the file, how the corrected image and ground points are made, and what to do.
+#: The mistake -> function that corrects image and ground points, and the remedy.
 SWAPS: dict[str, tuple[Swap, str]] = {
     "ground x and y are swapped (latitude before longitude?)": (
         lambda image, ground, rows: (image, ground[:, [1, 0, 2]]),
@@ -63,36 +62,36 @@ SWAPS: dict[str, tuple[Swap, str]] = {
 
 
 def refuse_swapped(model: SensorModel, points: Points, rows: int) -> None:
-    """Raise an error that names the swap, if the points are absurd as they are and right with one swap.
+    """Raise an error that names the swap, if the points are absurd as given and plausible after one swap.
 
     Parameters
     ----------
     model : SensorModel
         As delivered.
     points : Points
-        Heights that are not given (NaN) are taken at the model's reference height.
+        Missing heights (NaN) are replaced by the model's reference height.
     rows : int
         Height of the image in pixels.
 
     Raises
     ------
     InputError
-        If a swap brings the points more than twenty times closer to the model, or no point projects at all.
+        If a swap reduces the error by more than a factor of twenty, or most points are outside the model's domain.
     """
     if not len(points):
         return
     as_given = _misfit(model, points)
     if as_given <= ABSURD:
         return
-    found = {}
-    for what, (swap, _) in SWAPS.items():
+    misfits = {}
+    for mistake, (swap, _) in SWAPS.items():
         image, ground = swap(points.image, points.ground, float(rows))
-        found[what] = _misfit(model, replace(points, image=image, ground=ground))
-    best = min(found, key=lambda what: found[what])
-    if found[best] * BETTER < as_given and np.isfinite(found[best]):
+        misfits[mistake] = _misfit(model, replace(points, image=image, ground=ground))
+    best = min(misfits, key=misfits.__getitem__)
+    if misfits[best] * BETTER < as_given and np.isfinite(misfits[best]):
         now = f"{as_given:.0f} px off" if np.isfinite(as_given) else "outside the model's domain"
         raise InputError(
-            f"{best}. As given, the points are {now}; with this corrected, they are {found[best]:.1f} px off",
+            f"{best}. As given, the points are {now}; with this corrected, they are {misfits[best]:.1f} px off",
             file=points.source,
             remedy=SWAPS[best][1],
         )

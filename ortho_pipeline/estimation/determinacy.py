@@ -1,4 +1,4 @@
-"""What points leave open: corners that they say little of, and parameters that they do not tell apart."""
+"""What the points do not determine: uncertain corners, and parameters that cannot be separated."""
 
 from __future__ import annotations
 
@@ -15,22 +15,20 @@ from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
-#: Refuse where some corner of the image (of the model's domain without one) would be predicted so many times worse than
-#: a point is measured ...
+#: Error if the uncertainty at a corner of the image (or of the domain) is this many times that of a measured point ...
 EXTRAPOLATION_LIMIT = 100.0
-#: ... and say so from here on.
+#: ... and warning from this factor on.
 EXTRAPOLATION_WARNING = 10.0
-#: Beyond this condition without its regularisation a model is called unstable.
+#: A model is called unstable above this condition number (without regularisation).
 UNSTABLE = 1e4
-#: Two parameters correlated beyond this are listed as 1.000: they cannot be told apart.
+#: Parameters with a larger correlation (printed as 1.000) cannot be separated.
 _INSEPARABLE = 0.9995
 
 
 def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> float:
-    """Return how many times less certain a model is at a corner of its image than a measured point.
+    """Return the uncertainty of a model at the worst corner of its image, relative to a measured point.
 
-    One that is much less certain is refused, but never a regularised one: what the points leave open, the user has
-    decided.
+    Raises an error if it is far too large; never for a regularised model, because the user chose the regularisation.
     """
     if not len(solution.model.params) or not len(solution.residuals):
         return 0.0
@@ -57,6 +55,7 @@ def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> 
 
 
 def uncertain_edge(factor: float) -> list[Notice]:
+    """Return a notice if a model is uncertain at a corner."""
     if factor <= EXTRAPOLATION_WARNING:
         return []
     text = f"uncertain at the edge: at a corner, the model's uncertainty is {factor:.0f} times that of a measured point"
@@ -64,6 +63,7 @@ def uncertain_edge(factor: float) -> list[Notice]:
 
 
 def unstable(solution: Solution, strength: float | None) -> list[Notice]:
+    """Return a notice if the points hardly determine the parameters, or cannot separate some."""
     names = solution.model.param_names
     if strength is not None:
         if solution.condition <= UNSTABLE:
@@ -89,7 +89,7 @@ def unstable(solution: Solution, strength: float | None) -> list[Notice]:
 
 
 def nothing_adjusted(model: SensorModel, points: Points) -> list[Notice]:
-    """Return a notice if a model without parameters was given to be adjusted, without a correction over it."""
+    """Return a notice if a model without parameters was to be adjusted without a correction."""
     if model.param_names or isinstance(model, ImageCorrection) or not points.control.any():
         return []
     text = (

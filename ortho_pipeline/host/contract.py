@@ -1,7 +1,7 @@
-"""Requirements on a scene and its models: the cheap part of the contract, asked of every scene that is opened.
+"""Requirements on a scene and its models: the fast part of the contract, checked for every opened scene.
 
-A fault is a text that says what was returned and what is wanted. The host makes a `PluginError` of the first one, in
-milliseconds and before a warp of hours; `ortho_pipeline.testing` makes it an `AssertionError`, and asks more.
+A fault is a text that states what was returned and what is required. The host turns the first one into a `PluginError`,
+in milliseconds and before hours of warping. `ortho_pipeline.testing` turns it into an `AssertionError`, and tests more.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ortho_pipeline.hookspecs import Piece, Scene, Sensor
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 
-#: No image has smaller pixels (m), and no scene is narrower: its ground is in other units than its CRS.
+#: Smaller pixels (m) or a narrower scene mean that its ground is not in the units of its CRS.
 SMALLEST_PIXEL, NARROWEST = 1e-3, 1.0
 #: Parts of the half-size of the domain at which a model is tried, and a row of NaN.
 _TRIED = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5], [-0.5, -0.5, -0.5], [math.nan] * 3])
 
 
 def sensor_faults(sensor: object) -> Iterator[str]:
-    """Yield what is wrong with an offered sensor: types of its fields, and the arguments of its functions."""
+    """Yield the faults of an offered sensor: types of its fields, and arguments of its functions."""
     if not isinstance(sensor, Sensor):
         yield f"ortho_sensors returned {type(sensor).__name__} instead of Sensor"
         return
@@ -53,7 +53,7 @@ def _option_faults(sensor: Sensor) -> Iterator[str]:
     try:
         _, *parameters = inspect.signature(sensor.open_scene).parameters.values()
     except (TypeError, ValueError):
-        # A callable without a signature, or without arguments; opening it says what is wrong.
+        # A callable without a signature or without arguments; the error comes when it opens a scene.
         return
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         for name in set(sensor.options) - {parameter.name for parameter in parameters}:
@@ -70,10 +70,10 @@ def _option_faults(sensor: Sensor) -> Iterator[str]:
 def scene_faults(
     sensor: Sensor, scene: object, size: tuple[int, int], kinds: Collection[str] | None = None
 ) -> Iterator[str]:
-    """Yield what is wrong with a scene that `sensor` returned for a dataset of `size` (columns, rows).
+    """Yield the faults of a scene that `sensor` returned for a dataset of `size` (columns, rows).
 
-    `kinds` are the model families that can be read from files; without them that is not asked. Errors of this package
-    that a model raises pass.
+    `kinds` are the model families that can be read from files; without them this is not checked. Errors of this package
+    that a model raises are passed on.
     """
     if not isinstance(scene, Scene):
         yield f"open_scene returned {type(scene).__name__} instead of a Scene"
@@ -115,7 +115,7 @@ def model_faults(model: SensorModel, kinds: Collection[str] | None = None) -> It
     except OrthoError:
         raise
     except Exception as error:
-        # The model is somebody else's code.
+        # The model is foreign code.
         yield f"the model failed ({described(error, type(model))})"
     yield from _mapping_faults(model)
 
@@ -235,7 +235,7 @@ def _is_pair_of_vectors(domain: Any) -> bool:
 
 
 def _shown(value: object) -> str:
-    """Return a value that people gave in few words."""
+    """Return a short description of a value."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
     text = repr(value)

@@ -1,7 +1,7 @@
-"""The plugins that are there: where each came from, what its hooks return, and which names are whose.
+"""The registered plugins: their origin, what their hooks return, and who owns each name.
 
-Plugins are found through entry-point groups, the bundled ones included: they have no privileged path, only reserved
-names. Those of commands have a group of their own, because ``ortho --help`` asks them: sensors import NumPy and GDAL.
+All plugins, also the bundled ones, are found through entry-point groups; bundled ones only have reserved names.
+Packages with commands have their own group, because ``ortho --help`` loads them, and sensors import NumPy and GDAL.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a plugin came from: its module, distribution and version."""
+    """Origin of a plugin: its module, distribution and version."""
 
     plugin: str
     module: str
@@ -46,13 +46,13 @@ class Origin:
 
     @property
     def bundled(self) -> bool:
-        """Whether it comes along with the package."""
+        """Whether the plugin belongs to ortho-pipeline."""
         return self.distribution.lower().replace("_", "-").replace(".", "-") == BUNDLED
 
 
 @dataclass(frozen=True)
 class Broken:
-    """A plugin that could not be imported, or that breaks the contract, and why."""
+    """A plugin that could not be imported or breaks the contract, with the reason."""
 
     plugin: str
     distribution: str
@@ -64,25 +64,25 @@ class Broken:
 
 
 class Registry:
-    """The plugins that are registered, where they came from, which names are whose, and what their hooks return.
+    """The registered plugins, their origins, the owners of names, and what their hooks return.
 
     Parameters
     ----------
     lenient : bool
-        Leave out a plugin that breaks the contract and list it in `broken`, instead of raising.
+        Skip a plugin that breaks the contract and list it in `broken`, instead of raising.
     group : str, optional
-        Entry-point group of the plugins, of the ``GROUPS`` of `specs`; its ``PROJECT_NAME`` without it.
+        Entry-point group, one of ``GROUPS`` of `specs`; default: its ``PROJECT_NAME``.
     reserved : iterable of str
         Names that belong to the host.
     specs : module
-        The hooks, as `ortho_pipeline.hookspecs` has them: a package that has hooks of its own names its module.
+        The hooks: `ortho_pipeline.hookspecs`, or the module of a package that has its own hooks.
 
     Attributes
     ----------
     origin : dict of str to Origin
-        Of every plugin, by its name.
+        Origin of each plugin.
     owner : dict of str to str
-        The plugin that a sensor, a model family, a format, a command or another offer belongs to.
+        Plugin of each sensor, model family, format, command or other offer.
     broken : tuple of Broken
     """
 
@@ -100,28 +100,28 @@ class Registry:
         self.broken: tuple[Broken, ...] = ()
 
     def register_installed(self) -> None:
-        """Register the plugins that installed distributions name as entry points."""
-        known: dict[int, tuple[str, str]] = {}  # each look at a name or a version parses all metadata
+        """Register the plugins that installed distributions declare as entry points."""
+        known: dict[int, tuple[str, str]] = {}  # each access to a name or version parses all metadata
         origins: list[tuple[Origin, metadata.EntryPoint]] = []
         for entry in metadata.entry_points(group=self._group):
             if id(entry.dist) not in known:
-                told = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
-                known[id(entry.dist)] = told["Name"], told["Version"]
+                fields = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
+                known[id(entry.dist)] = fields["Name"], fields["Version"]
             origins.append((Origin(entry.name, entry.value, *known[id(entry.dist)]), entry))
-        # Bundled ones first: what they offer is theirs.
-        for origin, entry in sorted(origins, key=lambda one: (not one[0].bundled, one[1].name)):
+        # Bundled plugins first: their names are reserved.
+        for origin, entry in sorted(origins, key=lambda pair: (not pair[0].bundled, pair[1].name)):
             if origin.bundled:
                 self._reserved.add(entry.name)
             try:
                 plugin = entry.load()
             except (Exception, SystemExit) as error:
-                # A plugin is somebody else's code: whatever its import does wrong, the others go on.
+                # A plugin is foreign code: whatever fails in its import, continue with the others.
                 self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, entry.module)))
                 continue
             self.register(plugin, origin)
 
     def register(self, plugin: Any, origin: Origin) -> None:
-        """Register one plugin, which came from `origin`."""
+        """Register one plugin."""
         name = f"{origin.plugin} ({origin})" if origin.version else origin.plugin
         with self._judged(origin):
             self._refuse_misspelt(plugin, name)
@@ -133,13 +133,13 @@ class Registry:
                 self.origin[registered] = origin
 
     def sensors(self) -> Mapping[str, Sensor]:
-        """Collect the sensors that plugins offer, by name."""
+        """Collect the sensors of all plugins, by name."""
         from ortho_pipeline.host.contract import sensor_faults
 
         return self.named("ortho_sensors", "sensor", Sensor, sensor_faults)
 
     def models(self) -> Mapping[str, type[SensorModel]]:
-        """Collect the model families that plugins offer, by kind."""
+        """Collect the model families of all plugins, by kind."""
         from ortho_pipeline.models import KINDS, SensorModel
 
         families: dict[str, type[SensorModel]] = {}
@@ -160,31 +160,31 @@ class Registry:
         return MappingProxyType(families)
 
     def formats(self) -> Mapping[str, Format]:
-        """Collect the formats that plugins add to those of the host, by name; what they write is checked."""
+        """Collect the formats of all plugins, by name; their output is checked."""
         from ortho_pipeline.exchange.export import FORMATS, RESERVED
 
         self._reserved |= RESERVED
-        endings = {one.ending.casefold(): one.name for one in FORMATS.values()}
+        endings = {offer.ending.casefold(): offer.name for offer in FORMATS.values()}
         added = self.named("ortho_formats", "format", Format, lambda offer: _format_faults(offer, endings))
-        return {name: replace(one, write=_checked(one, self.owner[name])) for name, one in added.items()}
+        return {name: replace(offer, write=_checked(offer, self.owner[name])) for name, offer in added.items()}
 
     def commands(self) -> Mapping[str, Subcommand]:
-        """Collect the commands that packages add, by name."""
+        """Collect the commands of all packages, by name."""
         return self.named("ortho_commands", "command", Subcommand, _command_faults)
 
     def named(
         self, hook: str, what: str, kind: type[Any], faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
     ) -> Mapping[str, Any]:
-        """Collect what a hook offers, by name.
+        """Collect the offers of a hook, by name.
 
         Parameters
         ----------
         hook : str
-            It returns an iterable of values of `kind`.
+            Returns an iterable of values of `kind`.
         what : str
-            What people call such a value.
+            Word for such a value in messages.
         faults : callable(offer) -> iterator of str
-            What is wrong with an offer; the first fault is an error of its plugin.
+            Faults of an offer; the first one is an error of its plugin.
         """
         offers: dict[str, Any] = {}
         advice = f"yield the {kind.__name__}, or return [{kind.__name__}(...)]"
@@ -203,7 +203,7 @@ class Registry:
 
     @contextlib.contextmanager
     def _judged(self, origin: Origin) -> Iterator[None]:
-        """Let an error of a plugin pass, or note it and go on."""
+        """Raise an error of a plugin, or skip the plugin and continue."""
         try:
             yield
         except PluginError as error:
@@ -237,15 +237,15 @@ class Registry:
             raise PluginError(f"plugin {name}: unknown hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
 
     def _returned(self, hook: str, wanted: type, collect: type, advice: str) -> Iterator[tuple[str, Any]]:
-        # pluggy calls the hook once for each plugin, wrappers around it: so an error can name its plugin.
-        every = getattr(self._manager.hook, hook).get_hookimpls()
-        offering = [one for one in every if not (one.wrapper or one.hookwrapper)]
+        # Call the hook for each plugin separately, with its wrappers, so that an error can name its plugin.
+        implementations = getattr(self._manager.hook, hook).get_hookimpls()
+        offering = [item for item in implementations if not (item.wrapper or item.hookwrapper)]
         for implementation in offering:
             plugin = implementation.plugin_name
-            others = [one.plugin for one in offering if one is not implementation]
+            others = [item.plugin for item in offering if item is not implementation]
             with self._judged(self.origin[plugin]):
                 try:
-                    # pluggy returns no None.
+                    # pluggy drops None.
                     offered = next(iter(self._manager.subset_hook_caller(hook, others)()), None)
                     returned = collect(offered) if isinstance(offered, wanted) else None
                 except (Exception, SystemExit) as error:
@@ -273,7 +273,7 @@ class Registry:
 
 
 def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
-    """Yield what is wrong with an offered format; `endings` are those that are taken, with the formats' names."""
+    """Yield the faults of an offered format; `endings` are those in use, with the names of their formats."""
     if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
         yield f"{offer.name!r} is not a valid format name; use lower case, digits and dashes"
     elif not isinstance(offer.title, str) or not offer.title.strip():
@@ -287,7 +287,7 @@ def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
 
 
 def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
-    """Return the function that writes a plugin's format, whole or not at all; its errors name the plugin."""
+    """Return a function that writes a plugin's format completely or not at all; its errors name the plugin."""
 
     def write(export: Any, path: Path) -> float:
         from ortho_pipeline.files import whole_or_nothing
