@@ -70,7 +70,7 @@ def _kind(path: Path) -> str | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether a camera lies beside an image."""
+    """Return whether there is a camera beside an image."""
     return camera_of(dataset.GetDescription()) is not None
 
 

@@ -145,7 +145,7 @@ def read_adjust(path: PathLike[str]) -> tuple[Array, Array]:
 
 
 def adjusted(model: SensorModel, translation: Array, rotation: Array) -> SensorModel:
-    """Return a camera moved and turned in space as an adjustment says.
+    """Return a camera after the translation and rotation of an adjustment.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def adjusted(model: SensorModel, translation: Array, rotation: Array) -> SensorM
 
 
 def _turns(own: Array, world: Array) -> Array | None:
-    """Return the rotations ``(rows, 3, 3)`` from camera to ECEF that turn directions best; None where none does."""
+    """Return the rotations ``(rows, 3, 3)`` from camera to ECEF that fit the directions best; None if none fits."""
     with np.errstate(all="ignore"):
         left, _, right = np.linalg.svd(np.einsum("rci,cj->rij", world, own))
         signs = np.ones((len(world), 3))

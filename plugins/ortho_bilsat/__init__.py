@@ -45,18 +45,18 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether an imaging survey lies beside the image."""
+    """Return whether there is an imaging survey beside the image."""
     try:
         # A dataset in memory has no name: ValueError.
         survey = survey_of(dataset.GetDescription())
-        # A refusal of what is not there looks for names like it among all of its folder.
+        # Check first: the error for a missing file searches the whole folder for similar names.
         return survey.is_file() and read_bounded(survey, len(MARK)).startswith(MARK.encode())
     except (InputError, ValueError):
         return False
 
 
 def survey_of(image: str) -> Path:
-    """Return the path at which the survey of an image is looked for."""
+    """Return the expected path of the survey of an image."""
     path = place(image)
     return path.with_name(f"{path.stem}_survey.txt")
 

@@ -1,4 +1,4 @@
-"""Sensor plugin for CARTOSAT-1 Ortho Kit images: RPC, and a pushbroom from what the metadata tells (cartosat.md)."""
+"""Sensor plugin for CARTOSAT-1 Ortho Kit images: RPC, and a pushbroom from the metadata (cartosat.md)."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from ortho_pipeline.plugin import (
     rpc_of_fields,
 )
 
-#: Ground for which the pushbroom is meant where no RPC tells it.
+#: Height range (m) of the pushbroom without an RPC.
 HEIGHTS = (-500.0, 9000.0)
-#: The RPC that GDAL finds and the one used here are called different beyond this (px).
+#: RPCs of GDAL and of this plugin that differ by more than this (px) give a warning.
 DISAGREEMENT = 1.0
 FACTS = {
     "product_id": "ProductID",
@@ -67,7 +67,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether the metadata of a CARTOSAT-1 image lie beside this one."""
+    """Return whether there are CARTOSAT-1 metadata beside this image."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and read_metadata(path).is_cartosat1
@@ -131,7 +131,7 @@ def open_scene(
 
 
 def _facts(name: str, metadata: Metadata, warnings: list[Notice]) -> dict[str, object]:
-    """Return what the metadata tell people; what is damaged there is no reason to refuse the image."""
+    """Return facts of the metadata; damaged ones give a warning, not an error."""
     partner = partner_of(name, metadata)
     facts: dict[str, object] = {"partner": None if partner is None else str(partner), "acquired": metadata.acquired}
     for fact, key in {**FACTS, **NUMBERS}.items():
@@ -158,11 +158,11 @@ def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | 
 
 
 def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[Notice]:
-    """Return a warning where GDAL's own readers took another RPC than this plugin."""
+    """Return a warning if GDAL reads another RPC than this plugin."""
     try:
         other = rpc_of_fields(dataset.GetMetadata("RPC") or {})
     except (InputError, RuntimeError):
-        # None, or an encrypted file, which GDAL takes for a damaged one.
+        # There is none, or the file is encrypted.
         return []
     centre = np.array([[found.lon_off, found.lat_off, found.h_off]])
     apart = float(np.abs(other.ground_to_image(centre) - found.ground_to_image(centre)).max())

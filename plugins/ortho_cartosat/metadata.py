@@ -1,7 +1,7 @@
 """The `_MET.TXT` of a CARTOSAT-1 product: ``key = value`` lines (docs/formats/cartosat.md), read with tolerance.
 
-Blanks are irregular, cases vary, ``-NA-`` stands for what is not known, and lines without an assignment are titles. A
-key is only judged when somebody asks for it: then a value that is none is an error that names file and key.
+Blanks are irregular, cases vary, ``-NA-`` means unknown, and lines without an assignment are titles. A key is only
+checked when it is read; an invalid value is an error that names file and key.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Metadata:
 
     @property
     def view(self) -> str | None:
-        """'fore' or 'aft', from the sensor's name or its angle along the track; None where neither says."""
+        """'fore' or 'aft', from the sensor's name or its angle along the track; None if neither states it."""
         sensor = re.sub(r"[\W_]", "", (self.text("Sensor", "BandNumbers") or "").upper())
         for name, view in (("FORE", "fore"), ("AFT", "aft"), ("PANF", "fore"), ("PANA", "aft")):
             if name in sensor:
@@ -137,7 +137,7 @@ class Metadata:
 
     @property
     def acquired(self) -> str | None:
-        """Time of the middle of the scene, as ISO 8601 in UTC where it can be understood, or as it stands."""
+        """Time of the middle of the scene, as ISO 8601 in UTC if it can be parsed, otherwise unchanged."""
         text = self.text("SceneCenterTime", "SceneCentreTime", "DateOfPass")
         if text is None:
             return None

@@ -42,7 +42,7 @@ CLOSE = 0.1
 
 
 def has_csm(path: str | PathLike[str]) -> bool:
-    """Tell whether a file is a CSM state, from its first line."""
+    """Return whether a file is a CSM state, from its first line."""
     try:
         return read_bounded(path, 200)[:200].lstrip().startswith(tuple(name.encode() for name in _NAMES))
     except InputError:
@@ -131,7 +131,7 @@ def write_csm(model: SensorModel, path: str | PathLike[str], *, force: bool = Fa
 
 
 def _apart(model: SensorModel, again: SensorModel, size: tuple[int, int], heights: tuple[float, float]) -> float:
-    """Return by how many pixels two models of one image differ at most; infinite where one sees nothing."""
+    """Return the largest difference of two models of one image in pixels; infinite if one has no ground."""
     ground = ground_of_grid(model, size, 7, heights)
     ground = ground[np.isfinite(ground).all(axis=1)]
     theirs = ground_transform(model.crs, again.crs)(ground) if model.crs != again.crs else ground

@@ -104,7 +104,7 @@ def read_frame(state: StateFields) -> FrameCamera:
 
 
 def frame_fields(model: FrameCamera) -> dict[str, Any]:
-    """Return the state of a frame; what it has of a lens, of refraction or of a map projection is left out."""
+    """Return the state of a frame; lens distortion, refraction and map projection are not part of it."""
     from scipy.spatial.transform import Rotation
 
     interior = model.interior
@@ -145,7 +145,7 @@ def _orientation(model: FrameCamera) -> tuple[Array, Array]:
 
 
 def _below(model: FrameCamera) -> Array:
-    """Return lon, lat, height ``(1, 3)`` of what the middle of the frame sees, or of what is below it."""
+    """Return lon, lat, height ``(1, 3)`` of the ground at the middle of the frame, or below the camera."""
     middle = np.array([[model.interior.width, model.interior.height]]) / 2
     seen = model.image_to_ground(middle, model.reference_height)
     if not np.isfinite(seen).all():

@@ -36,15 +36,15 @@ from ortho_pipeline.plugin import (
 HEIGHTS = (-500.0, 9000.0)
 #: Lines whose times are further (lines) from one rate have no constant period.
 _EVEN = 0.01
-#: Positions are written so far apart (s), and angles so many times as often as the knots of their spline.
+#: Time step (s) of written positions, and number of written angles per knot of their spline.
 _EVERY, _OFTEN, _FEWEST = 0.25, 2, 16
-#: Columns at which a line of detectors is looked at to make it one of equal pixels, and how close (px) is exact.
+#: Columns at which a line of detectors is sampled to make its pixels equal, and tolerance (px) for exactness.
 _COLUMNS, _EXACT = 33, 1e-7
 _QUATERNIONS, _POSITIONS = "m_quaternions", "m_positions"
 
 
 def read_line_scanner(state: StateFields) -> Pushbroom:
-    """Make a line scanner of a state; free are offsets and drifts of its attitude."""
+    """Make a line scanner of a state. Its parameters are offsets and drifts of the attitude."""
     columns, rows = state.size()
     if state.numbers("m_currentParameterValue").any():
         raise state.error("corrections of the tables are not supported", "m_currentParameterValue")
@@ -170,7 +170,7 @@ def line_scanner_fields(model: Pushbroom) -> dict[str, Any]:
     }
 
 
-#: What is the same for every state that is written.
+#: Fields that have the same value in each state that is written.
 _FIXED: dict[str, Any] = {
     "m_imageIdentifier": "",
     "m_sensorName": "ortho-pipeline",
@@ -276,7 +276,7 @@ def _line(model: Pushbroom) -> _Line:
         centred = look @ tilted
         centred /= centred[:, 2:]
         first, third, fifth = np.linalg.lstsq(off[:, None] ** (1, 3, 5), centred[:, 0], rcond=None)[0]
-        # A line that is bent is one that the distortion bends: beside the axis, as far as it is bent.
+        # A bent line is represented by distortion: offset from the axis by the size of the bend.
         bent = float(np.polynomial.polynomial.polyfit(off, centred[:, 1], 2)[2])
         wanted = float(bent * first / third) if abs(third) > 1e-9 * abs(first) else 0.0
         tilt += float(np.clip(centred[:, 1].mean() - wanted, -0.1, 0.1))

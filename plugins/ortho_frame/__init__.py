@@ -1,6 +1,6 @@
 """Sensor plugin for frame images in general: a camera file, and a table of exterior orientations.
 
-It recognises nothing by itself: it is taken when its options are given (``camera``, ``exterior``).
+It recognises nothing automatically: it is used when its options are given (``camera``, ``exterior``).
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def _shot_model(
 
 def _heights(text: str | None, camera: float) -> tuple[float, float]:
     if text is None:
-        # What is known is only that the ground is below the camera.
+        # Only one thing is known: the ground is below the camera.
         low = min(-100.0, camera - 1000.0)
         return low, min(9000.0, camera - 0.1 * (camera - low))
     low, high = _pair(text)
@@ -185,7 +185,7 @@ def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
 
 
 def _pair(text: str) -> tuple[float, float]:
-    """Return two numbers; NaN for what is none."""
+    """Return two numbers; NaN if there are not two."""
     found = numbers_of(text)
     return (found[0], found[1]) if len(found) == 2 else (math.nan, math.nan)
 

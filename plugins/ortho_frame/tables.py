@@ -23,7 +23,7 @@ from ortho_pipeline.plugin import (
 )
 
 MAX_BYTES = 5_000_000
-#: A reconstruction holds the points of the whole block too.
+#: A reconstruction also has the points of the whole block.
 MAX_JSON_BYTES = 200_000_000
 #: Columns of a table, by the ways to write them; the first of each is the name in messages.
 MAP_COLUMNS = (("x",), ("y",), ("z",), ("omega",), ("phi",), ("kappa",))
@@ -50,7 +50,7 @@ DISTORTION_KEYS = ("k1", "k2", "k3", "p1", "p2")
 
 @dataclass(frozen=True)
 class Pose:
-    """One row of the table: position and angles (degrees) as they stand there."""
+    """One row of the table: position and angles (degrees) as written."""
 
     source: str
     where: str
@@ -229,7 +229,7 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
     Raises
     ------
     InputError
-        If the table has no header, the image is not in it or stands twice, or a number is wrong.
+        If the table has no header, the image is missing or appears twice, or a number is wrong.
     """
     if is_reconstruction(path):
         return _shot(path, Path(image))
@@ -257,7 +257,7 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
 
 
 def is_reconstruction(path: str | PathLike[str]) -> bool:
-    """Tell whether a file of exterior orientations is OpenSfM's ``reconstruction.json``, and no table."""
+    """Tell whether a file of exterior orientations is OpenSfM's ``reconstruction.json``, not a table."""
     return Path(path).suffix.lower() == ".json"
 
 

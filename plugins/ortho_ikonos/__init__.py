@@ -1,8 +1,8 @@
 """Sensor plugin for IKONOS Geo products: ``po_<order>_<band>_<component>`` images with their metadata file.
 
-Two models: the vendor's RPC where there is one, and ``geo``, the plane at Reference Height from the metadata alone
-(docs/formats/ikonos.md). Bands in files of their own are stacked on request; points that were measured in another
-band or component of the same acquisition count for this image as well.
+There are two models: the vendor's RPC, if there is one, and ``geo``, the plane at Reference Height from the metadata
+alone (docs/formats/ikonos.md). Bands in separate files are stacked on request. Points that were measured in another
+band or component of the same acquisition also count for this image.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ OPTIONS = {
 }
 #: Products on the plane at Reference Height.
 PRODUCT_LINE, LEVEL = "Geo", "Standard Geometrically Corrected"
-#: Half the range of heights that `geo` is meant for where nothing else is known (m).
+#: Half of the height range (m) of `geo` without other information.
 HALF_RANGE = 500.0
 #: What the vendor states of the first years is 50 m at 90 %: 23 m for each coordinate. Direction of relief: by how much
 #: it differs from the nominal one within a real scene (docs/engineering/block-adjustment.md).
@@ -80,7 +80,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether it is named like an image of an order whose metadata, which lie beside it, are of IKONOS."""
+    """Return whether the file is named like an image of an order, with IKONOS metadata beside it."""
     image = OrderImage.of(place(dataset.GetDescription()))
     if image is None:
         return False
@@ -149,7 +149,7 @@ def open_scene(
 
 
 def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
-    """Return the RPC and where it is from; GDAL does not attach a side-car to every format."""
+    """Return the RPC and its source; GDAL does not attach a sidecar to every format."""
     if choice is not None or has_rpc(dataset):
         return rpc_of_dataset(dataset, choice)
     found = rpc_file(place(dataset.GetDescription()))
@@ -157,7 +157,7 @@ def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
 
 
 def _lacking(position: Position, source: SourceImage) -> list[str]:
-    """Return the keys without which there is no plane."""
+    """Return missing keys that the plane needs."""
     wanted = {
         "Map Projection (UTM on WGS84, or of the image)": position.crs,
         "UL Map X, UL Map Y": position.corner,
@@ -235,7 +235,7 @@ def _priors(models: Mapping[str, SensorModel]) -> dict[str, Prior]:
 def _pieces(
     image: OrderImage, delivery: Delivery, component: Component, position: Position, with_models: bool
 ) -> tuple[tuple[Piece, ...], list[Notice]]:
-    """Return the other files of the acquisition, of the same plane and maybe other pixels, and what is wrong."""
+    """Return the other files of the acquisition (same plane, maybe other pixels), and warnings."""
     found: list[Piece] = []
     warnings: list[Notice] = []
     others = list(image.others())
@@ -262,7 +262,7 @@ def _pieces(
     return tuple(found), warnings
 
 
-# -- what to say -----------------------------------------------------------------------------------------------------
+# -- facts and warnings ----------------------------------------------------------------------------------------------
 
 
 def _level_warnings(delivery: Delivery) -> list[Notice]:

@@ -1,8 +1,8 @@
 """The metadata file of an IKONOS order (``po_<order>_metadata.txt``) and the header of one image (``_hdr.txt``).
 
-Sections stand between lines of ``=``, are nested by blanks, and hold records that begin at ``Source Image ID`` or
-``Component ID`` (older orders: ``Tile ID``). A component names its product image, and that a source image
-(docs/formats/ikonos.md). What is not known is left alone; what is wanted and is not there is an error.
+Lines of ``=`` separate sections. Blanks nest entries. Records begin at ``Source Image ID`` or ``Component ID`` (older
+orders: ``Tile ID``). A component names its product image, which names a source image (docs/formats/ikonos.md). Unknown
+keys are ignored; a required key that is missing is an error.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ class MetadataLine:
 
 @dataclass(frozen=True)
 class SectionRecord:
-    """The entries of one record of a section, looked up by key wherever they are nested."""
+    """The entries of one record of a section, by key at any level."""
 
     file: str
     name: str
     entries: tuple[MetadataLine, ...]
 
     def text(self, *keys: str) -> str | None:
-        """Return the value of the first of these keys that is there and not empty; None without.
+        """Return the value of the first of these keys that exists and is not empty; None without one.
 
         Raises
         ------
         InputError
-            If the key stands there twice with two values.
+            If the key appears twice with different values.
         """
         for key in keys:
             found = [entry for entry in self.entries if entry.key.lower() == key.lower() and entry.value]
@@ -96,7 +96,7 @@ class SectionRecord:
         return number
 
     def count(self, *keys: str, units: tuple[str, ...] = PIXELS) -> int | None:
-        """Return a whole number that is not negative; None without."""
+        """Return a whole number that is not negative; None without one."""
         value = self.number(*keys, units=units, low=0, high=1e7)
         if value is not None and value != int(value):
             raise InputError(
@@ -110,7 +110,7 @@ class SectionRecord:
 
 @dataclass(frozen=True)
 class SourceImage:
-    """One acquisition; angles in degrees, None for what the file does not say.
+    """One acquisition; angles in degrees, None if not stated.
 
     `azimuth` and `elevation` are of the satellite as seen from the scene, `azimuth` from true north clockwise.
     """
@@ -129,7 +129,7 @@ class SourceImage:
 
 @dataclass(frozen=True)
 class MapPlacement:
-    """How an image lies on the map; None for what the file does not say.
+    """Position of an image on the map; None if not stated.
 
     `upper_left` is the map position of the *centre* of the first pixel, `size` columns and rows.
     """
@@ -140,7 +140,7 @@ class MapPlacement:
     reference_height: float | None = None
 
     def completed_by(self, other: MapPlacement) -> MapPlacement:
-        """Return this placement with what it does not say taken from another."""
+        """Return this placement with missing values taken from another."""
         return MapPlacement(
             self.upper_left or other.upper_left,
             self.pixel or other.pixel,
@@ -162,8 +162,8 @@ class Component:
 class Delivery:
     """The statements of the metadata file of an order.
 
-    `crs` is None where the projection is another than UTM on WGS84, `projection` what the file calls it. `product`
-    is what the whole product has in common, where it does not belong to one component.
+    `crs` is None if the projection is not UTM on WGS84; `projection` is its name in the file. `product` has what
+    belongs to the whole product, not to one component.
     """
 
     file: str
@@ -269,7 +269,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
 
 @reads("copy the _hdr.txt again from the delivery")
 def read_header(path: str | PathLike[str]) -> MapPlacement:
-    """Read how an image lies on the map from its ``_hdr.txt``; its keys are those of a component.
+    """Read the position of an image on the map from its ``_hdr.txt``, with the keys of a component.
 
     Raises
     ------
@@ -311,7 +311,7 @@ def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:
 
 
 def _sections(path: str, text: str) -> dict[str, list[SectionRecord]]:
-    """Return by title the records of each section; the first is what stands before any record."""
+    """Return the records of each section by title; the first one has the entries before all records."""
     blocks: list[list[tuple[int, str]]] = [[]]
     for number, line in _lines(path, text):
         if _RULE.fullmatch(line.strip()):

@@ -1,4 +1,4 @@
-"""The files of an IKONOS order: which bands and components lie beside an image, and where each lies on the map."""
+"""The files of an IKONOS order: bands and components beside an image, and the map position of each."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class OrderImage:
 
     @classmethod
     def of(cls, path: Path) -> OrderImage | None:
-        """Return what the name says; None for a name that is not the vendor's."""
+        """Return the parts of the file name; None if it is not a name of the vendor."""
         match = _NAME.fullmatch(path.name)
         return match and cls(path, match["order"], match["band"].lower(), match["component"])
 
@@ -101,15 +101,15 @@ def bands_of(image: OrderImage, wanted: str) -> tuple[Path, ...]:
     return tuple(there[name] for name in names)
 
 
-# -- where an image lies ---------------------------------------------------------------------------------------------
+# -- map position ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Position:
-    """Where an image lies on the map; None for what nothing says.
+    """Position of an image on the map; None if not stated.
 
     `corner` is the outer corner of the first pixel, `pixel` the size of a pixel of this image, both in metres;
-    `sources` are the files that say so.
+    `sources` are the files with this information.
     """
 
     crs: str | None
@@ -132,12 +132,12 @@ class Position:
 
 
 def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component) -> Position:
-    """Return where an image lies: by its header, its component, the product, and last by its own georeferencing.
+    """Return the position of an image: from its header, its component, the product, or last from its georeferencing.
 
     Raises
     ------
     InputError
-        If the image has not the size that is stated.
+        If the image has another size than stated.
     """
     path, size = place(dataset.GetDescription()), (dataset.RasterXSize, dataset.RasterYSize)
     header = beside(path, f"{path.stem}_hdr.txt")
@@ -170,10 +170,10 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
 
 
 def _factor(stated: MapPlacement, size: tuple[int, int], path: Path, own_pixel: tuple[float, float] | None) -> int:
-    """Return how many stated pixels are one pixel of the image: 4 for colours beside panchromatic metadata.
+    """Return the number of stated pixels per pixel of the image: 4 for colours with panchromatic metadata.
 
-    Colour and panchromatic images of one acquisition share their outer corner. A crop to a half, or to a quarter, has
-    such a size as well: its own pixels tell, and where it has none, only colours can be coarser.
+    Colour and panchromatic images of one acquisition share their outer corner. A crop to a half or a quarter can have
+    such a size too. Then its pixel size decides; without one, only colours can be coarser.
     """
     if stated.size is None or stated.size == size:
         return 1

@@ -23,7 +23,7 @@ from ortho_pipeline.plugin import (
     rpc_of_dataset,
 )
 
-#: From here on (px) the rigorous model and the RPC are worth a word, and from here on they are of two images.
+#: If rigorous model and RPC differ by more (px), warn; if by more than the second value, they are of different images.
 APART, DISAGREEMENT = 5.0, 100.0
 
 
@@ -40,7 +40,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether ISD XML of an image lies beside it."""
+    """Return whether there is ISD XML beside an image."""
     return metadata_of(dataset.GetDescription()) is not None
 
 
@@ -91,7 +91,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
 
 
 def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None) -> tuple[RPC | None, str]:
-    """Return the RPC of an image in its own pixels, and where it is from."""
+    """Return the RPC of an image in its own pixels, and its source."""
     if choice is not None:
         return rpc_of_dataset(dataset, choice)
     if isd.rpc is None:
@@ -100,7 +100,7 @@ def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None)
 
 
 def _compared(rigorous: Pushbroom, rpc: RPC | None) -> list[Notice]:
-    """Return a warning where rigorous model and RPC of an image differ; refuse to take both where it is much."""
+    """Return a warning if rigorous model and RPC of an image differ; raise an error if they differ too much."""
     if rpc is None:
         return []
     middle = np.array([rigorous.camera.size]) / 2

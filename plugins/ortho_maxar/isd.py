@@ -1,11 +1,11 @@
 r"""ISD XML of WorldView 1 to 4, GeoEye-1 and QuickBird: orbit, attitude and detectors as a line scanner; RPC; tiles.
 
-What the vendor's numbers mean:
+Conventions of the vendor:
 
 - row r, counted from 0 at the centre of the first, is exposed at TLCTIME + t, with t linear between the pairs (r, t) of
-  TLCLIST: t decreases where the scan ran against the flight (SCANDIRECTION Reverse); positions and attitude are
-  TIMEINTERVAL apart, the first of them at STARTTIME;
-- positions are ECEF; the quaternion, scalar last, turns the camera to ECEF, as it is at the moment of exposure;
+  TLCLIST: t decreases if the scan ran against the flight (SCANDIRECTION Reverse); positions and attitude have the step
+  TIMEINTERVAL and begin at STARTTIME;
+- positions are ECEF; the quaternion (scalar last) rotates the camera to ECEF at the moment of exposure;
 - column c, counted from 0 at the first centre, looks along (DETORIGINX, DETORIGINY - c DETPITCH, PD) of the camera, in
   millimetres, z to the ground;
 - velocity aberration *and* refraction are not in the angles: the vendor's RPC has both.
@@ -14,8 +14,8 @@ Checked on both parts of a WorldView-1 strip at 19 degrees off nadir, over the i
 vendor's RPC: the constant is (0.03, -0.13) and (0.04, -0.10) px, the standard deviation (0.04, 0.07) and (0.05, 0.02)
 px. Without refraction it is 1.1 rows and changes with height by 0.05 rows, without aberration (17, 20) px.
 
-Not read, because nothing was at hand to check their sense with: turned detectors, several arrays, an optical
-distortion, a camera that is turned in or away from the middle of its platform.
+Not supported, because no data were available to check their signs: rotated detectors, several arrays, optical
+distortion, and a camera that is rotated in its platform or off its centre.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 
 #: An hour of a strip has 30 MB; no strip takes an hour.
 MAX_SIZE = 20_000_000
-#: Heights (m) of the ground where there is no RPC that tells them.
+#: Height range (m) of the ground without an RPC.
 HEIGHTS = (-500.0, 9000.0)
 #: Rows whose times are off the mean line rate by more than this (rows) are not those of one rate.
 _EVEN = 0.1
@@ -109,7 +109,7 @@ class Isd:
 
     @cached_property
     def rpc(self) -> RPC | None:
-        """The vendor's RPC of the whole image; None without."""
+        """The vendor's RPC of the whole image; None without one."""
         return read_rpc_text(self.path) if self.file.has("RPB/IMAGE/LINEOFFSET") else None
 
     @cached_property
@@ -132,7 +132,7 @@ class Isd:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is worth showing; what is damaged there is left out."""
+        """Facts for people; damaged ones are left out."""
         image = "IMD/IMAGE"
         facts: dict[str, Any] = {
             "satellite": self.file.said(f"{image}/SATID"),
@@ -167,12 +167,12 @@ def read_isd_pushbroom(
     ----------
     source : path or Isd
     size, first : (int, int)
-        Columns and rows of the tile, and its first column and row; without them the whole image.
+        Columns and rows of the tile, and its first column and row; default: the whole image.
 
     Raises
     ------
     InputError
-        If something is missing or impossible, or the camera is of a kind whose conventions are not known.
+        If something is missing or impossible, or the conventions of the camera are not known.
     """
     isd = source if isinstance(source, Isd) else Isd(source)
     file = isd.file
@@ -181,7 +181,7 @@ def read_isd_pushbroom(
     across, along = _look(file, isd.band)
     began = start + (first[1] - 0.5) * period
     heights = HEIGHTS if isd.rpc is None else isd.rpc.height_range
-    # From the first centre of the whole to the outer corner of the first pixel of the tile.
+    # From the first pixel centre of the whole image to the outer corner of the first pixel of the tile.
     shifted = np.array([across[0] + (first[0] - 0.5) * across[1], across[1]])
     eph_times, places = _rows_of(file, "EPH", "EPHEMLIST", 12)
     att_times, quaternions = _rows_of(file, "ATT", "ATTLIST", 14)

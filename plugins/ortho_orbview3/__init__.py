@@ -48,7 +48,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether a label of OrbView-3 lies beside the image."""
+    """Return whether there is an OrbView-3 label beside the image."""
     path = label_of(dataset.GetDescription())
     if path is None:
         return False
@@ -56,7 +56,7 @@ def recognises(dataset: gdal.Dataset) -> bool:
         text = read_bounded(path, 100_000)
     except InputError:
         return False
-    # A label that is cut off should say so, and not be passed over: the name of the satellite comes late in it.
+    # Also accept a truncated label, so that the error says so: the name of the satellite is near its end.
     return b"OV-3" in text or (b"productInfo" in text and b"numScanLines" in text) or bool(_NAME.match(path.name))
 
 

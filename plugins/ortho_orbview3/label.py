@@ -59,7 +59,7 @@ class LabelGroup:
         return self.groups[name]
 
     def text(self, key: str) -> str:
-        """Return a value as it stands there, without its quotes.
+        """Return a value as written, without quotes.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class LabelGroup:
         Raises
         ------
         InputError
-            If it is missing, or is none.
+            If it is missing or invalid.
         """
         return self._number(key, self.text(key))
 
@@ -87,7 +87,7 @@ class LabelGroup:
         Raises
         ------
         InputError
-            If it is missing, or is none.
+            If it is missing or invalid.
         """
         value = self.number(key)
         if value != int(value) or not 0 < value < 1e9:
@@ -95,12 +95,12 @@ class LabelGroup:
         return int(value)
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return a list of so many finite numbers.
+        """Return a list of this many finite numbers.
 
         Raises
         ------
         InputError
-            If it is missing, or is not that.
+            If it is missing or invalid.
         """
         value = self._value(key)
         if not isinstance(value, tuple) or len(value) != count:
@@ -113,7 +113,7 @@ class LabelGroup:
         return tuple(self._number(key, part) for part in value)
 
     def has(self, key: str) -> bool:
-        """Tell whether there is a value of this key."""
+        """Return whether this key has a value."""
         return key in self.values
 
     def _value(self, key: str) -> str | tuple[str, ...]:
@@ -230,7 +230,7 @@ class _Reader:
                 values[last] = value
 
     def close(self, path: str) -> None:
-        """Read what follows END_GROUP: nothing, or the name of the group."""
+        """Read the rest of END_GROUP: nothing, or the name of the group."""
         if not path:
             raise self.wrong("END_GROUP without a group", f"line {self.line}")
         if self.next is None or self.next.text != "=":

@@ -1,4 +1,4 @@
-"""An OrbView-3 Basic product: what its label says, translated, and its RPC from the label and from the text file."""
+"""An OrbView-3 Basic product: its translated label, and its RPC from the label and from the text file."""
 
 from __future__ import annotations
 
@@ -102,12 +102,12 @@ class Product:
 
 
 def label_of(image: str | PathLike[str]) -> Path | None:
-    """Return the label beside an image, None if there is none."""
+    """Return the label beside an image; None without one."""
     return _beside(place(image), ".pvl")
 
 
 def rpc_text_of(image: str | PathLike[str]) -> Path | None:
-    """Return the RPC text beside an image, None if there is none."""
+    """Return the RPC text beside an image; None without one."""
     return _beside(place(image), "_rpc.txt")
 
 
@@ -155,17 +155,17 @@ def read_product(path: str | PathLike[str]) -> Product:
 
 
 def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple[RPC, str, tuple[Notice, ...]]:
-    """Return the RPC to use, its file, and what there is to say about it.
+    """Return the RPC to use, its file, and warnings.
 
     Parameters
     ----------
     choice : {None, 'label', 'text', 'sidecar'} or path
-        Which one, where they differ; the text is the side-car that GDAL reads.
+        Which RPC to use if they differ; the text is the sidecar that GDAL reads.
 
     Raises
     ------
     InputError
-        If the text is damaged or absent, or both differ by more than a pixel and none is chosen.
+        If the text is damaged or missing, or if both differ by more than a pixel and none is chosen.
     """
     if choice == "label":
         return product.rpc, product.file, ()

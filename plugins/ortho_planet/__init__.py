@@ -1,7 +1,7 @@
 """Sensor plugin for Planet's basic products: PlanetScope level 1B and SkySat level 1A/1B, by their RPC.
 
-The metadata of an item (``<id>_metadata.json``) lie beside its assets, whose names begin with the item's. Frames of one
-strip are images of their own: `ortho adjust` takes them together.
+The metadata of an item (``<id>_metadata.json``) are beside its assets, whose names begin with that of the item. Frames
+of a strip are separate images; `ortho adjust` adjusts them together.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ortho_pipeline.plugin import (
 MAX_SIZE = 5_000_000
 _METADATA = re.compile(r".*_metadata\.json$", re.IGNORECASE | re.DOTALL)
 _REMEDY = "download the metadata of this item again"
-#: What of an item is worth showing, and what it is called here.
+#: Facts of an item, with their names here.
 _TEXTS = {
     "acquired": "acquired",
     "satellite_id": "satellite",
@@ -75,7 +75,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether metadata of an item of Planet lie beside an image."""
+    """Return whether there are metadata of a Planet item beside an image."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and b'"item_type"' in read_bounded(path, MAX_SIZE)
@@ -118,12 +118,12 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
 
 @reads(_REMEDY)
 def read_item(path: Path) -> dict[str, Any]:
-    """Read what is worth showing of an item's metadata.
+    """Read the facts of an item's metadata.
 
     Raises
     ------
     InputError
-        If it is no JSON of an item.
+        If the file is not the JSON of an item.
     """
     document = read_json(path, MAX_SIZE, _REMEDY)
     properties = document.get("properties") if isinstance(document, dict) else None

@@ -1,7 +1,7 @@
 """Images with geolocation arrays: longitude and latitude of every pixel, or of every few, in GDAL's domain or in files.
 
-Such arrays are of one height for each pixel, which nobody states, so they tell where an image lies and not how its
-relief is displaced: a start for matching. The model is the lowest polynomial that follows them; what it leaves is said.
+Such arrays are for one unknown height per pixel. So they give the position of an image without relief displacement: a
+start for matching. The model is the simplest polynomial that fits them; a warning states its error.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OPTIONS = {
     "lon": "file with the longitudes of the pixels (or of every n-th), if the image does not name it",
     "lat": "file with the latitudes, in the same way",
 }
-#: Largest arrays (pixels), and how many of their rows and columns are looked at.
+#: Largest arrays (pixels), and number of sampled rows and columns.
 _MOST, _NODES = 100_000_000, 60
 #: Polynomials are tried until one follows the arrays to this (px).
 _FOLLOWS = 0.1
@@ -61,7 +61,7 @@ class Layout:
 
 
 def has_arrays(dataset: gdal.Dataset) -> bool:
-    """Tell whether an image names its geolocation arrays."""
+    """Return whether an image has geolocation arrays."""
     return bool((dataset.GetMetadata("GEOLOCATION") or {}).get("X_DATASET"))
 
 
@@ -101,9 +101,9 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
 
 
 def _layout_of(dataset: gdal.Dataset) -> Layout:
-    """Return what the domain ``GEOLOCATION`` says; its files have to lie beside the image."""
+    """Return the contents of the domain ``GEOLOCATION``; its files must be beside the image."""
     name = dataset.GetDescription()
-    # GDAL gives bytes where a text is none.
+    # GDAL returns bytes for invalid text.
     fields = {
         key: text if isinstance(text, str) else "?" for key, text in (dataset.GetMetadata("GEOLOCATION") or {}).items()
     }
@@ -114,7 +114,7 @@ def _layout_of(dataset: gdal.Dataset) -> Layout:
     for axis in "XY":
         text = fields[f"{axis}_DATASET"]
         beside = folder / text.replace("\\", "/").rpartition("/")[2]
-        # Whatever folder the metadata name, only the image's own is looked into.
+        # Only the folder of the image is searched, whatever folder the metadata name.
         if ":" in text or not _is_file(beside):
             raise InputError(
                 f"the array {text[:200]!r} is not a file beside the image",

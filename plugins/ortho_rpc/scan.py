@@ -24,7 +24,7 @@ PROFILES = {
     "S7_SENSOR": _NO_LIGHT,
     "PNEO_SENSOR": LightPath(refraction=True),
 }
-#: Seconds of the units in which line periods stand; Pleiades names none.
+#: Units of line periods in seconds; Pleiades states none.
 _UNITS = {None: 1e-3, "ms": 1e-3, "millisecond": 1e-3, "microsecond": 1e-6, "us": 1e-6}
 #: How often an attitude polynomial is sampled, and by how many cubic polynomials it is followed: to 1e-12 rad.
 _SAMPLES, _PIECES = 96, 24
@@ -36,21 +36,21 @@ _VENDOR_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.
 
 @dataclass(frozen=True)
 class Scan:
-    """A scene as either version describes it; times are seconds of the day.
+    """A scene as described by either version; times are seconds of the day.
 
     Parameters
     ----------
     start : float
-        When the centre of the first row is exposed.
+        Exposure time of the centre of the first row.
     psi_x, psi_y : (k,)
         Polynomials, lowest power first, of the column counted from 0 at the first centre.
     orbit : (N,), (N, 3)
     attitude : callable(first, duration) -> (N,), (N, 3, 3)
-        Times and rotations around so many seconds from `first` on.
+        Times and rotations for a duration in seconds, from `first` on.
     pieces : int, optional
-        By how many polynomials the attitude is followed; through all its rows without it.
+        Number of polynomials for the attitude; default: through all its rows.
     light : LightPath
-        What the angles leave out.
+        Effects that the angles do not include.
     """
 
     columns: int
@@ -110,7 +110,7 @@ def second_version(file: DimapFile) -> Scan:
 
 
 def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
-    """Return the polynomials of both angles, which all bands of the image have to share."""
+    """Return the polynomials of both angles; all bands of the image must share them."""
     base = f"{SECOND}/Geometric_Calibration/Instrument_Calibration"
     for name in ("YAW", "PITCH", "ROLL"):
         field = f"{base}/Instrument_Biases/{name}"
@@ -128,7 +128,7 @@ def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
 
 
 def _angle(file: DimapFile, base: str, name: str) -> Array:
-    """Return the coefficients ``name_0``, ``name_1`` ... that there are, of which the first has to be."""
+    """Return the coefficients ``name_0``, ``name_1`` ...; the first one is required."""
     terms = [file.number(f"{base}/{name}_0")]
     while file.has(f"{base}/{name}_{len(terms)}") and len(terms) <= MOST_TERMS:
         terms.append(file.number(f"{base}/{name}_{len(terms)}"))
@@ -145,7 +145,7 @@ def _possible_period(file: DimapFile, period: float, field: str) -> float:
 
 
 def _refuse_part_of_a_line(file: DimapFile, field: str, columns: int) -> None:
-    """Refuse columns that are not those of the whole image: no numbers of a vendor tell how they count."""
+    """Raise an error unless the columns are those of the whole image; the convention for others is unknown."""
     if not file.has(field):
         return
     first = file.number(f"{field}/FIRST_COL")
@@ -157,7 +157,7 @@ def _refuse_part_of_a_line(file: DimapFile, field: str, columns: int) -> None:
 
 
 def _refuse_other_duration(file: DimapFile, field: str, start: float, duration: float) -> None:
-    """Refuse a part of a pass: which of its rows the image has is not said."""
+    """Raise an error for a part of a pass, because it is not stated which rows the image has."""
     if not file.has(f"{field}/END"):
         return
     taken = file.time(f"{field}/END") - start
@@ -166,7 +166,7 @@ def _refuse_other_duration(file: DimapFile, field: str, start: float, duration: 
 
 
 def _polynomial_attitude(file: DimapFile, scaled: str, parts: str) -> Callable[[float, float], tuple[Array, Array]]:
-    """Return polynomials, sampled as far as half an image beyond both ends."""
+    """Return the attitude polynomials, sampled to half an image beyond both ends."""
     offset, scale = file.number(f"{scaled}/OFFSET"), file.number(f"{scaled}/SCALE")
     if scale == 0:
         raise file.error("a scale is zero", f"{scaled}/SCALE")

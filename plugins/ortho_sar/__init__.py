@@ -1,11 +1,11 @@
 r"""Sensor plugin for radar images that were geocoded on a plane (GEC), not on terrain: Capella, Umbra, ICEYE, others.
 
-A radar measures range: a point above the plane lies nearer to the antenna than the point of the plane below it, and is
-drawn *towards* the radar, by :math:`1 / \tan\theta` of its height at the incidence angle :math:`\theta`. In direction
-and sign a camera on the other side would see so at the elevation :math:`\theta`; the model is `MapPlane`.
+A radar measures range. A point above the plane is nearer to the antenna than the point of the plane below it, so it is
+displaced *towards* the radar, by :math:`1 / \tan\theta` of its height at the incidence angle :math:`\theta`. A camera
+on the other side at the elevation :math:`\theta` would show the same displacement; the model is `MapPlane`.
 
-No product was at hand to check the fields with that are read of Capella's ``_extended.json`` (places of satellite and
-scene centre, from which both angles follow); of others the angles are given as options. A notice says so.
+The reader of Capella's ``_extended.json`` (positions of satellite and scene centre, which give both angles) could not
+be checked with a real product; a notice says so. For other products the angles are options.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ortho_pipeline.plugin import (
 
 MAX_SIZE = 20_000_000
 _REMEDY = "download the metadata again, or give incidence=DEG and azimuth=DEG"
-#: Ground (m) above and below the plane that the model is meant for.
+#: Height range (m) of the model above and below the plane.
 HALF_RANGE = 1000.0
 #: Incidence angles of radars (degrees).
 _STEEPEST, _FLATTEST = 10.0, 80.0
@@ -62,7 +62,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def metadata_of(name: str) -> Path | None:
-    """Return the extended metadata of an image of Capella; None without."""
+    """Return the extended metadata of a Capella image; None without them."""
     if not name:
         return None
     try:
@@ -74,7 +74,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether extended metadata of Capella lie beside an image, or it has complex values that nothing places."""
+    """Return whether an image has extended Capella metadata beside it, or complex values without a position."""
     path = metadata_of(dataset.GetDescription())
     if path is None and _is_slant(dataset) and not has_rpc(dataset):
         return True
@@ -87,7 +87,7 @@ def recognises(dataset: gdal.Dataset) -> bool:
 def open_scene(
     dataset: gdal.Dataset, *, incidence: str | None = None, azimuth: str | None = None, plane: str | None = None
 ) -> Scene:
-    """Open an image on a plane; refuse one in slant range."""
+    """Open an image on a plane; raise an error for slant range."""
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     if _is_slant(dataset):
         raise InputError(
@@ -131,7 +131,7 @@ def open_scene(
 
 
 def _is_slant(dataset: gdal.Dataset) -> bool:
-    """Tell whether an image has complex values, which only a radar in its own geometry gives, and no map geometry."""
+    """Return whether an image has complex values (a radar image in its own geometry) and no map geometry."""
     band = dataset.GetRasterBand(1) if dataset.RasterCount else None
     complex_ = band is not None and bool(gdal.DataTypeIsComplex(band.DataType))
     return complex_ and dataset.GetGeoTransform(can_return_null=True) is None
@@ -139,12 +139,12 @@ def _is_slant(dataset: gdal.Dataset) -> bool:
 
 @reads(_REMEDY)
 def read_extended(path: Path) -> dict[str, Any]:
-    """Read the angles and the plane of Capella's extended metadata: of the satellite over the scene's centre.
+    """Read angles and plane from Capella's extended metadata.
 
     Raises
     ------
     InputError
-        If it is no such JSON, or its places are not those of a satellite and a scene.
+        If it is not such JSON, or its positions are not those of a satellite and a scene.
     """
     document = read_json(path, MAX_SIZE, _REMEDY)
 
@@ -169,7 +169,7 @@ def read_extended(path: Path) -> dict[str, Any]:
             for one in vectors
         ]
     )
-    # The middle of the aperture is where the radar is nearest, within what the vectors' distance leaves open.
+    # The radar is nearest at the middle of the aperture, within the time step of the vectors.
     line = places[int(np.argmin(np.linalg.norm(places - target, axis=1)))] - target
     ground = geodetic(target[None])
     east, north, up = enu_from_ecef(ground)[0] @ (line / np.linalg.norm(line))

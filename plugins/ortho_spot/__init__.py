@@ -49,7 +49,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether metadata of a SPOT scene lie beside an image, or are it."""
+    """Return whether a file is the metadata of a SPOT scene, or an image with them beside it."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and b"<METADATA_PROFILE>SPOTSCENE" in read_bounded(path, 4000).replace(b" ", b"")
