@@ -1,8 +1,8 @@
 """The hooks, and what plugins return from them; authors import all of it from `ortho_pipeline.plugin`.
 
-A plugin is a module that is named in the entry-point group ``ortho_pipeline`` of an installed distribution
-(``tinysat = "tinysat_plugin"`` under ``[project.entry-points.ortho_pipeline]``). It translates what a vendor wrote
-into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole of a plugin::
+A plugin is a module in the entry-point group ``ortho_pipeline`` of an installed distribution
+(``tinysat = "tinysat_plugin"`` under ``[project.entry-points.ortho_pipeline]``). It translates vendor metadata into a
+sensor model; the mathematics stays in `ortho_pipeline.models`. A complete plugin::
 
     from ortho_pipeline.plugin import Scene, Sensor, hookimpl, rpc_of_dataset
 
@@ -10,26 +10,25 @@ into a sensor model; the mathematics stays in `ortho_pipeline.models`. The whole
     def ortho_sensors():
         yield Sensor("tinysat", "TinySat level 1A scenes", recognises, open_scene, {"band": "band to use, 1 to 4"})
 
-    def recognises(dataset):                        # an open gdal.Dataset; cheap, and False for what is not yours
+    def recognises(dataset):                        # an open gdal.Dataset; fast, and False for other products
         return dataset.GetMetadataItem("TIFFTAG_SOFTWARE") == "TINYSAT"
 
-    def open_scene(dataset, *, band="1"):           # the declared options arrive as keyword arguments
+    def open_scene(dataset, *, band="1"):           # the declared options are keyword arguments
         rpc, source = rpc_of_dataset(dataset)
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-Files beside an image are found from ``ortho_pipeline.plugin.place(dataset.GetDescription())``, which has the methods of
-`pathlib.Path` for an image on disk and for one in an archive (docs/plugin-reference.md).
+To find files beside an image, use ``ortho_pipeline.plugin.place(dataset.GetDescription())``. It has the methods of
+`pathlib.Path`, for images on disk and in archives (docs/plugin-reference.md).
 
-The host tries every scene at a few points before it works with it (`ortho_pipeline.host.contract`). Test more with
-`ortho_pipeline.testing.check_sensor`.
+The host tries every scene at a few points before it uses it (`ortho_pipeline.host.contract`).
+`ortho_pipeline.testing.check_sensor` tests more.
 
-The hooks stand here and not in `ortho_pipeline.plugin`: that module names readers and commands, and rooms below those
-use `Scene` too.
+The hooks are in this module and not in `ortho_pipeline.plugin`, because rooms below the readers and commands of that
+module also use `Scene`.
 
-A package that adds commands to ``ortho`` names a module in the group ``ortho_pipeline_commands``, which implements
-`ortho_commands`. That module is imported by ``ortho --help``: it declares the commands and imports nothing heavy. So
-this module imports nothing heavy either.
+A package that adds commands to ``ortho`` declares a module in the group ``ortho_pipeline_commands``, which implements
+`ortho_commands`. ``ortho --help`` imports that module, so it must import nothing heavy; neither does this module.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.points import Points
 
 PROJECT_NAME = "ortho_pipeline"
-#: The entry-point groups, and the hooks that are called in the modules which each names.
+#: The entry-point groups, with the hooks of the modules of each.
 GROUPS = {
     PROJECT_NAME: ("ortho_sensors", "ortho_models", "ortho_formats"),
     "ortho_pipeline_commands": ("ortho_commands",),
@@ -62,21 +61,21 @@ hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 @dataclass(frozen=True)
 class Piece:
-    """Another file cut from the same acquisition: what is measured in it counts for the scene as well.
+    """Another file of the same acquisition: points that are measured in it also count for the scene.
 
     Parameters
     ----------
     path : path
-        The file; points name it as the image that they were measured in.
+        The file. Points refer to it as the image in which they were measured.
     offset : (float, float)
-        Column and row of its first corner in the pixels of the scene; (0, 0) for another band.
+        Column and row of its first corner in pixels of the scene; (0, 0) for another band.
     size : (int, int), optional
-        Its columns and rows, where it has a model of its own.
+        Its columns and rows, if it has its own model.
     model : SensorModel, optional
-        In its own pixels, where the first model of the scene does not reach as far; with another scale than 1, where
-        its pixels lie beside those of the scene by the ground alone (`sees_apart`).
+        Its own model, in its own pixels. Needed where the first model of the scene does not cover it, and if `scale` is
+        not 1.
     scale : float
-        Width of one of its pixels in those of the scene; another than 1 where colours are coarser than panchromatic.
+        Width of its pixels in pixels of the scene; not 1 if, for example, colours are coarser than panchromatic.
     """
 
     path: str | PathLike[str]
@@ -87,42 +86,42 @@ class Piece:
 
     @property
     def sees_apart(self) -> bool:
-        """Whether it is an image of its own, as colours beside panchromatic: both models say what is where in both."""
+        """Whether only the two models relate it to the scene, as for colours with panchromatic."""
         return self.model is not None and self.scale != 1.0
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One opened product: its image and the models that suit it.
+    """An opened product: its image and its sensor models.
 
     Parameters
     ----------
     sensor : str
-        Name of the sensor that opened it.
+        Name of the sensor that opened the product.
     path : path
         The image file.
     width, height : int
-        Size of the image in pixels, which is that of the dataset.
+        Size of the image in pixels, equal to that of the dataset.
     models : mapping of str to SensorModel
-        Best first; image coordinates are (column, row) from the outer corner of the first pixel.
+        The best model first. Image coordinates are (column, row) from the outer corner of the first pixel.
     model_source : str
-        The file or tag that the first model was read from.
+        The file or tag of the first model.
     facts : mapping
-        What is worth showing to people (acquisition time, sun elevation, cloud cover ...): JSON values.
+        Facts for people (acquisition time, sun elevation, cloud cover ...) as JSON values.
     warnings : tuple of str
-        What the user ought to know before trusting the result; a `Notice` among them brings a code of its own.
+        What users must know before they trust the result. A `Notice` has its own code.
     priors : mapping of str to Prior
-        How well the vendor knows parameters of the model that ``--correction model`` adjusts (`adjustable`).
+        Accuracy of the parameters that ``--correction model`` adjusts (see `adjustable`).
     rasters : tuple of path
-        Files of one size whose bands the ortho stacks, in this order; without them the image alone.
+        Files of the same size whose bands the ortho stacks, in this order; default: the image alone.
     pieces : tuple of Piece
-        Other bands and components of the same acquisition, which share one adjustment with this image.
+        Other bands and components of the same acquisition, adjusted together with this image.
     sources : tuple of path
-        Files that were read besides the image and `model_source`, for the record.
+        Other files that were read, besides the image and `model_source`.
     unsuited : mapping of str to str
-        Model families (`ortho models`) that do not suit this product, each with what to say where it is fitted.
+        Model families (`ortho models`) that do not suit this product, each with its warning.
     adjusted : mapping, optional
-        What the model was adjusted by before: the section ``adjustment`` of the model file that it comes from.
+        The earlier adjustment of the model: the section ``adjustment`` of its model file.
     """
 
     sensor: str
@@ -149,7 +148,7 @@ class Scene:
         object.__setattr__(self, "rasters", tuple(map(place, self.rasters)))
 
     def __fspath__(self) -> str:
-        """Stand for the image file where a path is wanted."""
+        """Return the path of the image, so that a scene can be used as a path."""
         return str(self.path)
 
     @property
@@ -159,7 +158,7 @@ class Scene:
 
     @property
     def shared_model(self) -> SensorModel:
-        """The first model, with those of the other pieces of the acquisition where they have their own."""
+        """The first model, combined with the models of other pieces of the acquisition that have their own."""
         parts = {(0.0, 0.0): (self.model, (self.width, self.height))}
         for piece in self.pieces:
             if piece.model is not None and piece.size is not None and not piece.sees_apart:
@@ -173,14 +172,14 @@ class Scene:
         return Pieces(models, tuple(parts), sizes)
 
     def fit(self, points: Points, correction: str = "shift") -> Fit:
-        """Adjust the model to control points, as `ortho fit` does.
+        """Adjust the model to control points, like `ortho fit`.
 
         Parameters
         ----------
         points : Points
             In pixels of this image, with heights.
         correction : {'none', 'shift', 'shift-drift', 'affine', 'model'}
-            What is adjusted: the image points, or the parameters of the model itself ('model').
+            A correction in the image, or 'model' for the model's own parameters.
 
         Raises
         ------
@@ -196,10 +195,12 @@ class Scene:
 
         if correction not in CORRECTIONS:
             raise InputError(
-                f"there is no correction {correction!r}", field="correction", remedy=f"one of {', '.join(CORRECTIONS)}"
+                f"unknown correction {correction!r}", field="correction", remedy=f"use one of {', '.join(CORRECTIONS)}"
             )
         if not self.models:
-            raise InputError("this image has no model", file=self.path, field="model", remedy="open it with a sensor")
+            raise InputError(
+                "this image has no sensor model", file=self.path, field="model", remedy="open it with a sensor"
+            )
         if correction == OWN:
             own = self.model if self.adjustable is None else self.models[self.adjustable]
             return fit_own(own, points, self.priors)
@@ -214,20 +215,20 @@ class Scene:
 
     @property
     def notices(self) -> tuple[Notice, ...]:
-        """The warnings, each with a code: one that came as text alone is ``from-sensor``."""
+        """The warnings, each with a code; plain texts get ``from-sensor``."""
         from ortho_pipeline.display.notices import FROM_SENSOR, with_code
 
         return with_code(self.warnings, FROM_SENSOR)
 
     @property
     def adjustable(self) -> str | None:
-        """Name of the first model that has parameters of its own, such as a pushbroom beside an RPC; None if none."""
+        """Name of the first model that has its own parameters, such as a pushbroom model; None without one."""
         return next((name for name, model in self.models.items() if model.param_names), None)
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """The offer of a plugin: how to recognise and to open one kind of product.
+    """What a plugin offers: how to recognise and open one kind of product.
 
     Parameters
     ----------
@@ -236,20 +237,19 @@ class Sensor:
     description : str
         One line for `ortho sensors`.
     recognises : callable(dataset) -> bool
-        True if the open `gdal.Dataset` is such a product. No exception for what is not, datasets without a file
-        included.
+        True if the open `gdal.Dataset` is such a product. Returns False, and raises nothing, for all others, also for
+        datasets without a file.
     open_scene : callable(dataset, **options) -> Scene
         Translates the vendor's metadata. Raises `ortho_pipeline.errors.InputError` for a damaged product.
     options : mapping of str to str
-        The keyword options of `open_scene`, each with a default there and a line of help here. Values arrive as
-        text; any other option is refused before `open_scene` is called.
+        The keyword options of `open_scene`, each with a line of help; each needs a default in `open_scene`. Values are
+        strings. The host refuses other options.
     fallback : bool
-        A fallback sensor serves any product of a general kind: it is asked only when no other sensor
-        recognises the dataset, and it is taken when it alone declares the options that the user gave.
+        A fallback sensor opens a general kind of product. It is asked only if no other sensor recognises the dataset.
+        It is also used if it alone declares the options that the user gave.
     metadata_beside : callable(image) -> Path, optional
-        Where the metadata of an image are looked for, if a product is an image and one file beside it
-        (`Scene.model_source`): a copy there makes another image of the same pixels such a product, as `ortho register`
-        does.
+        Where an image has its metadata, if a product is one image and one file beside it (`Scene.model_source`). With a
+        copy there, another image of the same pixels is such a product too (`ortho register` does this).
     """
 
     name: str
@@ -263,7 +263,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Format:
-    """A format that sensor models are written in, by ``ortho export --format NAME``.
+    """A file format for sensor models, for ``ortho export --format NAME``.
 
     ::
 
@@ -274,15 +274,15 @@ class Format:
     Parameters
     ----------
     name : str
-        As it is typed: lower case, digits and dashes; unique among all plugins.
+        Lower case, digits and dashes; unique among all plugins.
     title : str
         One line for ``ortho export --help``, such as "RPC as text".
     ending : str
-        What the name of the file ends with, after the stem of the image: ``_corners.json``. No two formats share one.
+        End of the file name, after the stem of the image: ``_corners.json``. Unique among all formats.
     write : callable(export, path) -> float
-        Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance in
-        pixels between the file and the model. Raises `InputError` for a model that the format cannot express. If it
-        fails, the host removes the file.
+        Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance
+        between file and model in pixels. Raises `InputError` if the format cannot express the model. If it fails, the
+        host removes the file.
     """
 
     name: str
@@ -293,7 +293,7 @@ class Format:
 
 @dataclass(frozen=True)
 class Subcommand:
-    """A command of ``ortho`` that a package adds; its code is imported when somebody calls it.
+    """A command that a package adds to ``ortho``; its code is imported when it is called.
 
     ::
 
@@ -304,15 +304,15 @@ class Subcommand:
     Parameters
     ----------
     name : str
-        As it is typed: lower case, digits and dashes; unique among all packages.
+        Lower case, digits and dashes; unique among all packages.
     summary : str
-        The first sentence of its help, for the list of ``ortho --help``.
+        First sentence of its help, also in the list of ``ortho --help``.
     target : str
-        ``package.module:name`` of the command or group of click.
+        ``package.module:name`` of the click command or group.
     examples : tuple of (str, str)
-        What each is for, and its command line (``ortho coverage ...``): they end the command's help.
+        Purpose and command line (``ortho coverage ...``) of each example at the end of the help.
     group : str
-        The heading of ``ortho --help`` under which it is listed.
+        Heading of ``ortho --help`` for this command.
     """
 
     name: str
@@ -330,23 +330,23 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 @hookspec
 def ortho_models() -> Mapping[str, type[SensorModel]]:
-    """Return further model families by name: classes whose ``from_dict`` undoes their ``to_dict``.
+    """Return model families by name: classes whose ``from_dict`` reads what ``to_dict`` writes.
 
-    The name is the ``kind`` of the class, as `ortho_pipeline.models.model_from_dict` looks it up.
+    The name is the ``kind`` of the class, which `ortho_pipeline.models.model_from_dict` looks up.
     """
     raise NotImplementedError
 
 
 @hookspec
 def ortho_formats() -> Iterable[Format]:
-    """Return the formats that this plugin writes sensor models in."""
+    """Return the file formats for sensor models that this plugin offers."""
     raise NotImplementedError
 
 
 @hookspec
 def ortho_commands() -> Iterable[Subcommand]:
-    """Return commands of ``ortho``; called in modules of the entry-point group ``ortho_pipeline_commands`` alone.
+    """Return commands of ``ortho``; only for modules of the entry-point group ``ortho_pipeline_commands``.
 
-    It is called for ``ortho --help`` and for a command that the host does not have.
+    The host calls it for ``ortho --help``, and for a command that it does not have.
     """
     raise NotImplementedError

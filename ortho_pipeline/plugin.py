@@ -1,11 +1,11 @@
-"""Everything that a plugin is made of: its author imports from here alone.
+"""Everything that a plugin needs: its author imports only from this module.
 
-The hooks and what they return, errors and messages, files, the ellipsoid, sensor models, points, fits, and the parts of
-commands. docs/plugins.md shows how to write a plugin; `ortho_pipeline.hookspecs` states the hooks.
-docs/plugin-reference.md lists the names by purpose, and says how long a public name lives.
+It has the hooks and their types, errors and messages, files, the ellipsoid, sensor models, points, fits, and parts of
+commands. docs/plugins.md shows how to write a plugin; `ortho_pipeline.hookspecs` documents the hooks.
+docs/plugin-reference.md lists the names by purpose, and states how long they stay stable.
 
-Each name is loaded when it is first used: ``from ortho_pipeline.plugin import Subcommand, hookimpl`` loads neither
-NumPy nor GDAL.
+Each name is loaded on first use: ``from ortho_pipeline.plugin import Subcommand, hookimpl`` loads neither NumPy nor
+GDAL.
 """
 
 from __future__ import annotations

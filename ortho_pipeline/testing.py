@@ -1,4 +1,4 @@
-"""The contract of sensor models and sensors, as checks that a test calls: ours, and those of plugin authors.
+"""The contract of sensor models and sensors, as checks for tests: ours and those of plugin authors.
 
 ::
 
@@ -6,7 +6,7 @@
         scene = check_sensor(next(iter(tinysat_plugin.ortho_sensors())), "tests/data/tinysat.tif")
         assert scene.facts["band"] == 1
 
-Every check raises `AssertionError` with a text that says what the contract asks for.
+Every check raises `AssertionError` with the requirement of the contract.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground
 from ortho_pipeline.options.texts import counted
 
-#: Ground to image to ground to image has to close within this (pixels).
+#: Image to ground and back must close within this (pixels).
 CLOSURE = 1e-5
-#: Partial derivatives have to agree with differences of the model to this part of their largest.
+#: Partial derivatives must agree with finite differences, relative to the largest one.
 PARTIALS = 1e-4
-#: A domain reaches no farther from its image than so many image sizes: a crop of a scene may have the domain of it all.
+#: Largest distance of a domain from its image, in image sizes: a crop may have the domain of the whole scene.
 WIDEST = 20.0
-#: Images smaller than this (pixels) are tests, and their domains wider than they.
+#: Images smaller than this (pixels) are tests, with larger domains.
 _SMALL = 1000
 
 
 def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
     """Check that a sensor model keeps the contract.
 
-    Shapes; N points as N single points; rows of NaN stay NaN and harm no other row; points far away raise nothing;
-    ground to image to ground closes; `ground_partials` and `param_partials` predict a nudge; `with_params` and
-    `to_dict` give the same model again; it can be pickled.
+    It checks: shapes; N points give the same as N single points; rows of NaN stay NaN and do not change others; distant
+    points raise nothing; image to ground and back closes; `ground_partials` and `param_partials` agree with finite
+    differences; `with_params` and `to_dict` restore the same model; pickling works.
 
     Parameters
     ----------
     model : SensorModel
     ground : (N, 3)
-        Points in `model.crs` (EPSG:4979: lon, lat, ellipsoidal height) that it is meant for, at different heights; at
-        least 3.
+        At least 3 points in `model.crs` (EPSG:4979: lon, lat, ellipsoidal height), within its domain and at different
+        heights.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def check_sensor_model(model: SensorModel, ground: ArrayLike) -> None:
 def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> Scene:
     """Check that a sensor recognises and opens `path`, and that every model of the scene keeps the contract.
 
-    It must recognise neither a raster in memory nor a TIFF with nothing beside it; the domain of its models must lie
-    near the image, and the middle of the image meet the ground.
+    The sensor must recognise neither a raster in memory nor a TIFF without other files. The domain of its models must
+    be near the image, and the middle of the image must have ground.
 
     Parameters
     ----------
@@ -80,29 +80,29 @@ def check_sensor(sensor: Sensor, path: str | PathLike[str], **options: Any) -> S
     path : path
         A file of this sensor.
     **options
-        Options of the sensor; if there are some, the file need not be recognised without them.
+        Options of the sensor. With options, the sensor need not recognise the file.
 
     Returns
     -------
     Scene
-        For checks of its facts.
+        For further checks, such as of its facts.
 
     Raises
     ------
     AssertionError
     """
-    # Here, because models and estimation are tested without GDAL.
+    # Imported here, because models and estimation are tested without GDAL.
     from ortho_pipeline.raster.source import open_dataset
 
     _assert_none(sensor_faults(sensor))
-    assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names are in lower case, without blanks"
-    assert sensor.description.strip(), "a sensor has a description"
-    assert all(text.strip() for text in sensor.options.values()), "every option has a line of help"
+    assert sensor.name == sensor.name.lower().strip(), f"{sensor.name!r}: names must be lower case, without blanks"
+    assert sensor.description.strip(), "a sensor needs a description"
+    assert all(text.strip() for text in sensor.options.values()), "every option needs a line of help"
     undeclared = set(options) - set(sensor.options)
     assert not undeclared, f"the sensor does not declare the options {sorted(undeclared)}"
     dataset = open_dataset(path)
     recognised = sensor.recognises(dataset)
-    assert isinstance(recognised, bool), f"recognises returns True or False, not {recognised!r}"
+    assert isinstance(recognised, bool), f"recognises must return True or False, not {recognised!r}"
     assert recognised or options, f"the sensor does not recognise {path}"
     _check_foreign(sensor)
     scene = sensor.open_scene(dataset, **options)
@@ -128,35 +128,37 @@ def _assert_none(faults: Iterator[str]) -> None:
 
 
 def _check_foreign(sensor: Sensor) -> None:
-    """Check that a sensor leaves datasets alone that nobody can take for its own."""
+    """Check that a sensor does not recognise datasets that are clearly not its own."""
     from osgeo import gdal
 
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "foreign.tif"))
-        made = {"MEM": "a raster in memory (without a file name)", "GTiff": "a TIFF with nothing beside it"}
-        for driver, what in made.items():
+        foreign = {"MEM": "a raster in memory (without a file name)", "GTiff": "a TIFF without other files"}
+        for driver, what in foreign.items():
             dataset = gdal.GetDriverByName(driver).Create("" if driver == "MEM" else path, 4, 4)
             try:
                 recognised = sensor.recognises(dataset)
             except Exception as error:
                 text = described(error, sensor.recognises)
-                raise AssertionError(f"recognises of {what} failed ({text}): False, not an exception") from error
-            assert not recognised, f"recognises returns {recognised!r} for {what}, which is not of this sensor"
+                raise AssertionError(
+                    f"recognises failed for {what} ({text}); it must return False, not raise an exception"
+                ) from error
+            assert not recognised, f"recognises returns {recognised!r} for {what}, which is not from this sensor"
             dataset = None
 
 
 def _check_near(model: SensorModel, size: tuple[int, int]) -> None:
-    """Check that domain and image are of one place: a box in other units is the commonest mistake."""
-    asked = "domain must be (centre, half-size), not (low, high), in the units of crs and x (longitude) first"
+    """Check that domain and image are at the same place: a domain in other units is the most common mistake."""
+    rule = "domain must be (centre, half-size), not (low, high), in the units of crs and x (longitude) first"
     image = model.ground_to_image(_points_in(model))
     middle = np.array(size) / 2
     apart = np.abs((image - middle) / np.maximum(size, _SMALL)).max(axis=1)
-    assert np.isfinite(apart).any(), f"no point of the domain has an image: {asked}"
-    assert np.nanmin(apart) <= WIDEST, f"the domain lies {np.nanmin(apart):.0f} image sizes off the image: {asked}"
-    assert np.nanmax(apart) <= WIDEST, f"the domain reaches {np.nanmax(apart):.0f} image sizes off the image: {asked}"
+    assert np.isfinite(apart).any(), f"the model projects no point of its domain into the image; {rule}"
+    assert np.nanmin(apart) <= WIDEST, f"the domain is {np.nanmin(apart):.0f} image sizes away from the image; {rule}"
+    assert np.nanmax(apart) <= WIDEST, f"the domain extends {np.nanmax(apart):.0f} image sizes beyond the image; {rule}"
     ground = model.image_to_ground(middle[None], model.reference_height)
     assert np.isfinite(ground).all(), (
-        f"the middle of the image meets no ground within the domain at the height {model.reference_height:g} m: {asked}"
+        f"the middle of the image has no ground within the domain at the height {model.reference_height:g} m; {rule}"
     )
 
 
@@ -170,31 +172,31 @@ def _points_in(model: SensorModel) -> NDArray[np.float64]:
 def _check_mapping(model: SensorModel, ground: NDArray[np.float64]) -> NDArray[np.float64]:
     image = model.ground_to_image(ground)
     n = len(ground)
-    assert isinstance(image, np.ndarray), f"ground_to_image returns an array, not {type(image).__name__}"
-    assert image.shape == (n, 2), f"ground_to_image of {counted(n, 'point')} returns ({n}, 2), not {image.shape}"
-    assert image.dtype == np.float64, f"image points are float64, not {image.dtype}"
-    assert np.isfinite(image).all(), f"{np.isnan(image).any(axis=1).sum()} of the points given do not project"
+    assert isinstance(image, np.ndarray), f"ground_to_image must return an array, not {type(image).__name__}"
+    assert image.shape == (n, 2), f"ground_to_image of {counted(n, 'point')} must return ({n}, 2), not {image.shape}"
+    assert image.dtype == np.float64, f"image points must be float64, not {image.dtype}"
+    assert np.isfinite(image).all(), f"the model does not project {np.isnan(image).any(axis=1).sum()} of the points"
     singles = np.concatenate([model.ground_to_image(point[None]) for point in ground])
     worst = np.abs(singles - image).max()
-    assert worst < 1e-7, f"{n} points at once and one at a time differ by {worst:g} px"
-    assert model.ground_to_image(np.empty((0, 3))).shape == (0, 2), "no points give an empty (0, 2)"
+    assert worst < 1e-7, f"{n} points together and each alone differ by {worst:g} px"
+    assert model.ground_to_image(np.empty((0, 3))).shape == (0, 2), "for no points, the result must be empty (0, 2)"
     holed = ground.copy()
     for axis in range(3):
         holed[axis, axis] = np.nan
     result = model.ground_to_image(holed)
-    assert np.isnan(result[:3]).all(), "a point with a NaN in any coordinate projects to a row of NaN"
+    assert np.isnan(result[:3]).all(), "a point with a NaN coordinate must project to a row of NaN"
     assert np.allclose(result[3:], image[3:], rtol=0, atol=1e-7), "a NaN in one point changes other points"
     before = ground.copy()
     model.ground_to_image(ground)
     assert np.array_equal(before, ground), "ground_to_image changes its argument"
     lo, hi = model.height_range
-    assert lo < hi, f"height_range goes from {lo} to {hi}"
-    assert lo <= model.reference_height <= hi, "reference_height lies within height_range"
+    assert lo < hi, f"height_range must increase, not go from {lo} to {hi}"
+    assert lo <= model.reference_height <= hi, "reference_height must be within height_range"
     return image
 
 
 def _check_far(model: SensorModel) -> None:
-    """Check that points far from the scene have an image or NaN, and that points far from the image do no harm."""
+    """Check that ground far from the scene and image points far from the image give results or NaN."""
     centre, half = model.domain
     far = centre + 1000 * half * np.concatenate([np.eye(3), -np.eye(3)])
     for name, method, points in (
@@ -207,36 +209,36 @@ def _check_far(model: SensorModel) -> None:
     ):
         try:
             with np.errstate(all="ignore"):
-                found = method(points)
+                result = method(points)
         except Exception as error:
             raise AssertionError(
-                f"{name} of points far away failed ({described(error, type(model))}): must be NaN where there is none"
+                f"{name} of distant points failed ({described(error, type(model))}); it must return NaN there"
             ) from error
-        assert not np.isinf(found).any(), f"{name} of points far away returned inf: must be NaN where there is none"
+        assert not np.isinf(result).any(), f"{name} of distant points returned inf; it must return NaN there"
 
 
 def _check_closure(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
     back = model.image_to_ground(image, ground[:, 2])
-    assert back.shape == ground.shape, f"image_to_ground returns {ground.shape}, not {back.shape}"
+    assert back.shape == ground.shape, f"image_to_ground must return {ground.shape}, not {back.shape}"
     assert np.isfinite(back).all(), (
         f"{counted(np.isnan(back).any(axis=1).sum(), 'point has', 'points have')} no inverse"
     )
-    assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground returns the height that it was given"
+    assert np.array_equal(back[:, 2], ground[:, 2]), "image_to_ground must return the given heights"
     worst = np.abs(model.ground_to_image(back) - image).max()
-    assert worst < CLOSURE, f"ground to image to ground to image closes only to {worst:g} px, not {CLOSURE:g}"
-    # A second root of the same image point would close as well.
+    assert worst < CLOSURE, f"image to ground and back differs by {worst:g} px; at most {CLOSURE:g} px are allowed"
+    # A second solution for the same image point would also close.
     apart = np.abs((back - ground) / model.domain[1]).max()
-    assert apart < 1e-6, f"image_to_ground found another point, {apart:g} half-sizes of the domain away"
+    assert apart < 1e-6, f"image_to_ground returned another point, {apart:g} half-sizes of the domain away"
     broken = image.copy()
     broken[0, 0] = np.nan
     result = model.image_to_ground(broken, ground[:, 2])
-    assert np.isnan(result[0]).all(), "an image point with a NaN has a row of NaN for its ground"
-    assert np.isfinite(result[1:]).all(), "a NaN in one image point harms the others"
+    assert np.isnan(result[0]).all(), "the ground of an image point with NaN must be a row of NaN"
+    assert np.isfinite(result[1:]).all(), "a NaN in one image point changes other points"
 
 
 def _check_ground_partials(model: SensorModel, ground: NDArray[np.float64]) -> None:
     partials = model.ground_partials(ground)
-    assert partials.shape == (len(ground), 2, 3), f"ground_partials returns (N, 2, 3), not {partials.shape}"
+    assert partials.shape == (len(ground), 2, 3), f"ground_partials must return (N, 2, 3), not {partials.shape}"
     image, also = model.projected(ground)
     np.testing.assert_allclose(image, model.ground_to_image(ground), rtol=1e-12, err_msg="projected")
     np.testing.assert_allclose(also, partials, rtol=1e-9, atol=1e-12, err_msg="partials of projected")
@@ -253,19 +255,19 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     params = np.asarray(model.params, dtype=np.float64)
     n = len(model.param_names)
     assert params.shape == (n,), f"params has the shape {params.shape}, but there are {n} param_names"
-    assert len(set(model.param_names)) == n, "param_names has a name twice"
+    assert len(set(model.param_names)) == n, "a name appears twice in param_names"
     same = model.with_params(params)
     assert np.array_equal(same.params, params), "with_params(params) does not give the parameters back"
     assert np.allclose(same.ground_to_image(ground), image, rtol=0, atol=1e-9), "with_params(params) is another model"
     partials = model.param_partials(ground)
-    assert partials.shape == (len(ground), 2, n), f"param_partials returns (N, 2, {n}), not {partials.shape}"
+    assert partials.shape == (len(ground), 2, n), f"param_partials must return (N, 2, {n}), not {partials.shape}"
     shared = model.linearised(ground)
     np.testing.assert_allclose(shared[0], model.ground_to_image(ground), rtol=1e-12, err_msg="linearised")
     np.testing.assert_allclose(shared[2], partials, rtol=1e-9, atol=1e-12, err_msg="param_partials of linearised")
     for k, name in enumerate(model.param_names):
         reach = np.abs(partials[:, :, k]).max()
         assert reach > 0, f"the parameter {name!r} moves no point"
-        # A hundredth of a pixel: small enough to be linear, large enough to be above rounding.
+        # A hundredth of a pixel: small enough to be linear, large enough to exceed rounding.
         step = np.zeros(n)
         step[k] = 0.01 / reach
         ahead, behind = model.with_params(params + step), model.with_params(params - step)
@@ -276,11 +278,11 @@ def _check_params(model: SensorModel, ground: NDArray[np.float64], image: NDArra
 
 
 def _check_order(model: SensorModel, params: NDArray[np.float64], partials: NDArray[np.float64]) -> None:
-    """Check that `with_params` takes values in the order of `params`, by values that all differ."""
+    """Check that `with_params` takes values in the order of `params`, with values that all differ."""
     steps = 0.01 * np.arange(1, len(params) + 1) / np.abs(partials).max(axis=(0, 1), initial=0.0)
-    found = model.with_params(params + steps).params
-    assert (np.abs(found - params - steps) <= 1e-6 * steps + 1e-15 * np.abs(params)).all(), (
-        "with_params(values).params are other values: they come in the order of param_names"
+    values = model.with_params(params + steps).params
+    assert (np.abs(values - params - steps) <= 1e-6 * steps + 1e-15 * np.abs(params)).all(), (
+        "with_params(values).params differ from values; values are in the order of param_names"
     )
 
 
@@ -288,20 +290,20 @@ def _assert_predicts(
     predicted: NDArray[np.float64], moved: NDArray[np.float64], what: str, image: NDArray[np.float64]
 ) -> None:
     miss = np.abs(predicted - moved).max()
-    # Differences of image coordinates of some 1e5 px carry rounding of 1e-9 px.
+    # Image coordinates of about 1e5 px have rounding errors of 1e-9 px.
     allowed = PARTIALS * np.abs(moved).max() + 1e-8 * max(1.0, np.abs(image).max() / 1e5)
-    assert miss <= allowed, f"{what} misses a nudge by {miss:g} px (allowed {allowed:g})"
+    assert miss <= allowed, f"{what} differs from finite differences by {miss:g} px (allowed {allowed:g})"
 
 
 def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64]) -> None:
     data = model.to_dict()
-    assert data.get("kind") == model.kind, f"to_dict has the kind {data.get('kind')!r}, the class {model.kind!r}"
+    assert data.get("kind") == model.kind, f"kind is {data.get('kind')!r} in to_dict, but {model.kind!r} in the class"
     try:
         text = json.dumps(data, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise AssertionError(f"to_dict must be plain JSON values: {error}") from error
     if data["kind"] not in KINDS:
-        # A kind that a plugin brings is known once the plugin is found.
+        # A kind of a plugin is known after the plugin is found.
         from ortho_pipeline.host import Host
 
         Host.discover()
@@ -309,12 +311,12 @@ def _check_copies(model: SensorModel, ground: NDArray[np.float64], image: NDArra
     try:
         pickled = pickle.loads(pickle.dumps(model))
     except (pickle.PickleError, AttributeError, TypeError) as error:
-        raise AssertionError(f"models go to other processes, so they can be pickled: {error}") from error
+        raise AssertionError(f"the model cannot be pickled, which other processes need: {error}") from error
     _check_copy(pickled, model, ground, image, "pickle")
 
 
 def _check_copy(
     copy: SensorModel, model: SensorModel, ground: NDArray[np.float64], image: NDArray[np.float64], how: str
 ) -> None:
-    assert type(copy) is type(model), f"{how} gives a {type(copy).__name__} back"
-    assert np.array_equal(copy.ground_to_image(ground), image), f"{how} gives another model back"
+    assert type(copy) is type(model), f"{how} returns a {type(copy).__name__}"
+    assert np.array_equal(copy.ground_to_image(ground), image), f"{how} returns another model"

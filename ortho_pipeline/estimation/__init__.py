@@ -1,4 +1,4 @@
-"""Least squares and what can be said about its result: fits, blunders, regularisation, tests, comparison.
+"""Least squares and its statistics: fits, gross errors, regularisation, tests, comparison of models.
 
 Imports `models` and what is below; no raster, no file of a user.
 """

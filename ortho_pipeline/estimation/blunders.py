@@ -1,11 +1,10 @@
 """Search for gross errors among control points.
 
-Points that agree with each other are looked for first, in a way that bad ones cannot spoil: by least median of squares
-over minimal subsets for models with few parameters (linearised, and linearised again where that led), by taking out the
-worst point over and over for models with many. Every excluded point is then tested against the fit of the others and
-comes back if it agrees with them.
+The search first finds points that agree with each other, robustly: for models with few parameters by least median of
+squares over minimal subsets (linearised repeatedly), for models with many parameters by removing the worst point again
+and again. Then every excluded point is tested against the fit of the others, and readmitted if it agrees.
 
-What is never left out is tested too, and named: check points, and control points that stay in the fit (`outlying`).
+Check points and used control points are also tested, but never left out; suspicious ones are reported (`outlying`).
 
 Source: Baarda 1968 (data snooping); Rousseeuw 1984 (LMedS).
 """
@@ -31,50 +30,50 @@ from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import outside_of_hull
 
-#: Chance that a good set of points loses any of its points to the search for gross errors.
+#: Chance that the search rejects any point of a good set.
 BLUNDER_RISK = 0.001
-#: Chance that a set of good points has any that is named as outlying, for control and for check points.
+#: Chance that any point of a good set is reported as outlying, for control and for check points.
 OUTLYING_RISK = 0.01
-#: Check points that are together so many times farther off than expected are told.
+#: Check points whose errors together are this many times the expected ones are reported.
 _APART = 2.0
-#: Of these the ones are counted that are so many times as far off as expected, which hardly a good one is.
+#: Among these, points with this many times the expected error count as contradicting; good points hardly reach it.
 _ONE_APART = 3.0
-#: An RMSE so many times that of the check points which agree is no figure to judge accuracy by.
+#: If the RMSE is this many times that of the agreeing check points, it is no measure of accuracy.
 FAR_ABOVE = 2.0
 #: Contradicting points that a notice or an error names.
 NAMED = 10
-#: From so many check points on their own scatter counts, where it is larger than that of the control points.
+#: From this many check points on, their own scatter is the scale, if it is larger than that of the control points.
 _OWN_SCATTER = 5
-#: Measured check points that show where they lie together beside matches.
+#: This many measured check points determine their common offset from matches.
 _OWN_PLACE = 3
 #: Median of a chi-squared variable of two degrees of freedom.
 _MEDIAN_OF_TWO = 2 * math.log(2)
-#: More than this share of rejected control points is an error, not a clean-up.
+#: If a larger share of the control points is rejected, this is an error.
 REJECTED_LIMIT = 0.3
-#: Residuals are never tested at a finer scale than this part of their stated sigma (noise-free simulations).
+#: Lower limit of the scale in tests, as a part of the stated sigma (for noise-free simulations).
 SCALE_FLOOR = 1e-3
 #: A point with a smaller determinant of its redundancy is not tested.
 _TESTABLE = 1e-6
-#: A point without an image is so far off (px): its square is still a number.
+#: Error of a point without an image (px): its square is still finite.
 _FAR = 1e150
 _SUBSETS = 500
-#: Bound on the residuals of all subsets that are in memory together.
+#: Largest number of residuals of subsets in memory together.
 _RESIDUALS_AT_ONCE = 1_000_000
-#: Minimal subsets of models with more parameters hardly ever are without a bad point.
+#: For models with more parameters, minimal subsets nearly always contain a bad point.
 _FEW_PARAMETERS = 14
 _ROUNDS = 4
 
 
 def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[np.ndarray, dict[int, str]]:
-    """Return the mask of points to keep ``(n,)`` and the reason for each that is not.
+    """Return the mask of points to keep ``(n,)``, and the reason for each rejected point.
 
-    A regularisation that is to be found is found once more when suspected points are out.
+    If the regularisation is to be found, it is found again without the suspected points.
     """
     count = len(problem.rows)
     keep = np.ones(count, dtype=bool)
     few = len(problem.model.params) <= _FEW_PARAMETERS and not problem.ridge
     solution = _common(problem) if few else problem.solve(keep, linear=True)
-    if solution.redundancy < 2 * 2:  # a single point too many can contradict, but not say who is wrong
+    if solution.redundancy < 2 * 2:  # one redundant point can contradict, but cannot show which point is wrong
         return keep, {}
     if few:
         keep = _median_start(problem, solution)
@@ -86,7 +85,7 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
     if not keep.all():
         problem = _restarted(problem, keep)
     reasons: dict[int, str] = {}
-    # Suspicion first falls on too many: re-admit the excluded that agree with the others, until none is left that does.
+    # Too many points are suspected first: readmit those that agree with the others, until none is left.
     while not keep.all():
         chances, sizes = _chance(problem, keep)
         agree = ~keep & (chances >= BLUNDER_RISK / count)
@@ -98,19 +97,19 @@ def find_blunders(problem: Problem, ridge: float | str | None = None) -> tuple[n
 
 
 def refuse_many(names: Sequence[str], count: int, what: str, source: str, remedy: str) -> None:
-    """Refuse to clean up where so many of `count` contradict that which of them are wrong is a guess."""
+    """Raise an error if too large a share of `count` contradicts the others to decide which are wrong."""
     if len(names) > REJECTED_LIMIT * count:
         some = ", ".join(names[:NAMED]) + (" ..." if len(names) > NAMED else "")
         raise DegeneratePoints(
-            f"{len(names)} of {counted(count, what)} contradict the others ({some}): which of them are wrong cannot be "
-            "decided",
+            f"{len(names)} of {counted(count, what)} contradict the others ({some}), too many "
+            "to decide which are wrong",
             file=source or None,
             remedy=remedy,
         )
 
 
 def _common(problem: Problem) -> Solution:
-    """Return the solution of all points, or one step towards it where gross errors keep it from converging."""
+    """Return the solution of all points, or one step towards it if gross errors prevent convergence."""
     everything = np.ones(len(problem.rows), dtype=bool)
     try:
         return problem.solve(everything)
@@ -121,7 +120,7 @@ def _common(problem: Problem) -> Solution:
 def _restarted(problem: Problem, keep: np.ndarray) -> Problem:
     """Return the problem started from some points, if they determine it.
 
-    Gross errors in the start are then gone, also from the direction in which it takes errors of the ground to move.
+    Then gross errors no longer influence the start, nor the projection of ground errors into the image.
     """
     try:
         return problem.started(problem.solve(keep).model)
@@ -131,37 +130,37 @@ def _restarted(problem: Problem, keep: np.ndarray) -> Problem:
 
 def _reason(size: float) -> str:
     if not math.isfinite(size):
-        return "gross error, for the other points put it outside of the model"
-    return f"gross error, {size:.1f} px from where the other points put it"
+        return "gross error: the fit to the other points does not project it"
+    return f"gross error: {size:.1f} px from where the other points predict it"
 
 
 def _median_start(problem: Problem, solution: Solution) -> np.ndarray:
-    """Return a clean subset ``(n,)``, linearised anew until the linear prediction of its solution holds."""
+    """Return a clean subset ``(n,)``; linearise again until the linear prediction of its solution holds."""
     keep = _median_subset(solution, len(problem.priors))
     for _ in range(_ROUNDS):
         try:
-            found = problem.started(solution.model).solve(keep)
+            fitted = problem.started(solution.model).solve(keep)
         except (DegeneratePoints, NotConverged):
             return keep
-        step = found.model.params - solution.model.params
+        step = fitted.model.params - solution.model.params
         linear = solution.residuals - solution.jacobian @ step
-        residuals = problem.image - found.model.ground_to_image(problem.ground)
+        residuals = problem.image - fitted.model.ground_to_image(problem.ground)
         with np.errstate(invalid="ignore"):
             bent = ~(np.abs(problem.errors.whitened(residuals - linear)) < 0.1).all(axis=1)
         if not bent.any() or not np.isfinite(residuals).all():
             return keep
-        # The common solution was so far off that the model is not linear on the way: look again from the clean one.
-        jacobian = found.model.param_partials(problem.ground)
+        # The common solution was so far off that the model is not linear in between: repeat from the clean one.
+        jacobian = fitted.model.param_partials(problem.ground)
         solution = Solution(
-            found.model,
+            fitted.model,
             jacobian,
             residuals,
-            problem.started(found.model).errors,
-            found.cofactors,
-            found.freedom,
-            found.effective,
-            found.sigma0,
-            found.condition,
+            problem.started(fitted.model).errors,
+            fitted.cofactors,
+            fitted.freedom,
+            fitted.effective,
+            fitted.sigma0,
+            fitted.condition,
             problem.points.groups,
         )
         again = _median_subset(solution, len(problem.priors))
@@ -188,7 +187,7 @@ def _median_subset(solution: Solution, priors: int) -> np.ndarray:
         left = residuals[None] - (some @ jacobian.reshape(-1, params).T).reshape(len(some), count, 2)
         return (left**2).sum(axis=2)
 
-    # All subsets at once are 500 residuals of every point: gigabytes where points are matched, not measured.
+    # All subsets together have 500 residuals per point, which is gigabytes for matched points.
     parts = np.array_split(steps, math.ceil(len(steps) * count / _RESIDUALS_AT_ONCE))
     merit = np.concatenate([np.partition(squares(part), half - 1, axis=1)[:, half - 1].copy() for part in parts])
     best = int(np.argmin(merit))
@@ -200,22 +199,22 @@ def _median_subset(solution: Solution, priors: int) -> np.ndarray:
 def _minimal_subsets(count: int, size: int) -> list[list[int]]:
     if math.comb(count, size) <= _SUBSETS:
         return [list(subset) for subset in itertools.combinations(range(count), size)]
-    generator = np.random.default_rng(0)  # the same points give the same answer every time
+    generator = np.random.default_rng(0)  # the same points always give the same result
     return [sorted(generator.choice(count, size, replace=False).tolist()) for _ in range(_SUBSETS)]
 
 
 def _snooping_start(
     problem: Problem, solution: Solution, keep: np.ndarray | None = None, *, linear: bool = False
 ) -> np.ndarray:
-    """Return the points ``(n,)`` that are left when the one that fits the others worst is taken out, over and over."""
+    """Return the points ``(n,)`` that remain when the worst point is removed again and again."""
     count = len(problem.rows)
     keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
-    # One more than may be rejected: the caller then says that there are too many.
+    # One more than the limit: then the caller raises an error.
     while (~keep).sum() <= REJECTED_LIMIT * count:
         tested = _against_others(solution)
         if tested is None:
             break
-        # Where chances underflow to zero, the ratio still tells which is worst.
+        # If chances underflow to zero, the ratio still shows which is worst.
         worst = int(np.argmax(tested.ratios))
         if tested.chances[worst] >= BLUNDER_RISK / count:
             break
@@ -228,10 +227,10 @@ def _snooping_start(
 
 
 class _Tested(NamedTuple):
-    """Points ``(n,)`` against the variance of the others: squared distances over it, their chances, and that variance.
+    """Tests of points ``(n,)`` against the others: squared distance over variance, its chance, and the variance.
 
-    A point that the others do not determine the place of is at the distance 0. `redundancy` ``(n, 2, 2)`` are the
-    blocks of `Solution.redundancy_blocks`.
+    The distance is 0 for a point whose position the others do not determine. `redundancy` ``(n, 2, 2)`` has the blocks
+    of `Solution.redundancy_blocks`.
     """
 
     redundancy: Array
@@ -241,7 +240,7 @@ class _Tested(NamedTuple):
 
 
 def _against_others(solution: Solution) -> _Tested | None:
-    """Test the residual of each point; None where there is too little redundancy."""
+    """Test the residual of each point; None without enough redundancy."""
     redundancy = solution.redundancy_blocks()
     apart = left_out(redundancy, solution.errors.whitened(solution.residuals), known=0.0)
     squares, freedom = np.where(np.linalg.det(redundancy) > _TESTABLE, apart.squares, 0.0), solution.freedom - 2
@@ -252,7 +251,7 @@ def _against_others(solution: Solution) -> _Tested | None:
 
 
 def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
-    """Return for each point the chance of lying so far from the fit of the kept ones, and that distance in pixels."""
+    """Return for each point the chance of its distance from the fit of the kept points, and that distance (px)."""
     try:
         solution = problem.solve(keep)
     except (DegeneratePoints, TooFewPoints):
@@ -262,7 +261,7 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     return chance_of(apart.squares / scale**2, 2, max(solution.freedom, 1.0)), np.hypot(*apart.miss.T)
 
 
-# -- what is not left out --------------------------------------------------------------------------------------------
+# -- outlying points -------------------------------------------------------------------------------------------------
 
 
 Role = Literal["control", "check"]
@@ -271,9 +270,9 @@ Role = Literal["control", "check"]
 class OutlyingPoint(Record):
     """A point that contradicts the others and still counts."""
 
-    # Its distance (px) from where the fit of the others puts it, the root mean square of such distances for good
-    # points, and the chance of so large a one for a good point. Leverage is the share (0 to 1) of its own residual that
-    # it takes away: 0 for check points, and little for control points among many.
+    # `distance` (px) from the position that the fit of the others predicts, `expected` root mean square of this
+    # distance for good points, and `chance` that a good point has such a distance. `leverage` is the share (0 to 1) of
+    # its own residual that the point removes: 0 for check points, small for control points among many.
     id: str
     role: Role
     distance: float
@@ -284,28 +283,31 @@ class OutlyingPoint(Record):
 
     @classmethod
     def of(cls, name: str, role: Role, distance: float, expected: float, chance: float, leverage: float = 0.0) -> Self:
-        """Return it with the sentence about it, without its name."""
-        said = f"{distance:.3g} px from where the others put it, {expected:.2g} px expected: measure it again, for it "
+        """Return the point with its reason as a sentence, without the name."""
+        text = (
+            f"{distance:.3g} px from where the other points predict it ({expected:.2g} px expected). Measure it again: "
+        )
         if role == "check":
-            said += "counts in the RMSE of the check points all the same"
+            text += "it still counts in the RMSE of the check points"
         else:
-            said += f"stays in the adjustment (leverage {leverage:.2f})"
+            text += f"it still takes part in the adjustment (leverage {leverage:.2f})"
         return cls(
-            id=name, role=role, distance=distance, expected=expected, chance=chance, leverage=leverage, reason=said
+            id=name, role=role, distance=distance, expected=expected, chance=chance, leverage=leverage, reason=text
         )
 
 
 def outlying(
     solution: Solution, points: Points, used: np.ndarray, common: Array | None = None
 ) -> tuple[OutlyingPoint, ...]:
-    """Return check points, and used control points, that contradict the fit; none without redundancy.
+    """Return check points and used control points that contradict the fit; none without redundancy.
 
-    A check point is tested with its own uncertainty and that of the model there; from five check points on their own
-    (median) scatter is the scale where it is larger than sigma0, so that a model that is poor everywhere makes none of
-    them an outlier. A control point is tested by its residual had it taken no part, against the sigma0 of the others.
-    `common` ``(P, P)`` is what the error that control points have in common leaves in the parameters: check points that
-    do not share it may lie off by it. Where all control was matched and nobody states that error, measured check points
-    are held against each other: all of them being off alike is the reference's fault.
+    A check point is tested with its own uncertainty and that of the model. With five or more check points, their median
+    scatter is the scale if it is larger than sigma0: a model that is poor everywhere makes no point an outlier. A
+    control point is tested by its leave-one-out residual, against the sigma0 of the others.
+
+    `common` ``(P, P)`` is the covariance of the parameters from an error common to the control points; it also counts
+    for check points without this error. If all control points were matched and this error is not stated, measured
+    check points are only compared with each other, because a common offset comes from the reference.
     """
     if solution.sigma0 is None:
         return ()
@@ -317,7 +319,7 @@ def outlying(
 
 def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> list[OutlyingPoint]:
     tested = _against_others(solution)
-    rows, found = np.flatnonzero(used), []
+    rows, outliers = np.flatnonzero(used), []
     if tested is None or not (tested.chances < OUTLYING_RISK / len(rows)).any():
         return []
     redundancy, left = tested.redundancy, solution.leave_each_out()
@@ -326,15 +328,15 @@ def _outlying_control(solution: Solution, points: Points, used: np.ndarray) -> l
         expected = math.sqrt(float(tested.others[i] * spread[0]))
         chance, leverage = float(tested.chances[i]), float(1 - np.trace(redundancy[i]) / 2)
         name = points.ids[rows[i]]
-        found.append(OutlyingPoint.of(name, "control", float(np.hypot(*left[i])), expected, chance, leverage))
-    return found
+        outliers.append(OutlyingPoint.of(name, "control", float(np.hypot(*left[i])), expected, chance, leverage))
+    return outliers
 
 
 @dataclass(frozen=True)
 class _Apart:
-    """How far points that took no part in a solution are from it: ``(n, 2)`` px, and in sigmas.
+    """Distances of points that did not take part in a solution: ``(n, 2)`` px, and in sigmas.
 
-    `partials` are those by the parameters in sigmas of the points, `spread` what is expected with a sigma0 of 1.
+    `partials` are by the parameters, in sigmas of the points; `spread` is the expected covariance for a sigma0 of 1.
     """
 
     problem: Problem
@@ -344,7 +346,7 @@ class _Apart:
 
     @classmethod
     def of(cls, solution: Solution, problem: Problem) -> _Apart:
-        """Return it of the points of a problem; those without an image are infinitely far off."""
+        """Return the distances of the points of a problem; infinite for those without an image."""
         miss = problem.image - solution.model.ground_to_image(problem.ground)
         miss[~np.isfinite(miss).all(axis=1)] = np.inf
         partials = np.zeros((len(miss), 2, 0))
@@ -355,17 +357,17 @@ class _Apart:
 
     @property
     def squares(self) -> Array:
-        """Squared distances ``(n,)`` in sigmas; 2 in the mean where sigma0 is 1."""
+        """Squared distances ``(n,)`` in sigmas; 2 on average if sigma0 is 1."""
         white = np.clip(self.problem.errors.whitened(np.clip(self.miss, -_FAR, _FAR)), -_FAR, _FAR)
         return squared_distances(white, self.spread)
 
     def expected(self, scale: float) -> Array:
-        """Root mean square ``(n,)`` px of the distances of good points, where sigma0 squared is `scale`."""
+        """Root mean square ``(n,)`` px of the distances of good points, if sigma0 squared is `scale`."""
         return np.sqrt(scale * self.problem.errors.mean_square(self.spread))
 
 
 def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array | None) -> _Apart | None:
-    """Return how far check points that have an image are off."""
+    """Return the distances of check points that have an image."""
     usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
     if not usable.any():
         return None
@@ -386,7 +388,7 @@ def _outlying_checks(
     scale, freedom = max(sigma0, SCALE_FLOOR) ** 2, max(solution.freedom, 1.0)
     own = float(np.median(squares)) / _MEDIAN_OF_TWO
     if len(squares) >= _OWN_SCATTER and own > scale:
-        # The median of n is about as certain as a mean square of half as many.
+        # The median of n values is about as certain as the mean square of half as many.
         scale, freedom = own, float(len(squares))
     if common is not None:
         apart = checks.problem.points.sigma_common == 0
@@ -404,15 +406,14 @@ def _outlying_checks(
 
 
 def checks_apart(
-    solution: Solution, points: Points, used: np.ndarray, said: Sequence[OutlyingPoint], *, shared: bool = False
+    solution: Solution, points: Points, used: np.ndarray, outliers: Sequence[OutlyingPoint], *, shared: bool = False
 ) -> list[Notice]:
-    """Return a notice where check points contradict the control points, so that their RMSE tells no accuracy.
+    """Return a notice if check points contradict the control points, so that their RMSE is no measure of accuracy.
 
-    Those that contradict by themselves (`said`) do it where they more than double the RMSE of the others. The others
-    do it together, by the F test of their mean square against sigma0, where they are at least twice as far off as
-    expected: several wrong check points hide each other, and a model may follow its control points and nothing between
-    them. Of matches, and where points have an error in common (`shared`), that is left to what is said of their
-    reference.
+    Single `outliers` contradict if they more than double the RMSE of the others. The others contradict together, by the
+    F test of their mean square against sigma0, if their errors are at least twice the expected ones: several wrong
+    check points hide each other, and a model may fit its control points but not the area between them. This second test
+    is not made for matches, nor if points have a common error (`shared`); other notices judge the reference.
     """
     if solution.sigma0 is None or not len(solution.model.params):
         return []
@@ -422,7 +423,7 @@ def checks_apart(
         return []
     scale = max(float(solution.sigma0), SCALE_FLOOR) ** 2
     ids = np.array([points.ids[i] for i in checks.problem.rows])
-    off, usual = np.isin(ids, [one.id for one in said]), checks.expected(scale)
+    off, usual = np.isin(ids, [outlier.id for outlier in outliers]), checks.expected(scale)
     apart = not shared and measured[used].all() and _together_apart(checks.squares[~off], scale, solution.freedom)
     miss = checks.problem.image - solution.model.ground_to_image(checks.problem.ground)
     sizes = np.hypot(*miss.T)
@@ -435,11 +436,12 @@ def checks_apart(
     far = np.lexsort((-sizes, ~off))[: min(NAMED, int(off.sum()) or 3)]
     beyond = outside_of_hull(points.image[used], checks.problem.image[off])
     without = "" if rest is None else f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
-    agree = "check points are wrong, or the model is poor between the control points"
+    cause = "Either check points are wrong, or the model is poor between the control points"
     text = (
-        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}: RMSE {rms(sizes):.3g} px"
-        f"{'' if len(ids) == 1 else f' over all {len(ids)}'}{without}, where {rms(usual):.2g} px was to be expected "
-        f"from the control points; {agree if apart or rest is None else 'the others agree with them'}"
+        f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}. "
+        f"RMSE {rms(sizes):.3g} px{'' if len(ids) == 1 else f' of all {len(ids)}'}{without}; "
+        f"{rms(usual):.2g} px expected from the control points. "
+        f"{cause if apart or rest is None else 'The other check points agree with the control points'}"
     )
     return [
         Notice(
@@ -458,13 +460,13 @@ def checks_apart(
 
 
 def are_alike(misses: Array) -> bool:
-    """Tell whether several misses ``(n, k)`` are one shift: their scatter about their mean is below half of it."""
+    """Return whether several errors ``(n, k)`` are one shift: their scatter is less than half of their mean."""
     mean = misses.mean(axis=0) if len(misses) else np.zeros(1)
     return len(misses) > 1 and bool(rms(np.linalg.norm(misses - mean, axis=1)) < 0.5 * np.linalg.norm(mean))
 
 
 def _together_apart(squares: Array, scale: float, freedom: float) -> bool:
-    """Tell whether check points are farther off together than expected, by their squared distances in sigmas."""
+    """Return whether check points together have larger errors than expected, from squared distances in sigmas."""
     if not len(squares):
         return False
     total, size = float(squares.sum()) / scale, 2 * len(squares)
@@ -474,9 +476,9 @@ def _together_apart(squares: Array, scale: float, freedom: float) -> bool:
 def contradicting(
     off: int, count: int, points: Sequence[str], what: str = "the control points", role: str = "check"
 ) -> str:
-    """Say how many points of a role contradict `what`: `off` of `count`, or all together; and the farthest by name."""
+    """Return a sentence: `off` of `count` points of a role contradict `what`, or all together; and the worst names."""
     shown = points[:3]
-    named = f"({'farthest ' if (off or count) > len(shown) else ''}{', '.join(shown)})"
+    named = f"({'worst: ' if (off or count) > len(shown) else ''}{', '.join(shown)})"
     if not off:
         return f"{counted(count, f'{role} point')} together contradict {what} {named}"
     of = "" if off == count else f"{off} of "

@@ -1,8 +1,7 @@
-"""Swapped coordinates: the mistakes of point files that are not errors of measurement.
+"""Swapped coordinates: mistakes in point files that are not measurement errors.
 
-Latitude given first, row given first, rows counted upwards, heights in feet: the points then miss the model by hundreds
-of pixels or fall off the Earth. Each swap is tried; one that brings the points more than twenty times closer is not a
-coincidence.
+Examples are latitude first, row first, rows counted upwards, heights in feet. Then the points are hundreds of pixels
+off or not on Earth. Each swap is tried; if one reduces the error by more than a factor of twenty, it is reported.
 """
 
 from __future__ import annotations
@@ -17,29 +16,29 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 
-#: Residuals (px, median) above this are absurd: no vendor's model is so far off.
+#: Larger median residuals (px) are absurd: no vendor's model is so inaccurate.
 ABSURD = 50.0
-#: A swap has to be this many times better to be named.
+#: A swap is reported if it reduces the error by this factor.
 BETTER = 20.0
 _FOOT = 0.3048
 
 Swap = Callable[[Array, Array, float], tuple[Array, Array]]
 
-#: What is wrong with the file, how the corrected image and ground points are made, and what to do.
+#: The mistake -> function that corrects image and ground points, and the remedy.
 SWAPS: dict[str, tuple[Swap, str]] = {
-    "x and y of the ground are exchanged (latitude before longitude?)": (
+    "ground x and y are swapped (latitude before longitude?)": (
         lambda image, ground, rows: (image, ground[:, [1, 0, 2]]),
         "give x (longitude, easting) before y (latitude, northing)",
     ),
-    "column and row are exchanged": (
+    "column and row are swapped": (
         lambda image, ground, rows: (image[:, ::-1], ground),
         "give the column before the row",
     ),
-    "x and y, and column and row, are exchanged": (
+    "x and y, and column and row, are swapped": (
         lambda image, ground, rows: (image[:, ::-1], ground[:, [1, 0, 2]]),
         "give x before y and the column before the row",
     ),
-    "the sign of the rows is negative": (
+    "the rows are negative": (
         lambda image, ground, rows: (image * [1.0, -1.0], ground),
         "give rows downwards from the top of the image, as positive numbers",
     ),
@@ -63,46 +62,46 @@ SWAPS: dict[str, tuple[Swap, str]] = {
 
 
 def refuse_swapped(model: SensorModel, points: Points, rows: int) -> None:
-    """Raise an error that names the swap, if the points are absurd as they are and right with one swap.
+    """Raise an error that names the swap, if the points are absurd as given and plausible after one swap.
 
     Parameters
     ----------
     model : SensorModel
         As delivered.
     points : Points
-        Heights that are not given (NaN) are taken at the model's reference height.
+        Missing heights (NaN) are replaced by the model's reference height.
     rows : int
         Height of the image in pixels.
 
     Raises
     ------
     InputError
-        If a swap brings the points more than twenty times closer to the model, or no point projects at all.
+        If a swap reduces the error by more than a factor of twenty, or most points are outside the model's domain.
     """
     if not len(points):
         return
     as_given = _misfit(model, points)
     if as_given <= ABSURD:
         return
-    found = {}
-    for what, (swap, _) in SWAPS.items():
+    misfits = {}
+    for mistake, (swap, _) in SWAPS.items():
         image, ground = swap(points.image, points.ground, float(rows))
-        found[what] = _misfit(model, replace(points, image=image, ground=ground))
-    best = min(found, key=lambda what: found[what])
-    if found[best] * BETTER < as_given and np.isfinite(found[best]):
-        now = f"{as_given:.0f} px off" if np.isfinite(as_given) else "outside of the model's domain"
+        misfits[mistake] = _misfit(model, replace(points, image=image, ground=ground))
+    best = min(misfits, key=misfits.__getitem__)
+    if misfits[best] * BETTER < as_given and np.isfinite(misfits[best]):
+        now = f"{as_given:.0f} px off" if np.isfinite(as_given) else "outside the model's domain"
         raise InputError(
-            f"the points are {now} as given, and {found[best]:.1f} px with one change: {best}",
+            f"{best}. As given, the points are {now}; with this corrected, they are {misfits[best]:.1f} px off",
             file=points.source,
             remedy=SWAPS[best][1],
         )
     if not np.isfinite(as_given):
         raise InputError(
-            "most points lie outside of the model's domain",
+            "most points are outside the model's domain",
             file=points.source,
             field="CRS",
             remedy=Text(
-                "check the coordinate system of the points (",
+                "check the CRS of the points (",
                 Setting("points.crs"),
                 ") and that they belong to this scene",
             ),

@@ -1,4 +1,4 @@
-"""What points leave open: corners that they say little of, and parameters that they do not tell apart."""
+"""What the points do not determine: uncertain corners, and parameters that cannot be separated."""
 
 from __future__ import annotations
 
@@ -15,22 +15,20 @@ from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
-#: Refuse where some corner of the image (of the model's domain without one) would be predicted so many times worse than
-#: a point is measured ...
+#: Error if the uncertainty at a corner of the image (or of the domain) is this many times that of a measured point ...
 EXTRAPOLATION_LIMIT = 100.0
-#: ... and say so from here on.
+#: ... and warning from this factor on.
 EXTRAPOLATION_WARNING = 10.0
-#: Beyond this condition without its regularisation a model is called unstable.
+#: A model is called unstable above this condition number (without regularisation).
 UNSTABLE = 1e4
-#: Two parameters correlated beyond this are listed as 1.000: they cannot be told apart.
+#: Parameters with a larger correlation (printed as 1.000) cannot be separated.
 _INSEPARABLE = 0.9995
 
 
 def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> float:
-    """Return how many times less certain a model is at a corner of its image than a measured point.
+    """Return the uncertainty of a model at the worst corner of its image, relative to a measured point.
 
-    One that is much less certain is refused, but never a regularised one: what the points leave open, the user has
-    decided.
+    Raises an error if it is far too large; never for a regularised model, because the user chose the regularisation.
     """
     if not len(solution.model.params) or not len(solution.residuals):
         return 0.0
@@ -39,38 +37,41 @@ def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> 
     factor = float(np.nanmax(spread, initial=0.0) / np.median(solution.errors.sigma))
     if np.isnan(spread).all() and strength is None:
         raise DegeneratePoints(
-            "how certain the model is cannot be said: no corner of the ground that it is meant for has an image",
+            "the uncertainty of the model is unknown: it projects no corner of its domain into the image",
             file=source,
             field="domain",
-            remedy="check the metadata of the scene; of a plugin, that domain is (centre, half-size) in units of crs",
+            remedy="check the metadata of the scene. In a plugin: domain must be (centre, half-size) in units of crs",
         )
     if np.isnan(spread).all():
         factor = math.inf
     if factor > EXTRAPOLATION_LIMIT and strength is None:
         raise DegeneratePoints(
-            f"the control points do not determine the whole scene: at a corner the model is {factor:.0f} times less "
-            "certain than a measured point",
+            "the control points do not determine the model over the whole scene: at a corner, its uncertainty is "
+            f"{factor:.0f} times that of a measured point",
             file=source,
-            remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
+            remedy="spread the points over the image (for 3D models also over height), or use a simpler model",
         )
     return factor
 
 
 def uncertain_edge(factor: float) -> list[Notice]:
+    """Return a notice if a model is uncertain at a corner."""
     if factor <= EXTRAPOLATION_WARNING:
         return []
-    text = f"uncertain at the edge: at a corner of the scene {factor:.0f} times less certain than a measured point"
+    text = f"uncertain at the edge: at a corner, the model's uncertainty is {factor:.0f} times that of a measured point"
     return [Notice("uncertain-at-edge", text, factor=factor)]
 
 
 def unstable(solution: Solution, strength: float | None) -> list[Notice]:
+    """Return a notice if the points hardly determine the parameters, or cannot separate some."""
     names = solution.model.param_names
     if strength is not None:
         if solution.condition <= UNSTABLE:
             return []
         text = (
-            f"unstable: the points determine {solution.effective:.1f} of {counted(len(names), 'parameter')} (condition "
-            f"{solution.condition:.0e}); regularisation ({strength:.1e}) decides the others: trust check points only"
+            f"unstable: the points determine only {solution.effective:.1f} of {counted(len(names), 'parameter')} "
+            f"(condition number {solution.condition:.0e}). Regularisation ({strength:.1e}) sets the others. "
+            "Trust only check points"
         )
         return [Notice("unstable", text, condition=solution.condition)]
     if solution.condition <= UNSTABLE or len(names) < 2:
@@ -79,21 +80,20 @@ def unstable(solution: Solution, strength: float | None) -> list[Notice]:
             return []
         first, second = np.unravel_index(int(np.argmax(pairs)), pairs.shape)
         text = (
-            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters is', 'pairs of parameters are')} "
-            f"correlated beyond {_INSEPARABLE} "
-            f"({names[first]} and {names[second]} the most): they cannot be told apart"
+            f"{counted(int((pairs > _INSEPARABLE).sum()), 'pair of parameters', 'pairs of parameters')} cannot be "
+            f"separated: correlation above {_INSEPARABLE} (highest: {names[first]} and {names[second]})"
         )
         return [Notice("inseparable-parameters", text, parameters=[names[first], names[second]])]
-    text = f"unstable: the condition of the adjustment is {solution.condition:.0e}: a simpler model is safer"
+    text = f"unstable: the condition number of the adjustment is {solution.condition:.0e}. A simpler model is safer"
     return [Notice("unstable", text, condition=solution.condition)]
 
 
 def nothing_adjusted(model: SensorModel, points: Points) -> list[Notice]:
-    """Return a notice if a model without parameters was given to be adjusted, without a correction over it."""
+    """Return a notice if a model without parameters was to be adjusted without a correction."""
     if model.param_names or isinstance(model, ImageCorrection) or not points.control.any():
         return []
     text = (
-        f"nothing was adjusted: a model {model.kind!r} has no parameters of its own; "
-        'scene.fit(points, "shift") adjusts a correction over it'
+        f"nothing was adjusted: the model {model.kind!r} has no parameters of its own. "
+        'Adjust a correction: scene.fit(points, "shift")'
     )
     return [Notice("nothing-adjusted", text)]

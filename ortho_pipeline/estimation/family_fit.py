@@ -1,4 +1,4 @@
-"""Choosing among classical models: fit one by name, take out what is not justified, predict what was left out."""
+"""Fit a classical model by its name, and remove parameters that are not significant."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ OWN = "model"
 def fit_own(
     model: SensorModel, points: Points, priors: Mapping[str, Prior] | None = None, *, robust: bool = True
 ) -> Fit:
-    """Adjust the parameters that a scene's model has of its own, such as the exterior orientation of a frame.
+    """Adjust the own parameters of a scene's model, such as the exterior orientation of a frame.
 
     Parameters
     ----------
     priors : mapping of parameter name to Prior, optional
-        How well the vendor knows them.
+        Accuracy of the parameters as delivered.
 
     Raises
     ------
@@ -40,9 +40,9 @@ def fit_own(
     """
     if not model.param_names:
         raise InputError(
-            f"a model {model.kind!r} has no parameters of its own to adjust",
+            f"the model {model.kind!r} has no parameters of its own to adjust",
             field="points.correction",
-            remedy="take shift, shift-drift or affine",
+            remedy="use shift, shift-drift or affine",
         )
     return fit(model, points, priors=priors, robust=robust, name=f"{model.kind}+{OWN}")
 
@@ -64,19 +64,19 @@ def fit_family(
     Parameters
     ----------
     family : str
-        A name of `ortho_pipeline.models.families`. Of ``affine14`` both assignments of the image axes are tried; the
-        one with the smaller leave-one-out residuals is taken, and named in the result.
+        A name of `ortho_pipeline.models.families`. For ``affine14``, both assignments of the image axes are tried, and
+        the result names the one with the smaller leave-one-out residuals.
     crs, size, heights : optional
         As for `ortho_pipeline.models.start_model`.
     ridge : float, 'gcv', 'lcurve', 'auto' or None
-        Regularisation; ``auto`` is generalised cross-validation for rational functions and none for the others.
+        Regularisation; ``auto`` means generalised cross-validation for rational functions and none for others.
     params : sequence of str, optional
-        The only parameters that are adjusted, as of `restricted`.
+        Adjust only these parameters; the others are zero.
 
     Raises
     ------
     TooFewPoints, DegeneratePoints
-        If the points do not determine the model; the remedy names a simpler one that they do.
+        If the points do not determine the model. The remedy names a simpler one that they determine.
     """
     chosen = family_of(family)
     if chosen.variants:
@@ -101,12 +101,12 @@ def fit_family(
     try:
         wrong = gross_errors(start, points, priors=priors, ridge=ridge) if robust else {}
         if wrong:
-            # Where the model is meant for, and its normalisation, come from the points: from the good ones.
+            # Domain and normalisation of the model come from the points, so use only the good ones.
             good = points.select(~np.isin(np.array(points.ids), list(wrong)))
             start = restricted(start_model(family, good, crs=crs, size=size, heights=heights), params)
-        found = fit(start, points, priors=priors, robust=False, exclude=wrong, ridge=ridge, name=family)
-        # The start is of no vendor's making: that it is off says nothing.
-        return replace(found, raw_residuals=np.full_like(found.raw_residuals, np.nan))
+        result = fit(start, points, priors=priors, robust=False, exclude=wrong, ridge=ridge, name=family)
+        # The start is not a vendor's model, so its residuals mean nothing.
+        return replace(result, raw_residuals=np.full_like(result.raw_residuals, np.nan))
     except (DegeneratePoints, NotConverged) as error:
         simpler = _simpler(family, points, crs, size, heights)
         if simpler is None:
@@ -115,33 +115,35 @@ def fit_family(
             Text(f"{family}: ", error.message),
             file=error.file,
             field=error.field,
-            remedy=Text(error.remedy or "", f"; these points do determine {simpler}"),
+            remedy=Text(error.remedy or "", f"; these points are enough for {simpler}"),
         ) from error
 
 
 def restricted(model: SensorModelT, params: Sequence[str] | None) -> SensorModelT:
-    """Return a model of which only these parameters are adjusted; the others are zero.
+    """Return a model with only these adjustable parameters; the others are zero.
 
     Raises
     ------
     InputError
-        If a name is not that of a parameter, or the model's parameters cannot be taken out.
+        If a name is unknown, or the parameters of this model cannot be removed.
     """
     if params is None:
         return model
     unknown = [name for name in params if name not in model.param_names]
     if unknown or not params:
         raise InputError(
-            f"no parameter is called {', '.join(unknown)}" if unknown else "no parameter is named",
+            f"unknown parameter {', '.join(unknown)}" if unknown else "no parameter given",
             field="points.params",
-            remedy=f"some of {', '.join(model.param_names) or 'none: this model has no parameters'}",
+            remedy=f"use some of {', '.join(model.param_names)}"
+            if model.param_names
+            else "this model has no parameters",
         )
     rest = [name for name in model.param_names if name not in params]
     return model.without(rest) if rest else model
 
 
 def ridge_of(text: str) -> float | str | None:
-    """Return what ``--ridge`` means: auto, gcv and lcurve as they are, ``none`` as None, or a weight.
+    """Return the value of ``--ridge``: auto, gcv and lcurve unchanged, ``none`` as None, or a weight.
 
     Raises
     ------
@@ -155,15 +157,15 @@ def ridge_of(text: str) -> float | str | None:
     weight = number_of(text)
     if not weight > 0:
         raise InputError(
-            f"{text!r} is not a regularisation",
+            f"unknown regularisation {text!r}",
             field="points.ridge",
-            remedy=f"auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
+            remedy=f"use auto, none, {', '.join(METHODS)}, or a positive weight such as 1e-5",
         )
     return weight
 
 
 def _leave_one_out(found: Fit) -> float:
-    """Return the leave-one-out RMSE; without redundancy the RMSE of the control points is zero and decides nothing."""
+    """Return the leave-one-out RMSE; 0 without redundancy."""
     loo = found.rmse("loo")
     return loo.total if loo is not None else 0.0
 
@@ -192,12 +194,12 @@ def _simpler(
     return None
 
 
-# -- unjustified parameters ------------------------------------------------------------------------------------------
+# -- insignificant parameters ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Removed:
-    """A parameter that was taken out, and its Student test at that time."""
+    """A removed parameter, and its Student test at that time."""
 
     name: str
     t: float
@@ -206,36 +208,36 @@ class Removed:
 
 @dataclass(frozen=True, eq=False)
 class Pruned:
-    """The fit without the unjustified parameters, and those in the order in which they went."""
+    """The fit without insignificant parameters, and these in the order of their removal."""
 
     fit: Fit
     removed: tuple[Removed, ...]
 
 
 def prune(found: Fit, *, significance: float | None = None) -> Pruned:
-    """Take out the parameters that the points do not justify, one by one, the least significant first.
+    """Remove insignificant parameters one by one, the least significant first.
 
-    A parameter goes if the hypothesis that it is zero is not rejected; then all others are estimated again. A term on
-    which a higher one builds (X below XZ) stays while that one does, because whether it is zero depends on the origin.
+    A parameter is removed if the hypothesis that it is zero is not rejected; then the others are estimated again. A
+    lower term (X) stays as long as a higher one (XZ) does, because its value depends on the origin.
 
     Parameters
     ----------
     found : Fit
-        Of an image correction or a classical model. Points that were rejected stay so.
+        Of an image correction or a classical model. Rejected points stay rejected.
     significance : float, optional
-        Chance of keeping a parameter that is zero; that of the fit by default.
+        Chance of keeping a parameter that is zero; default: that of the fit.
 
     Raises
     ------
     InputError
-        If there is no redundancy to test with, or the model has no removable parameters.
+        If there is no redundancy, or the model has no removable parameters.
     """
     significance = found.significance if significance is None else significance
     if not 0 < significance < 1:
-        raise InputError("a significance lies between 0 and 1", field="significance")
+        raise InputError("the significance must be between 0 and 1", field="significance")
     if found.sigma0 is None:
         raise InputError(
-            "without redundancy no parameter can be tested", field="points.prune", remedy="give more control points"
+            "there is no redundancy, so parameters cannot be tested", field="points.prune", remedy="add control points"
         )
     removed: list[Removed] = []
     while True:
@@ -250,7 +252,7 @@ def prune(found: Fit, *, significance: float | None = None) -> Pruned:
 
 
 def _again(found: Fit, without: str) -> Fit:
-    """Fit once more to the same points, without a parameter."""
+    """Fit again to the same points, without a parameter."""
     again = fit(
         found.model.without([without]),
         found.points,

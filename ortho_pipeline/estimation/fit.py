@@ -1,7 +1,7 @@
-"""Adjustment of a sensor model to ground control, and the `Fit` that it results in.
+"""Adjust a sensor model to control points: `fit`, and its result `Fit`.
 
-Beside it, `problem` has the mathematics, `blunders` the search for gross errors, `regularisation` that of rational
-functions, `statistics` the tests of parameters.
+`problem` has the mathematics, `blunders` searches for gross errors, `regularisation` stabilises rational functions,
+and `statistics` tests parameters.
 """
 
 from __future__ import annotations
@@ -49,24 +49,27 @@ from ortho_pipeline.runtime.process_limits import one_blas_thread
 
 __all__ = ["Fit", "Prior", "fit"]
 
-#: Chance of calling a parameter justified that is zero.
+#: Chance that a parameter passes as significant although it is zero.
 SIGNIFICANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """Result of an adjustment.
+    """Result of an adjustment of one image.
 
-    Residuals are measured minus predicted, ``(N, 2)`` column and row in pixels, for all points whatever their role;
-    `raw_residuals` are those of the model before the adjustment, NaN where it is of the points alone. `loo_residuals`
-    are NaN for points that did not take part. `sigma0` is None without redundancy. Heights that a model of the plane
-    does not need, and that the points do not have, are its reference height in `points`. With a regularisation of the
-    strength `ridge`, the points determine `effective_parameters`, and `condition` is that of the design without it.
-    `corner_ratio` tells how many times less certain the model is at a corner of the scene than a measured point.
-    `outlying` are points that contradict the fit and were not left out: check points, and control points that the
-    search for gross errors does not take for such. Where points have groups, `shared_errors` says what neighbours err
-    together, and `covariance` has grown by it. Where they have an error in common, `common_error` is that, `covariance`
-    has its part, and `residuals` are what is left beside its estimate.
+    Residuals are measured minus predicted: ``(N, 2)`` column and row in pixels, for points of all roles.
+
+    - `raw_residuals`: of the model as delivered; NaN if the model comes from the points alone.
+    - `loo_residuals`: leave-one-out; NaN for points that did not take part.
+    - `sigma0`: None without redundancy.
+    - `points`: with the model's reference height where a 2D model needs no heights and the points have none.
+    - `rejected`: control points that were left out as gross errors, each with the reason.
+    - `outlying`: points that contradict the fit but still count.
+    - `ridge`: weight of the regularisation; then the points determine only `effective_parameters`. `condition` is the
+      condition number of the design without it.
+    - `corner_ratio`: uncertainty at the worst corner of the scene, relative to a measured point.
+    - `shared_errors`: errors that neighbouring points share, if points have groups; `covariance` includes them.
+    - `common_error`: an error common to all matched points; `covariance` includes it, `residuals` are without it.
     """
 
     model: SensorModel
@@ -95,7 +98,7 @@ class Fit:
 
     @property
     def reservations(self) -> tuple[str, ...]:
-        """Why the model is not to be relied on, whatever its residuals: ``unstable``, ``uncertain at a corner``."""
+        """Reasons not to trust the model, whatever its residuals: ``unstable``, ``uncertain at a corner``."""
         found = []
         if len(self.param_names) > 1 and self.condition > UNSTABLE:
             found.append("unstable")
@@ -125,7 +128,7 @@ class Fit:
 
     @property
     def relative_covariance(self) -> Array:
-        """The covariance ``(P, P)`` without what an error leaves in the parameters that points have in common."""
+        """The covariance ``(P, P)`` without the error that is common to the points."""
         return self.covariance if self.common_error is None else self.covariance - self.common_error.covariance
 
     @property
@@ -142,7 +145,7 @@ class Fit:
     def student(self) -> tuple[Array, Array]:
         """Student's t and two-sided p of the hypotheses that parameters are zero, each ``(P,)``.
 
-        Relative to what points have in common: by how much a reference may be off says nothing for the delivered model.
+        Without the error that is common to the points: it does not make a parameter less significant.
         """
         return student_of(
             self.values, self.relative_covariance, self.degrees_of_freedom if self.sigma0 is not None else 0.0
@@ -150,15 +153,18 @@ class Fit:
 
     @property
     def not_justified(self) -> tuple[str, ...]:
-        """Parameters whose chance p of being zero is above `significance`: the points do not justify them."""
+        """Parameters that are not significant: their p is above `significance`."""
         _, p = self.student
         return tuple(name for name, chance in zip(self.param_names, p, strict=True) if not chance <= self.significance)
 
     def rmse(self, which: str) -> Rmse | None:
-        """Return root mean squares in pixels for 'control' (used), 'check' or 'loo'; None where there is no point.
+        """Return root mean squares in pixels; None if there is no such point.
 
-        'matched' is of matches that check beside measured points, whose 'check' then is. 'agreeing' is the check points
-        without the outlying ones: never the accuracy, but what one wrong point hides.
+        Parameters
+        ----------
+        which : {'control', 'check', 'loo', 'matched', 'agreeing'}
+            Used control points, check points, or control points left out one at a time. 'matched': check points that
+            are matches, if others were measured. 'agreeing': check points without outliers, which is not the accuracy.
         """
         if which == "loo":
             residuals = self.loo_residuals[np.isfinite(self.loo_residuals).all(axis=1)]
@@ -178,13 +184,13 @@ class Fit:
 
     @property
     def rmses(self) -> Rmses:
-        """All of `rmse`, 'matched' only where there is one."""
+        """Root mean squares of control, check and leave-one-out; 'matched' only if there are such points."""
         both = ("matched",) if (self.points.check & ~self.points.tests).any() else ()
         return Rmses(**{which: self.rmse(which) for which in ("control", "check", "loo", *both)})
 
     @property
     def raw_bias(self) -> Bias | None:
-        """Mean and scatter (px) of measured minus predicted of the model as delivered, over the used points."""
+        """Mean and scatter (px) of the residuals of the model as delivered, over the used points."""
         raw = self.raw_residuals[self.used]
         if not np.isfinite(raw).any():
             return None
@@ -192,12 +198,12 @@ class Fit:
         return Bias(col=mean[0], row=mean[1], std_col=spread[0], std_row=spread[1], n=len(raw))
 
     def image_sigma(self, ground: Array) -> Array:
-        """Return the standard deviation ``(N, 2)`` of predicted image points that comes from the parameters."""
+        """Return the standard deviation ``(N, 2)`` px of predicted image points, from the parameters alone."""
         partials = self.model.param_partials(ground)
         return np.asarray(np.sqrt(((partials @ self.covariance) * partials).sum(axis=2)))
 
     def _statistics(self) -> Statistics:
-        """Return the tests of the parameters: what is not finite is None."""
+        """Return the tests of the parameters; values that are not finite become None."""
         t, p = self.student
         named = {"total_correlation": self.total_correlation, "t": t, "p": p}
         found: dict[str, Any] = {
@@ -220,15 +226,13 @@ class Fit:
         )
 
     def __repr__(self) -> str:
-        total = {role: found.total for role in ("control", "check", "loo") if (found := self.rmse(role))}
-        said = ", ".join(f"{role} {value:.3f} px" for role, value in total.items())
-        return (
-            f"<fit of {self.model_name} to {counted(int(self.used.sum()), 'control point')}: RMSE {said or 'unknown'}>"
-        )
+        total = {role: rmse.total for role in ("control", "check", "loo") if (rmse := self.rmse(role))}
+        text = ", ".join(f"{role} {value:.3f} px" for role, value in total.items()) or "unknown"
+        return f"<fit of {self.model_name} to {counted(int(self.used.sum()), 'control point')}: RMSE {text}>"
 
     @property
     def record(self) -> Adjustment:
-        """What is published of it (docs/engineering/formats.md)."""
+        """The fit as the record that is published (docs/engineering/formats.md)."""
         points = self.points
         names = ("image", "predicted", "residual", "loo_residual")
         pairs = (points.image, self.predicted, self.residuals, self.loo_residuals)
@@ -270,35 +274,34 @@ def fit(
     ridge: float | str | None = None,
     exclude: Mapping[str, str] | None = None,
 ) -> Fit:
-    """Adjust the parameters of `model` to the control points; check points take no part.
+    """Adjust the parameters of `model` to the control points; check points do not take part.
 
     Parameters
     ----------
     model : SensorModel
-        Start values; a model without parameters is only evaluated.
+        Start values. A model without parameters is only evaluated.
     points : Points
-        In any CRS that can be brought to the model's.
+        In any CRS that can be transformed to that of the model.
     priors : mapping of parameter name to Prior, optional
-        Soft constraints.
     robust : bool
-        Look for gross errors and leave them out.
+        Find gross errors and leave them out.
     ridge : float or 'gcv' or 'lcurve', optional
-        Regularisation of a rational model: its strength, or how to find it.
+        Regularisation of a rational model: its weight, or the method that finds it.
     exclude : mapping of id to reason, optional
-        Control points that are known to be wrong.
+        Control points to leave out.
 
     Raises
     ------
     TooFewPoints, DegeneratePoints
-        If the control points do not determine the parameters, or too many of them contradict the others.
+        If the points do not determine the parameters, or too many contradict the others.
     InputError
-        If no point at all has an image.
+        If the model projects no point.
     """
     if not isinstance(model, SensorModel):
         raise InputError(
-            f"a {type(model).__name__} is no sensor model, and has nothing to adjust",
+            f"a {type(model).__name__} is not a sensor model",
             field="model",
-            remedy='give a model; of a scene: scene.fit(points, "shift")',
+            remedy='pass a model; for a scene, use scene.fit(points, "shift")',
         )
     points = _placed(points, model)
     raw = points.image - model.ground_to_image(points.ground)
@@ -308,7 +311,7 @@ def fit(
     keep, rejected, problem, strength = _searched(problem, points, ridge, robust=robust)
     solution = problem.solve(keep)
     if rejected:
-        # A start that gross errors had a part in took those of the ground to move in directions of their making.
+        # The start included gross errors, so errors of the ground were projected with a wrong model.
         solution = problem.started(solution.model).solve(keep)
     if common is not None:
         measured = replace(problem, points=points.select(problem.rows))
@@ -318,12 +321,12 @@ def fit(
     used = np.zeros(len(points), dtype=bool)
     used[problem.rows[keep]] = True
     seen = _without(common, model, points)
-    said = outlying(solution, seen, used, None if common is None else common.covariance)
-    warnings += checks_apart(solution, seen, used, said, shared=common is not None)
-    found = _result(
+    outliers = outlying(solution, seen, used, None if common is None else common.covariance)
+    warnings += checks_apart(solution, seen, used, outliers, shared=common is not None)
+    result = _result(
         solution, seen, used, raw, {**known_bad, **rejected}, warnings, name, strength, problem.priors, common
     )
-    return replace(found, points=points, corner_ratio=ratio, outlying=said)
+    return replace(result, points=points, corner_ratio=ratio, outlying=outliers)
 
 
 def gross_errors(
@@ -338,7 +341,7 @@ def gross_errors(
     Raises
     ------
     TooFewPoints, DegeneratePoints, InputError
-        As `fit`, but not for what the remaining points leave open.
+        As `fit`, except for points that are too few after the search.
     """
     points = _placed(points, model)
     problem, _ = _posed(model, points, points.image - model.ground_to_image(points.ground), priors, {})
@@ -349,13 +352,13 @@ def gross_errors(
 def _common_error(
     model: SensorModel, points: Points, raw: Array, priors: Mapping[str, Prior] | None, *, robust: bool
 ) -> ImageCommonError | None:
-    """Return what control points have in common, with a start from those without it, or None."""
+    """Return the common error of control points, started from points without it; None if they have none."""
     usable = points.control & np.isfinite(raw).all(axis=1)
     common = ImageCommonError.of(model, points, usable)
     others = usable & (points.sigma_common == 0)
     if common is None or not others.any():
         return common
-    # Else the few that do not share it would look like gross errors among the many that do.
+    # Otherwise the few points without it would look like gross errors among the many points with it.
     try:
         first = fit(model, points.select(usable & ~others), priors=priors, robust=robust)
     except (InputError, ModelError):
@@ -364,7 +367,7 @@ def _common_error(
 
 
 def _without(common: ImageCommonError | None, model: SensorModel, points: Points) -> Points:
-    """Return points as they were measured, but for what they have in common."""
+    """Return points with their common error removed."""
     if common is None or not common.value.any():
         return points
     return replace(points, image=points.image - common.offset(model, points))
@@ -377,15 +380,14 @@ def _posed(
     priors: Mapping[str, Prior] | None,
     without: Mapping[int, str],
 ) -> tuple[Problem, list[Notice]]:
-    """Return the problem of the usable control points, and warnings about those that are not."""
+    """Return the problem of the usable control points, and warnings about the others."""
     projected = np.asarray(np.isfinite(raw).all(axis=1))
     if len(points) and not projected.any():
         raise InputError(
-            f"none of the {counted(len(points), 'point')} has an image by the model {model.kind!r}: no height, or "
-            "outside of "
-            "where the model is defined",
+            f"the model {model.kind!r} projects none of the points ({len(points)}): they have no height, or are "
+            "outside its domain",
             file=points.source or None,
-            remedy="check the CRS and the heights of the points, and that they and the model belong to this scene",
+            remedy="check CRS and heights of the points, and that points and model belong to this scene",
         )
     usable = points.control & projected
     wrong = np.zeros(len(points), dtype=bool)
@@ -398,7 +400,7 @@ def _posed(
 def _searched(
     problem: Problem, points: Points, ridge: float | str | None, *, robust: bool
 ) -> tuple[np.ndarray, dict[int, str], Problem, float | None]:
-    """Return the points to keep ``(n,)``, the rows that are not with the reason, and the regularised problem."""
+    """Return the points to keep ``(n,)``, the rejected rows with reasons, the regularised problem and its weight."""
     keep = np.ones(len(problem.rows), dtype=bool)
     strength = None
     if ridge is not None:
@@ -417,7 +419,7 @@ def _searched(
 
 
 def _placed(points: Points, model: SensorModel) -> Points:
-    """Return the points in the CRS of the model, at its reference height if it knows of none."""
+    """Return the points in the CRS of the model, at its reference height if it ignores heights and they have none."""
     points = points.to_crs(model.crs)
     missing = ~np.isfinite(points.ground[:, 2])
     if model.uses_height or not missing.any():
@@ -478,7 +480,7 @@ def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list
             found.append(
                 Notice(
                     "no-projection",
-                    f"{role} points without a projection (no height, or outside the model's domain): "
+                    f"the model cannot project these {role} points (no height, or outside its domain): "
                     f"{', '.join(names)}",
                     role=role,
                     points=names,

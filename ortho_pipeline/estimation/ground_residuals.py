@@ -1,7 +1,7 @@
-"""Residuals as people feel them: in metres on the ground, and along or across the direction of view.
+"""Residuals in metres on the ground, and along or across the direction of view.
 
-An ortho shows a point where its ray meets the DEM. A wrong height moves it along the direction of view and nowhere
-else, so that residuals along it tell of heights, and those across it of the sensor model and of measuring.
+An ortho shows a point where its ray meets the DEM. A wrong height moves the point only along the direction of view. So
+residuals along it show errors of heights, and residuals across it show errors of the sensor model and the measurement.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array, SensorModel, solve_2x2
 
-#: An image that moves less than this (pixels per metre of height) has no direction of view to speak of.
+#: If a metre of height moves the image less than this (pixels), the direction of view is undefined.
 _NADIR = 1e-4
 
 
@@ -28,20 +28,18 @@ def metre_partials(model: SensorModel, ground: Array) -> tuple[Array, Array]:
 
 
 def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
-    """Return how the middle of an image is seen: pixel size on the ground, and the direction of view.
+    """Return the viewing geometry at the middle of an image: pixel size on the ground, and direction of view.
 
-    All are None where the middle has no ground. `view` has the angle at the ground between ray and vertical, the
-    azimuth (clockwise from true north) in which the sensor stands, and the size of a pixel along and across that
-    direction: the length on level ground that one pixel of the image covers. For a square pixel of the size
-    p straight down, the paper's formula gives p / cos^2 along and p / cos across; the model gives what is so, also
-    where lines follow each other at another distance.
+    All values are None if the middle has no ground. `view` has incidence angle, azimuth of the sensor (clockwise
+    from true north), and the size of a pixel on level ground along and across that direction. For a square pixel p,
+    the formula of the paper gives p / cos^2 along and p / cos across; the model also covers other line spacings.
 
     Returns
     -------
     dict
-        `ground_pixel_m` [along the row, along the column], `lean_m_per_m` and `lean_azimuth_deg` (how far and whereto
-        the ortho moves per metre of height), `view` {incidence_deg, sensor_azimuth_deg, pixel_m {along_view,
-        across_view}}; `sensor_azimuth_deg` is None straight down, where along is north and across is east.
+        `ground_pixel_m` [along the row, along the column], `lean_m_per_m` and `lean_azimuth_deg` (distance and azimuth
+        of the ortho's shift per metre of height), `view` {incidence_deg, sensor_azimuth_deg, pixel_m {along_view,
+        across_view}}; `sensor_azimuth_deg` is None for a vertical view; then along is north and across is east.
 
     Source: Bueyueksalih et al. (OrbView-3), formula 1.
     """
@@ -77,7 +75,7 @@ def viewing(model: SensorModel, width: int, height: int) -> dict[str, Any]:
 
 
 def with_reference_height(model: SensorModel, ground: Array) -> Array:
-    """Return ground points with the model's reference height where they have none (2D models take such points)."""
+    """Return ground points with the model's reference height where they have none (as 2D models allow)."""
     missing = np.isnan(ground[:, 2])
     if missing.any():
         ground = ground.copy()
@@ -110,10 +108,10 @@ def rmse_metres(fit: Fit) -> RmsesOnGround:
 
 
 def along_view(fit: Fit) -> Array:
-    """Return the residuals ``(N, 2)`` px along and across the direction of view; NaN for a view straight down.
+    """Return the residuals ``(N, 2)`` px along and across the direction of view; NaN for a vertical view.
 
-    Along is positive towards where a higher point appears in the image; across is 90 degrees further, from column
-    towards row.
+    Along is positive in the direction in which a higher point moves in the image. Across is 90 degrees further, from
+    column towards row.
     """
     if not len(fit.points):
         return np.zeros((0, 2))

@@ -1,8 +1,8 @@
 r"""Linear algebra of the adjustment: least squares by orthogonal triangulation, and Gauss-Newton on top of it.
 
-The design matrix :math:`A` is scaled to columns of length one and factored, :math:`A S = Q R`; normal equations, which
-square the condition, are never formed. The solution is refined with residuals in extended precision (Bjoerck's
-augmented system), so it is right to nearly all digits whenever the points determine it at all.
+The design matrix :math:`A` is scaled to columns of length one and factored, :math:`A S = Q R`. Normal equations, which
+square the condition number, are never formed. The solution is refined with residuals in extended precision (Bjoerck's
+augmented system), so nearly all digits are correct whenever the points determine the parameters.
 
 Source: Golub 1965 (Householder triangulation); Bjoerck 1967 (refinement); Bates and Watts 1988 (relative offset).
 """
@@ -20,7 +20,7 @@ from ortho_pipeline.geodesy.ellipsoid import Array
 
 _REFINEMENTS = 3
 _STEPS = 30
-#: Gauss-Newton ends when a step would change the residuals by less than this part of their length.
+#: Gauss-Newton stops when a step would change the residuals by less than this part of their length.
 _RELATIVE_OFFSET = 1e-10
 
 
@@ -28,8 +28,8 @@ _RELATIVE_OFFSET = 1e-10
 class LinearSolution:
     """Least-squares solution of ``design @ values = observed``.
 
-    `cofactors` ``(P, P)`` is the inverse of the normal matrix; `condition` the ratio of the extreme singular values of
-    the design with columns of length one (inf where the rank is deficient; values and cofactors are then NaN).
+    `cofactors` ``(P, P)`` is the inverse of the normal matrix. `condition` is the ratio of the extreme singular values
+    of the design with columns of length one; if the rank is deficient, it is inf, and values and cofactors are NaN.
     """
 
     values: Array
@@ -50,9 +50,9 @@ class LinearSolution:
 
 
 def solve_linear(design: Array, observed: Array, *, refine: bool = True) -> LinearSolution:
-    """Solve an overdetermined linear system ``(n, P)`` for ``(P,)`` values in the sense of least squares.
+    """Solve an overdetermined linear system ``(n, P)`` for ``(P,)`` values by least squares.
 
-    Observations of other weights than one are scaled by the caller, rows and right side alike.
+    For weights other than one, the caller scales both rows and right side.
     """
     design, observed = np.asarray(design, dtype=float), np.asarray(observed, dtype=float)
     rows, count = design.shape
@@ -63,7 +63,7 @@ def solve_linear(design: Array, observed: Array, *, refine: bool = True) -> Line
     nothing = LinearSolution(np.full(count, np.nan), np.full(rows, np.nan), np.full((count, count), np.nan), math.inf)
     if rows < count or not np.isfinite(design).all():
         return nothing
-    # Powers of two scale without rounding: the refinement then solves the very system that was given.
+    # Scaling by powers of two has no rounding, so the refinement solves exactly the given system.
     scale = np.exp2(np.round(np.log2(length)))
     scaled = design / scale
     q, r = np.linalg.qr(scaled)
@@ -118,27 +118,27 @@ def minimise(
         Derivatives of the *predicted* values, over the same sigma.
     start : (P,)
     singular : float
-        Where the iteration stays in a valley without a bottom, of this condition or worse, the parameters there are
-        returned: the caller tells that they are not determined.
+        If the iteration stays in a flat valley with this condition number or worse, the parameters there are returned;
+        the caller reports that they are not determined.
 
     Raises
     ------
     NotConverged
-        If no descent is found.
+        If the iteration does not converge.
     """
     params = np.asarray(start, dtype=float)
     found = _gauss_newton(residuals, slopes, params)
     if found is not None:
         return found
-    # Far from the solution the damped steps of Levenberg and Marquardt come closer than halved ones.
+    # Far from the solution, the damped steps of Levenberg and Marquardt work better than halved ones.
     params, arrived = _levenberg_marquardt(residuals, slopes, params)
     found = _gauss_newton(residuals, slopes, params)
     if found is not None:
         return found
-    # In a valley without a bottom the caller tells what is undetermined by the condition of the design.
+    # In a flat valley, the caller reports undetermined parameters from the condition number of the design.
     if arrived or condition_of(slopes(params)) > singular:
         return params
-    raise NotConverged("the adjustment did not converge", remedy="give better start values or fewer parameters")
+    raise NotConverged("the adjustment did not converge", remedy="give better start values, or adjust fewer parameters")
 
 
 def _gauss_newton(residuals: Callable[[Array], Array], slopes: Callable[[Array], Array], params: Array) -> Array | None:
@@ -172,7 +172,7 @@ def _gauss_newton(residuals: Callable[[Array], Array], slopes: Callable[[Array],
 def _levenberg_marquardt(
     residuals: Callable[[Array], Array], slopes: Callable[[Array], Array], params: Array
 ) -> tuple[Array, bool]:
-    """Return parameters, and whether the iteration came to an end there."""
+    """Return parameters, and whether the iteration converged."""
     from scipy.optimize import least_squares
 
     try:

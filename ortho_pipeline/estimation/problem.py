@@ -1,20 +1,20 @@
 r"""The least-squares problem of one image: image measurements of control points, priors, and a regularisation.
 
-With image residuals :math:`v = l - f(x)` (measured minus predicted), weights :math:`W = \Sigma^{-1}` with a 2 x 2
-block :math:`\Sigma = C + G S G^T` for each point (`ImageErrors`: C of the measurement, S of the ground, which the start
-moves by its partials G), and as further observations each `Prior` and each of the model's own
-(`SensorModel.constraints`), the estimate minimises :math:`v^T W v`. Then
+Image residuals are :math:`v = l - f(x)` (measured minus predicted). Weights are :math:`W = \Sigma^{-1}`, with a 2 x 2
+block :math:`\Sigma = C + G S G^T` for each point (`ImageErrors`): C of the measurement, and S of the ground, projected
+by the partials G of the start. Each `Prior`, and each constraint of the model (`SensorModel.constraints`), is a further
+observation. The estimate minimises :math:`v^T W v`. Then
 
 - redundancy :math:`r` = observations - parameters, :math:`\sigma_0^2 = v^T W v / r`,
 - covariance :math:`C = \sigma_0^2 (J^T W J)^{-1}` (a-priori :math:`\sigma_0 = 1` where :math:`r = 0`),
 - leave-one-out residual of point i, without a refit: :math:`R_{ii}^{-1} v_i` with the 2 x 2 block
   :math:`R_{ii} = I - J_i (J^T W J)^{-1} J_i^T W_i` of the redundancy matrix (exact for models linear in their
-  parameters). Points of one group (`Points.groups`) share errors, and are left out together: :math:`R_{ii}` is then
-  that of the group.
+  parameters). Points of one group (`Points.groups`) share errors and are left out together; then :math:`R_{ii}` is that
+  of the group.
 
-A regularisation adds pseudo-observations of zero, and the soft constraints of a model are as fictitious: they have no
-part in :math:`v^T W v`, and the effective number of parameters, the trace of the hat matrix of the true observations,
-takes the place of their number. Else constraints that are never violated would make every sigma too small.
+Pseudo-observations of zero (regularisation) and soft constraints of a model are fictitious: they do not count in
+:math:`v^T W v`. The effective number of parameters, the trace of the hat matrix of the true observations, replaces the
+number of parameters. Otherwise constraints that are never violated would make every sigma too small.
 
 Source: Cook and Weisberg 1982 (leave-one-out); Hansen 1998 (regularisation, effective degrees of freedom).
 """
@@ -36,7 +36,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
-#: A scaled normal matrix beyond this condition is taken as singular: the points do not determine the model.
+#: Above this condition number the points do not determine the model.
 CONDITION_LIMIT = 1e6
 #: A point with less redundancy than this in some direction is indispensable.
 INDISPENSABLE = 1e-9
@@ -44,10 +44,10 @@ INDISPENSABLE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Result of an adjustment; `jacobian` ``(n, 2, P)`` and `residuals` ``(n, 2)`` px are those of its control points.
+    """Solution of the problem; `jacobian` ``(n, 2, P)`` and `residuals` ``(n, 2)`` px belong to the control points.
 
-    `freedom` is the number of observations minus that of (effective) parameters; `condition` is of the design without
-    a regularisation. `groups` ``(n,)`` are those of `Points`.
+    `freedom` is the number of observations minus that of (effective) parameters; `condition` is the condition number of
+    the design without regularisation; `groups` ``(n,)`` are those of `Points`.
     """
 
     model: SensorModel
@@ -63,11 +63,11 @@ class Solution:
 
     @property
     def redundancy(self) -> int:
-        """Whole number of observations beyond the parameters."""
+        """Number of observations minus parameters, rounded down."""
         return math.floor(self.freedom + 1e-6)
 
     def redundancy_blocks(self) -> Array:
-        """Return the blocks ``(n, 2, 2)`` of the redundancy matrix of whitened observations, one of each point.
+        """Return the blocks ``(n, 2, 2)`` of the redundancy matrix of whitened observations, one for each point.
 
         Half of the trace of a block is the point's redundancy number.
         """
@@ -75,9 +75,9 @@ class Solution:
         return np.eye(2) - white @ self.cofactors @ white.transpose(0, 2, 1)
 
     def leave_one_out(self) -> Array:
-        """Return residuals ``(n, 2)`` px that each point would have had, had it, and its group, taken no part.
+        """Return leave-one-out residuals ``(n, 2)`` px; points of a group are left out together.
 
-        NaN is a point, or a group, that is indispensable.
+        NaN if the point or group is indispensable.
         """
         left, white = self.leave_each_out(), self.errors.whitened(self.residuals)
         design = self.errors.whitened(self.jacobian)
@@ -90,31 +90,31 @@ class Solution:
         return left
 
     def leave_each_out(self) -> Array:
-        """Return residuals ``(n, 2)`` px that each point would have had alone without itself, whatever its group."""
+        """Return leave-one-out residuals ``(n, 2)`` px with each point left out alone, whatever its group."""
         white = self.errors.whitened(self.residuals)
         return self.errors.restored(left_out(self.redundancy_blocks(), white, known=INDISPENSABLE).whole)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Control points, a model with start values, and what is known beforehand."""
+    """Control points, a model with start values, and prior knowledge."""
 
     model: SensorModel
     rows: np.ndarray  # indices of the control points in the table
     points: Points  # those rows of it
-    errors: ImageErrors  # those of the ground included, as `model` moves them
+    errors: ImageErrors  # with errors of the ground, projected by `model`
     priors: Mapping[str, Prior]
     ridge: Mapping[str, float] = field(default_factory=dict)  # sigma of the pseudo-observation of zero
 
     @classmethod
     def of(cls, model: SensorModel, points: Points, usable: np.ndarray, priors: Mapping[str, Prior]) -> Problem:
-        """Return the problem of the points in the mask `usable`, which are in the CRS of the model."""
+        """Return the problem of the points in the mask `usable`; they must be in the CRS of the model."""
         unknown = sorted(set(priors) - set(model.param_names))
         if unknown:
             raise InputError(
-                f"a prior names parameters that the model does not have: {', '.join(unknown)}",
+                f"priors for parameters that the model does not have: {', '.join(unknown)}",
                 field="priors",
-                remedy=f"its parameters are {', '.join(model.param_names) or 'none'}",
+                remedy=f"the model has these parameters: {', '.join(model.param_names) or 'none'}",
             )
         rows = np.flatnonzero(usable)
         chosen = points.select(rows)
@@ -139,13 +139,13 @@ class Problem:
         return replace(self, ridge=dict(ridge))
 
     def started(self, model: SensorModel) -> Problem:
-        """Return this problem with other start values, and errors of the ground as that model moves them."""
+        """Return this problem with other start values, which also project the errors of the ground."""
         return replace(self, model=model, errors=ImageErrors.of(model, self.points))
 
     def solve(self, keep: np.ndarray, *, linear: bool = False) -> Solution:
         """Adjust to the points in the mask `keep` ``(n,)``.
 
-        With `linear`, one step on the linearised problem: its residuals, and the model as it was.
+        With `linear`, only one step of the linearised problem; the model stays unchanged.
         """
         ground, image, errors = self.ground[keep], self.image[keep], self.errors[keep]
         count = len(self.model.params)
@@ -165,7 +165,7 @@ class Problem:
         observed = np.concatenate([errors.whitened(residuals).ravel(), believed[true]])
         effective = effective_parameters(count, [(rows[~true], solved.cofactors)])
         freedom = len(observed) - effective
-        # Less than a whole observation too many tells nothing of weights.
+        # A redundancy below one observation gives no sigma0.
         sigma0 = unit_weight(float(observed @ observed), freedom, 1 - 1e-6)
         return Solution(
             model,
@@ -186,24 +186,24 @@ class Problem:
         least = self.model.minimum_points if not known else math.ceil((count - known) / 2)
         if points < least:
             raise TooFewPoints(
-                f"{counted(points, 'control point does', 'control points do')} not determine "
+                f"{counted(points, 'control point is', 'control points are')} not enough for "
                 f"{counted(count, 'parameter')}",
                 file=self.points.source,
-                remedy=f"give at least {counted(least, 'control point')}, or a simpler model",
+                remedy=f"give at least {counted(least, 'control point')}, or use a simpler model",
             )
 
     def _determined(self, condition: float) -> None:
         if condition > CONDITION_LIMIT:
             raise DegeneratePoints(
-                f"the control points do not determine all parameters (condition {condition:.1e})",
+                f"the control points do not determine all parameters (condition number {condition:.1e})",
                 file=self.points.source,
-                remedy="spread the points over the image (and over height, for 3D models), or take a simpler model",
+                remedy="spread the points over the image (for 3D models also over height), or use a simpler model",
             )
 
     def _pseudo(self, model: SensorModel) -> tuple[Array, Array, np.ndarray]:
-        """Return misclosures and design rows of the model's constraints, of priors, then of the regularisation.
+        """Return misclosures and design rows of the model's constraints, the priors and the regularisation.
 
-        The mask at the end tells which of them are true observations.
+        The last value is the mask of true observations among them.
         """
         wanted = [(name, prior.mean, prior.sigma) for name, prior in self.priors.items()]
         wanted += [(name, 0.0, sigma) for name, sigma in self.ridge.items()]
@@ -234,6 +234,6 @@ class Problem:
             image_part = errors.whitened(model.param_partials(ground))
             return np.vstack([image_part.reshape(-1, len(params)), self._pseudo(model)[1]])
 
-        # Far from singular at the start, or the iteration would only wander: say so at once.
+        # If the start is nearly singular, the iteration would only wander: raise the error at once.
         self._determined(condition_of(slopes(origin)))
         return start.with_params(minimise(misfit, slopes, origin, singular=CONDITION_LIMIT))

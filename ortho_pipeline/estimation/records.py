@@ -1,6 +1,6 @@
-"""What an adjustment results in, as it is published: points, parameters and their tests, and root mean squares.
+"""The published results of an adjustment: points, parameters and their tests, and root mean squares.
 
-Numbers that do not exist are None. A residual is measured minus predicted, in pixels (column, row).
+Missing numbers are None. A residual is measured minus predicted, in pixels (column, row).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NoticeDocument = Annotated[
 
 
 def is_known(values: Residual | None) -> TypeGuard[Pair]:
-    """Tell whether a vector is known, in both axes."""
+    """Return whether both components of a vector are known."""
     return values is not None and None not in values
 
 
@@ -50,7 +50,7 @@ class Rmse(Record):
 
     @classmethod
     def of(cls, residuals: Array) -> Self | None:
-        """Return that of residuals ``(N, 2)``; None for no residuals."""
+        """Return the record of residuals ``(N, 2)``; None without residuals."""
         if not len(residuals):
             return None
         col, row = (residuals**2).mean(axis=0)
@@ -67,9 +67,9 @@ class RmseOnGround(Record):
 
     @classmethod
     def of(cls, shifts: Array) -> Self | None:
-        """Return that of shifts ``(N, 2)`` in metres; None for none."""
-        found = Rmse.of(shifts)
-        return None if found is None else cls(x=found.col, y=found.row, total=found.total, n=found.n)
+        """Return the record of shifts ``(N, 2)`` in metres; None without shifts."""
+        rmse = Rmse.of(shifts)
+        return None if rmse is None else cls(x=rmse.col, y=rmse.row, total=rmse.total, n=rmse.n)
 
 
 class RmseOfView(Record):
@@ -81,10 +81,10 @@ class RmseOfView(Record):
 
 
 class Rmses(Record):
-    """Over control points (the fit), check points, and control points left out in turn.
+    """RMSE of control points (the fit), of check points, and of control points left out one at a time (loo).
 
-    Where check points were measured beside matches, `check` is of those, absolute, and `matched` of the matches that
-    were held out, relative to their reference.
+    If there are both measured and matched check points, `check` is absolute, of the measured ones, and `matched` is
+    relative to the reference, of the matched ones.
     """
 
     control: Rmse | None
@@ -103,14 +103,14 @@ class RmsesOnGround(Record):
 
 
 class RmsesOfView(Record):
-    """Over control points (the fit) and check points."""
+    """RMSE of control points (the fit) and of check points."""
 
     control: RmseOfView | None
     check: RmseOfView | None
 
 
 class Bias(Record):
-    """Mean and scatter of measured minus predicted of the model as delivered, over the used points."""
+    """Mean and scatter of the residuals of the model as delivered, over the used points."""
 
     col: float
     row: float
@@ -127,9 +127,9 @@ class Parameter(Record):
 
 
 class CommonError(Record):
-    """An error that points have in common, as matches that of their reference: metres true east and north.
+    """An error common to many points, such as the error of a reference for its matches: metres true east and north.
 
-    `estimate_m` is what other points tell of it, and `estimate_sigma_m` what that leaves.
+    `estimate_m` is its estimate from other points, and `estimate_sigma_m` the standard deviation of the estimate.
     """
 
     points: Count
@@ -139,13 +139,13 @@ class CommonError(Record):
 
     @classmethod
     def of(cls, common: CommonUnknown) -> Self:
-        """Return what is published of the unknown."""
+        """Return the published record of the unknown."""
         estimate, left = common.value * common.sigma, np.sqrt(np.diag(common.left)) * common.sigma
         return cls(points=common.points, sigma_m=common.sigma, estimate_m=tuple(estimate), estimate_sigma_m=tuple(left))
 
 
 class Statistics(Record):
-    """Tests of the parameters; ridge is the regularisation, condition that of the design."""
+    """Tests of the parameters; ridge is the weight of the regularisation, condition the condition number."""
 
     correlation: tuple[tuple[float | None, ...], ...]
     total_correlation: dict[str, float | None]
@@ -162,16 +162,16 @@ class Statistics(Record):
 
 
 class GroupedStatistics(Statistics):
-    """Tests of the parameters where points have groups."""
+    """Tests of the parameters if points have groups."""
 
     shared_errors: SharedErrors
 
 
 class Point(Record):
-    """A point in the image: `residual_m` is where the ortho shows it minus where it belongs, metres east and north.
+    """A point in the image: `residual_m` is its position in the ortho minus its true position, metres east and north.
 
-    `view_residual` is along and across the direction of view, `raw_residual` of the model as delivered. `lon_lat` is
-    where it belongs and `shown_lon_lat` where the ortho shows it, degrees (WGS 84).
+    `view_residual` is along and across the direction of view, `raw_residual` that of the model as delivered. `lon_lat`
+    is its true position and `shown_lon_lat` its position in the ortho, degrees (WGS 84).
     """
 
     id: str
@@ -190,12 +190,12 @@ class Point(Record):
 
     @property
     def length(self) -> float | None:
-        """Length of the residual, px."""
+        """Length of the residual in pixels."""
         return math.hypot(*self.residual) if is_known(self.residual) else None
 
     @property
     def kind(self) -> Literal["control", "check", "out"]:
-        """The mark that it is drawn with."""
+        """The symbol of the point in drawings."""
         if self.role == "control" and not self.used:
             return "out"
         return "check" if self.role == "check" else "control"
@@ -209,7 +209,7 @@ class LeftOut(Record):
 
 
 class Adjustment(Record):
-    """The model that was adjusted to the points, and how well it fits them."""
+    """The adjusted model, and how well it fits the points."""
 
     model: str
     parameters: dict[str, Parameter]

@@ -1,11 +1,11 @@
-r"""Regularisation after Tikhonov, and the choice of its strength.
+r"""Tikhonov regularisation, and the choice of its weight.
 
-With normalised coefficients c beyond the affine part, and image coordinates normalised as well, what is minimised is
+With normalised image coordinates and normalised coefficients c beyond the affine part, the adjustment minimises
 :math:`\sum v_n^2 + \lambda \sum (g c)^2`: each such coefficient is observed as zero, with a sigma of
-:math:`\sigma_{image} / (g S \sqrt{\lambda})` for an image of half-size S. The grade g is 1 for the lowest terms
-that are drawn to zero and ten times as much for each further order, because the effects of real sensors fall off like
-that. The strength :math:`\lambda` is given, or found by generalised cross-validation, or at the corner of the L-curve,
-on the problem linearised at its solution.
+:math:`\sigma_{image} / (g S \sqrt{\lambda})` for an image of half-size S. The grade g is 1 for the lowest penalised
+terms and ten times larger for each further order, because the effects of real sensors decrease like this. The weight
+:math:`\lambda` is given, or found by generalised cross-validation or at the corner of the L-curve, on the problem
+linearised at its solution.
 
 Source: Golub, Heath and Wahba 1979 (GCV); Kim and Gu 2004 (factor 1.4 against undersmoothing); Hansen 1992 (L-curve).
 """
@@ -23,9 +23,9 @@ from ortho_pipeline.models.families import exponents
 from ortho_pipeline.models.rational import Rational
 
 METHODS = ("gcv", "lcurve")
-#: The penalised part of the design is never let closer to singular than this.
+#: Lower limit of the weight, relative to the largest singular value of the penalised part of the design.
 _WEAKEST = 1e-5
-#: Each parameter counts so much in GCV: with 1, a small sample is fitted too closely now and then.
+#: Weight of each parameter in GCV: with 1, small samples are sometimes overfitted.
 _CAUTION = 1.4
 _ROUNDS = 5
 _GRADE = 10.0
@@ -34,37 +34,37 @@ _GRADE = 10.0
 def regularised(
     problem: Problem, keep: np.ndarray, ridge: float | str, *, linear: bool = False
 ) -> tuple[Problem, float]:
-    """Return the problem with pseudo-observations of the coefficients, and their strength lambda.
+    """Return the problem with pseudo-observations of the coefficients, and their weight lambda.
 
     Parameters
     ----------
     keep : (n,) bool
-        The points that count for the choice.
+        The points that determine the choice.
     ridge : float or 'gcv' or 'lcurve'
     linear : bool
-        Choose on the problem linearised at the start values, for points among which gross errors are suspected.
+        Choose on the problem linearised at the start values, for points that may have gross errors.
 
     Raises
     ------
     InputError
-        If the model has no coefficients to regularise, or the strength is not positive.
+        If the model has no coefficients to regularise, or the weight is not positive.
     """
     model = problem.model
     if not isinstance(model, Rational) or not model.penalised:
-        raise InputError("only models with higher terms can be regularised", field="ridge")
+        raise InputError("only models with higher-order terms can be regularised", field="ridge")
     if isinstance(ridge, str):
         if ridge not in METHODS:
             raise InputError(
-                f"{ridge!r} chooses no regularisation", field="ridge", remedy=f"{', '.join(METHODS)} or a number"
+                f"unknown regularisation {ridge!r}", field="ridge", remedy=f"use {', '.join(METHODS)} or a number"
             )
         return _chosen(problem, keep, ridge, model, 1 if linear else _ROUNDS)
     if not (math.isfinite(ridge) and ridge > 0):
-        raise InputError("a regularisation is a positive number", field="ridge")
+        raise InputError("the weight of the regularisation must be a positive number", field="ridge")
     return problem.with_ridge(_sigmas(problem, model, ridge)), float(ridge)
 
 
 def _weight(problem: Problem, model: Rational) -> float:
-    """Return how many sigmas of the image a coefficient of one moves the edge of the image."""
+    """Return the displacement of the image edge by a coefficient of one, in sigmas of the image."""
     return float(model.image_scale.mean() / np.median(problem.errors.sigma))
 
 
@@ -74,13 +74,13 @@ def _sigmas(problem: Problem, model: Rational, strength: float) -> dict[str, flo
 
 
 def _grade(name: str) -> float:
-    """Return how much more a coefficient is drawn to zero than those of the lowest penalised order of its part."""
+    """Return the penalty of a coefficient relative to the lowest penalised order of its part."""
     order = int(exponents(name.rpartition("_")[2]).sum())
     return _GRADE ** (order - (1 if "den_" in name else 2))
 
 
 def _chosen(problem: Problem, keep: np.ndarray, method: str, model: Rational, rounds: int) -> tuple[Problem, float]:
-    """Alternate between the choice on the linearised problem and the solution with it, until the choice stays."""
+    """Alternate between the choice on the linearised problem and its solution, until the choice is stable."""
     strength, current = 0.0, model
     for number in range(rounds):
         before, strength = strength, _choice(problem, keep, method, current)
@@ -119,7 +119,7 @@ def _choice(problem: Problem, keep: np.ndarray, method: str, model: Rational) ->
 
 
 def _corner(x: Array, y: Array) -> int:
-    """Return where a curve turns most sharply towards the origin."""
+    """Return the index at which a curve turns most sharply towards the origin."""
     dx, dy = np.gradient(x), np.gradient(y)
     ddx, ddy = np.gradient(dx), np.gradient(dy)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,15 +1,15 @@
-r"""Statistics of an adjustment, of one image and of a block: of its observations, and of estimated parameters.
+r"""Statistics of an adjustment of one image or a block: of observations, and of estimated parameters.
 
-Observations are left out without adjusting again. With the redundancy matrix :math:`I - H` of observations of unit
-weight, and its block :math:`R` of some of them with the misfits :math:`v`, these would be :math:`R^{-1} v` off had they
-taken no part, and :math:`w^2 = v^T R^{-1} v` is their distance from all others in standard deviations. Both are exact
-for models that are linear in their parameters. Directions in which the others tell nothing have no redundancy: nothing
-is known there, and nothing can be tested.
+Observations are left out without a new adjustment. Let :math:`I - H` be the redundancy matrix of observations of unit
+weight, :math:`R` its block for some of them, and :math:`v` their misfits. Without these observations, their misfits
+would be :math:`R^{-1} v`, and :math:`w^2 = v^T R^{-1} v` is their squared distance from all others in standard
+deviations. Both are exact for models that are linear in their parameters. In a direction without redundancy, nothing is
+known and nothing can be tested.
 
-Of estimated parameters, from their values and covariance:
+For estimated parameters, from their values and covariance:
 
 - total correlation of parameter k: :math:`\sqrt{1 - 1 / (C_{kk} (C^{-1})_{kk})}`, its multiple correlation with all
-  others; 1 is a parameter whose effect the group of the others can take over;
+  others; 1 means that the others together can replace the parameter;
 - Student test of the hypothesis that the parameter is zero: :math:`t_k = x_k / \sigma_k`, two-sided.
 
 Source: Baarda 1968 and Cook and Weisberg 1982, section 2.2 (leaving out); section 3.3 of Bueyueksalih et al.
@@ -29,11 +29,11 @@ from ortho_pipeline.geodesy.ellipsoid import Array
 
 
 class PartsLeftOut(NamedTuple):
-    """Parts of k observations each, left out one by one.
+    """Parts of k observations each, left out one at a time.
 
-    `misfits` ``(n, k)`` are zero along directions in which nothing is known, and NaN where that is so in all; `known`
-    ``(n, k)`` are the others, along the axes of the redundancy. `squares` ``(n,)`` are w squared, of `rank` ``(n,)``
-    degrees of freedom.
+    `misfits` ``(n, k)`` are zero in unknown directions, and NaN if all directions are unknown. `known` ``(n, k)`` marks
+    known directions, along the axes of the redundancy. `squares` ``(n,)`` are w squared, with `rank` ``(n,)`` degrees
+    of freedom.
     """
 
     misfits: Array
@@ -43,17 +43,17 @@ class PartsLeftOut(NamedTuple):
 
     @property
     def whole(self) -> Array:
-        """The misfits, NaN where they are not known in all directions."""
+        """The misfits, NaN unless they are known in all directions."""
         return np.where(self.known.all(axis=1, keepdims=True), self.misfits, np.nan)
 
 
 def left_out(redundancy: Array, misfits: Array, *, known: float, testable: float | None = None) -> PartsLeftOut:
-    """Return parts with blocks ``(n, k, k)`` of the redundancy matrix, and misfits ``(n, k)``, as if left out.
+    """Leave out parts with the blocks ``(n, k, k)`` of the redundancy matrix and the misfits ``(n, k)``.
 
     Parameters
     ----------
     known, testable : float
-        Least redundancy of a direction in which something is known, and in which it is tested; the same by default.
+        Smallest redundancy of a known direction, and of a tested one; equal by default.
     """
     shares, axes = np.linalg.eigh(redundancy)
     turned = np.einsum("nij,ni->nj", axes, misfits)
@@ -67,23 +67,23 @@ def left_out(redundancy: Array, misfits: Array, *, known: float, testable: float
 def squared_distances(residuals: Array, covariance: Array) -> Array:
     r"""Return :math:`r^T C^{-1} r` ``(n,)`` of residuals ``(n, k)`` and their covariances ``(n, k, k)``.
 
-    Under the normal distribution they follow chi-squared of k degrees of freedom.
+    For normally distributed residuals they follow chi-squared with k degrees of freedom.
     """
     return np.asarray(np.einsum("ni,ni->n", residuals, np.linalg.solve(covariance, residuals[:, :, None])[:, :, 0]))
 
 
 def chance_of(squares: ArrayLike, size: ArrayLike, freedom: ArrayLike) -> Array:
-    """Return the chance of squared distances of `size` degrees of freedom beyond these, in units of a variance.
+    """Return the chance of larger squared distances of `size` degrees of freedom, in units of a variance.
 
-    That variance was estimated with `freedom` degrees (Fisher's distribution).
+    The variance was estimated with `freedom` degrees (Fisher's distribution).
     """
-    from scipy.special import fdtrc  # scipy.stats would take most of the start-up of a command
+    from scipy.special import fdtrc  # importing scipy.stats would take most of a command's start-up
 
     return np.asarray(fdtrc(size, freedom, np.asarray(squares) / size))
 
 
 def rms(sizes: Array) -> float:
-    """Return the root mean square of sizes ``(n,)``; what is not finite is left out, and 0 stands for none."""
+    """Return the root mean square of the finite values of sizes ``(n,)``; 0 if there are none."""
     known = sizes[np.isfinite(sizes)]
     return float(np.sqrt((known**2).mean())) if len(known) else 0.0
 
@@ -91,16 +91,16 @@ def rms(sizes: Array) -> float:
 def effective_parameters(count: int, fictitious: Iterable[tuple[Array, Array]]) -> float:
     """Return how many of `count` parameters true observations determine: the trace of their hat matrix.
 
-    `fictitious` are rows ``(k, p)`` of other observations over their sigmas (a regularisation, soft constraints, what
-    holds a datum) and the cofactors ``(p, p)`` of their parameters: what these determine is not unknown.
+    `fictitious` are rows ``(k, p)`` of other observations over their sigmas (regularisation, soft constraints, datum),
+    with the cofactors ``(p, p)`` of their parameters.
     """
     return count - sum(float(((rows @ cofactors) * rows).sum()) for rows, cofactors in fictitious)
 
 
 def unit_weight(square: float, freedom: float, least: float) -> float | None:
-    """Return the standard error of unit weight of a sum of squares; None for no more than `least` degrees of freedom.
+    """Return the standard error of unit weight of a sum of squares; None unless `freedom` is above `least`.
 
-    These are a fraction where some observations are fictitious.
+    `freedom` need not be an integer if some observations are fictitious.
     """
     return math.sqrt(square / freedom) if freedom > least else None
 
@@ -112,7 +112,7 @@ def basis_of(columns: Array) -> Array:
 
 
 def correlation_of(covariance: Array) -> Array:
-    """Return the correlation matrix ``(P, P)`` of a covariance matrix; NaN for what has no variance."""
+    """Return the correlation matrix ``(P, P)`` of a covariance matrix; NaN for parameters without variance."""
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / sigma / sigma[:, None]
@@ -121,13 +121,13 @@ def correlation_of(covariance: Array) -> Array:
 
 
 def total_correlation_of(covariance: Array) -> Array:
-    """Return the multiple correlation ``(P,)`` of each parameter with all others; NaN for what has no variance."""
+    """Return the multiple correlation ``(P,)`` of each parameter with all others; NaN without variance."""
     correlation = correlation_of(covariance)
     if not len(correlation):
         return np.zeros(0)
     if not np.isfinite(correlation).all():
         return np.full(len(correlation), np.nan)
-    # Correlation matrices of poor solutions are singular to working precision: their total correlations are 1.
+    # Correlation matrices of poor solutions are numerically singular: their total correlations are 1.
     values, vectors = np.linalg.eigh(correlation)
     inverse = (vectors**2 / np.maximum(values, 1e-15)) @ np.ones(len(values))
     return np.sqrt(np.clip(1.0 - 1.0 / np.maximum(inverse, 1.0), 0.0, 1.0))
@@ -136,11 +136,11 @@ def total_correlation_of(covariance: Array) -> Array:
 def student_of(values: Array, covariance: Array, degrees_of_freedom: float) -> tuple[Array, Array]:
     """Return t and two-sided p ``(P,)`` of the hypotheses that parameters are zero.
 
-    Without redundancy (0 degrees of freedom) the covariance is a priori, and the normal distribution is taken.
+    Without redundancy (0 degrees of freedom) the covariance is a priori, and the normal distribution is used.
     """
     if not len(values):
         return np.zeros(0), np.zeros(0)
-    from scipy.special import ndtr, stdtr  # scipy.stats would take most of the start-up of a command
+    from scipy.special import ndtr, stdtr  # importing scipy.stats would take most of a command's start-up
 
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = values / np.sqrt(np.diag(covariance))

@@ -1,7 +1,7 @@
 """All that the host calls: find the plugins, recognise a product, open it.
 
-See `ortho_pipeline.hookspecs` for the other side. Host and GDAL are loaded when they are first asked for: the commands
-that packages add are found without them.
+`ortho_pipeline.hookspecs` is the other side. Host and GDAL are loaded on first use, because the commands of packages
+are found without them.
 """
 
 from __future__ import annotations

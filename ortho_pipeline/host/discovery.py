@@ -22,29 +22,29 @@ from ortho_pipeline.models import KINDS
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import open_dataset
 
-_COPY_IT = "correct what the file says there, or copy it again from the delivery"
+_COPY_IT = "correct this field, or copy the file again from the delivery"
 _COPY_AGAIN = Text(
-    "copy the metadata again from the delivery, or give a sound model (",
+    "copy the metadata again from the delivery, or give another model (",
     Setting("scene.rpc", "FILE"),
     ", ",
     Setting("scene.model", "FILE"),
     ")",
 )
-_TEST_IT = "its author: run ortho_pipeline.testing.check_sensor on this file"
+_TEST_IT = "report it to the author of the plugin; authors: run ortho_pipeline.testing.check_sensor on this file"
 log = logging.getLogger(__name__)
 
 
 class Host:
-    """The plugins that are there, and what they offer.
+    """The registered plugins, and what they offer.
 
     Parameters
     ----------
     plugins : iterable of module
-        Plugins to register besides the installed ones, for scripts and tests.
+        Further plugins, for scripts and tests.
     installed : bool
-        Whether to look for the entry points of installed distributions.
+        Also register the entry points of installed distributions.
     lenient : bool
-        Leave out a plugin that breaks the contract and list it in `broken`, instead of raising.
+        Skip a plugin that breaks the contract and list it in `broken`, instead of raising.
 
     Attributes
     ----------
@@ -52,13 +52,13 @@ class Host:
     models : mapping of str to type
         Model families that plugins registered.
     broken : tuple of Broken
-        Plugins that could not be imported.
+        Skipped plugins.
 
     Raises
     ------
     PluginError
-        If two sensors have one name, a bundled name is taken by another distribution, a hook is misspelt or has
-        the wrong arguments, or a hook returns what it must not.
+        If two sensors have the same name, another distribution uses a bundled name, or a hook is misspelt, has wrong
+        arguments or returns a wrong type.
     """
 
     def __init__(self, plugins: Iterable[ModuleType] = (), *, installed: bool = False, lenient: bool = False) -> None:
@@ -73,11 +73,11 @@ class Host:
 
     @classmethod
     def discover(cls) -> Host:
-        """Return the host of the installed plugins; they are looked for once per process."""
+        """Return the host of the installed plugins, which are searched once per process."""
         return _discovered()
 
     def provenance(self, sensor: str) -> Origin:
-        """Return the plugin, distribution and version that a sensor or model family comes from.
+        """Return plugin, distribution and version of a sensor or model family.
 
         Raises
         ------
@@ -89,17 +89,17 @@ class Host:
         return self._registry.origin[self._registry.owner[sensor]]
 
     def plugins(self) -> tuple[Origin, ...]:
-        """Return the provenance of every plugin that is registered."""
+        """Return the origins of all registered plugins."""
         return tuple(self._registry.origin.values())
 
     @property
     def broken(self) -> tuple[Broken, ...]:
-        """Plugins that were left out, and why."""
+        """Skipped plugins, with reasons."""
         return self._registry.broken
 
     @functools.cached_property
     def formats(self) -> Mapping[str, Format]:
-        """The formats that models are written in, by name: those of the host, then those of plugins."""
+        """File formats for models by name: those of the host, then those of plugins."""
         return {**FORMATS, **self._registry.formats()}
 
     def open_image(
@@ -110,55 +110,55 @@ class Host:
         allow_network: bool = False,
         roots: Sequence[str | PathLike[str]] = (),
     ) -> Any:
-        """Return the dataset of an image; of a link, beside which nothing of its product lies, that of its target."""
+        """Return the dataset of an image; for a symbolic link without its product's files, that of the target."""
         dataset = open_dataset(path, allow_network=allow_network, roots=roots)
         if not Path(path).is_symlink():
             return dataset
         target = open_dataset(os.path.realpath(path), allow_network=allow_network, roots=roots)
-        # A sensor that knows the product goes before a fallback, at the link and at its target.
+        # A sensor that knows the product has priority over a fallback, both at the link and at its target.
         for fallback in (False, True):
-            asked = [
+            candidates = [
                 item for item in self.sensors.values() if sensor in (None, item.name) and item.fallback == fallback
             ]
-            for found in (dataset, target):
-                if any(self._recognises(item, found) for item in asked):
-                    return found
+            for candidate in (dataset, target):
+                if any(self._recognises(item, candidate) for item in candidates):
+                    return candidate
         return dataset
 
     def recognise(self, dataset: Any, sensor: str | None = None, options: Iterable[str] = ()) -> Sensor:
-        """Return the sensor that `dataset` belongs to.
+        """Return the sensor of `dataset`.
 
         Parameters
         ----------
         dataset : gdal.Dataset
         sensor : str, optional
-            Take this one without asking.
+            Use this sensor, whether it recognises the dataset or not.
         options : iterable of str
-            Names of the options that the user gave: the fallback sensor that alone declares them is taken for a
-            dataset that nobody recognises.
+            Names of the options of the user. If no sensor recognises the dataset, the only fallback sensor that
+            declares them is used.
 
         Raises
         ------
         InputError
             If there is no such sensor, or none or several recognise the dataset.
         PluginError
-            If a plugin failed while looking at it.
+            If a plugin failed to check the dataset.
         """
         if sensor is not None:
             if sensor not in self.sensors:
                 raise _unknown_sensor(sensor, self.sensors)
             return self.sensors[sensor]
-        asked = set(options)
+        names = set(options)
         special = [item for item in self.sensors.values() if not item.fallback]
         general = [item for item in self.sensors.values() if item.fallback]
-        found = (
+        candidates = (
             [item for item in special if self._recognises(item, dataset)]
             or [item for item in general if self._recognises(item, dataset)]
-            or [item for item in general if asked and asked <= set(item.options)]
+            or [item for item in general if names and names <= set(item.options)]
         )
-        if len(found) == 1:
-            return found[0]
-        raise _not_one(found, self.sensors.values(), dataset)
+        if len(candidates) == 1:
+            return candidates[0]
+        raise _not_one(candidates, self.sensors.values(), dataset)
 
     def open_scene(
         self,
@@ -178,7 +178,7 @@ class Host:
             if name not in chosen.options:
                 declared = ", ".join(chosen.options) or "none"
                 raise InputError(
-                    f"the sensor {chosen.name!r} has no option {name!r} (its options: {declared})",
+                    f"the sensor {chosen.name!r} has no option {name!r}; its options: {declared}",
                     file=path,
                     field=name,
                     remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
@@ -192,11 +192,14 @@ class Host:
             raise
         except (Exception, SystemExit) as error:
             text = described(error, chosen.open_scene)
-            raise PluginError(f"{self._name(chosen)} failed to open it ({text})", file=path) from error
+            raise PluginError(f"{self._name(chosen)} could not open it ({text})", file=path) from error
         if fault and self.provenance(chosen.name).bundled:
-            # The plugins that come along keep the contract with sound files: it is the file that is damaged.
+            # Bundled plugins keep the contract for valid files, so the file is damaged.
             raise InputError(
-                f"this is not a possible {fault}", file=scene.model_source, field="model", remedy=_COPY_AGAIN
+                f"the metadata give an impossible geometry: {fault}",
+                file=scene.model_source,
+                field="model",
+                remedy=_COPY_AGAIN,
             )
         if fault:
             raise PluginError(f"{self._name(chosen)}: {fault}", file=path, field="scene", remedy=_TEST_IT)
@@ -208,11 +211,9 @@ class Host:
             return bool(sensor.recognises(dataset))
         except (Exception, SystemExit) as error:
             raise PluginError(
-                f"{self._name(sensor)} failed while looking at the dataset ({described(error, sensor.recognises)})",
+                f"{self._name(sensor)} failed to check this dataset ({described(error, sensor.recognises)})",
                 file=dataset.GetDescription(),
-                remedy=Text(
-                    "choose the sensor yourself with ", Setting("scene.sensor", "NAME"), ", or uninstall that plugin"
-                ),
+                remedy=Text("choose a sensor with ", Setting("scene.sensor", "NAME"), ", or uninstall this plugin"),
             ) from error
 
     def _name(self, sensor: Sensor) -> str:
@@ -234,23 +235,24 @@ def open_scene(
     ----------
     path : path
         The image file.
-    sensor : str, optional
-        Name of the sensor, where it is not to be found out.
-    options : mapping, optional
-        Options of the sensor; only those that it declares are taken.
+    sensor, options : str, mapping, optional
+        Name of the sensor, instead of automatic recognition, and its options.
     allow_network : bool
-        Whether URLs and GDAL's network file systems may be opened.
+        Allow URLs and GDAL's network file systems.
     roots : sequence of path
         Folders that an image may refer to, besides its own.
     crop_offset : (float, float), optional
-        Column and row of the first pixel, where the image is a crop and its model is of the whole (`crop`).
+        Column and row of the first pixel, if the image is a crop and its model is for the whole image.
 
     Raises
     ------
     InputError
-        If the file cannot be opened, no sensor or several recognise it, or an option is not the sensor's.
-    PluginError
-        If a plugin broke the contract.
+        If the file cannot be opened, not exactly one sensor recognises it, or an option is unknown.
+
+    Examples
+    --------
+    >>> open_scene("sample_data/scene.tif").sensor
+    'rpc'
     """
     return Host.discover().open_scene(
         path, sensor, options, allow_network=allow_network, roots=roots, crop_offset=crop_offset
@@ -260,7 +262,7 @@ def open_scene(
 @functools.cache
 def _discovered() -> Host:
     host = Host(installed=True)
-    # From now on model files that name one of these families can be read.
+    # Model files of these families can be read from now on.
     KINDS.update(host.models)
     return host
 
@@ -268,33 +270,35 @@ def _discovered() -> Host:
 def _unknown_sensor(name: str, sensors: Iterable[str]) -> InputError:
     names = ", ".join(sensors) or "none"
     return InputError(
-        f"there is no sensor {name!r} (installed: {names})", field="scene.sensor", remedy="see `ortho sensors`"
+        f"unknown sensor {name!r} (installed: {names})",
+        field="scene.sensor",
+        remedy="list sensors with `ortho sensors`",
     )
 
 
-def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> InputError:
+def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> InputError:
     path = dataset.GetDescription()
-    if found:
-        names = ", ".join(item.name for item in found)
+    if candidates:
+        names = ", ".join(item.name for item in candidates)
         return InputError(
-            f"several sensors recognise it: {names}",
+            f"several sensors recognise this image: {names}",
             file=path,
             remedy=Text("choose one with ", Setting("scene.sensor", "NAME")),
         )
     if beside := unread(dataset):
         return InputError(
-            f"{beside.what}, which no sensor opens by itself", file=path, field="scene.sensor", remedy=beside.remedy
+            f"{beside.what}; no sensor opens it automatically", file=path, field="scene.sensor", remedy=beside.remedy
         )
     names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
-    hint = f" (for images in general: {general})" if general else ""
+    hint = f" (general ones: {general})" if general else ""
     return InputError(
-        f"no sensor recognises it (installed: {names})",
+        f"no sensor recognises this image (installed: {names})",
         file=path,
         remedy=Text(
-            "choose one with ",
+            "choose a sensor with ",
             Setting("scene.sensor", "NAME"),
-            f", which says what it needs{hint}, or give the RPC file with ",
+            f"{hint}; its error message then says what is missing. Or give an RPC file with ",
             Setting("scene.rpc", "FILE"),
         ),
     )

@@ -1,7 +1,7 @@
-"""The plugins that are there: where each came from, what its hooks return, and which names are whose.
+"""The registered plugins: their origin, what their hooks return, and who owns each name.
 
-Plugins are found through entry-point groups, the bundled ones included: they have no privileged path, only reserved
-names. Those of commands have a group of their own, because ``ortho --help`` asks them: sensors import NumPy and GDAL.
+All plugins, also the bundled ones, are found through entry-point groups; bundled ones only have reserved names.
+Packages with commands have their own group, because ``ortho --help`` loads them, and sensors import NumPy and GDAL.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a plugin came from: its module, distribution and version."""
+    """Origin of a plugin: its module, distribution and version."""
 
     plugin: str
     module: str
@@ -46,13 +46,13 @@ class Origin:
 
     @property
     def bundled(self) -> bool:
-        """Whether it comes along with the package."""
+        """Whether the plugin belongs to ortho-pipeline."""
         return self.distribution.lower().replace("_", "-").replace(".", "-") == BUNDLED
 
 
 @dataclass(frozen=True)
 class Broken:
-    """A plugin that could not be imported, or that breaks the contract, and why."""
+    """A plugin that could not be imported or breaks the contract, with the reason."""
 
     plugin: str
     distribution: str
@@ -60,29 +60,29 @@ class Broken:
     error: str
 
     def __str__(self) -> str:
-        return f"plugin {self.plugin!r} of {self.distribution} {self.version} is left out: {self.error}"
+        return f"plugin {self.plugin!r} of {self.distribution} {self.version} is skipped: {self.error}"
 
 
 class Registry:
-    """The plugins that are registered, where they came from, which names are whose, and what their hooks return.
+    """The registered plugins, their origins, the owners of names, and what their hooks return.
 
     Parameters
     ----------
     lenient : bool
-        Leave out a plugin that breaks the contract and list it in `broken`, instead of raising.
+        Skip a plugin that breaks the contract and list it in `broken`, instead of raising.
     group : str, optional
-        Entry-point group of the plugins, of the ``GROUPS`` of `specs`; its ``PROJECT_NAME`` without it.
+        Entry-point group, one of ``GROUPS`` of `specs`; default: its ``PROJECT_NAME``.
     reserved : iterable of str
         Names that belong to the host.
     specs : module
-        The hooks, as `ortho_pipeline.hookspecs` has them: a package that has hooks of its own names its module.
+        The hooks: `ortho_pipeline.hookspecs`, or the module of a package that has its own hooks.
 
     Attributes
     ----------
     origin : dict of str to Origin
-        Of every plugin, by its name.
+        Origin of each plugin.
     owner : dict of str to str
-        The plugin that a sensor, a model family, a format, a command or another offer belongs to.
+        Plugin of each sensor, model family, format, command or other offer.
     broken : tuple of Broken
     """
 
@@ -100,28 +100,28 @@ class Registry:
         self.broken: tuple[Broken, ...] = ()
 
     def register_installed(self) -> None:
-        """Register the plugins that installed distributions name as entry points."""
-        known: dict[int, tuple[str, str]] = {}  # each look at a name or a version parses all metadata
+        """Register the plugins that installed distributions declare as entry points."""
+        known: dict[int, tuple[str, str]] = {}  # each access to a name or version parses all metadata
         origins: list[tuple[Origin, metadata.EntryPoint]] = []
         for entry in metadata.entry_points(group=self._group):
             if id(entry.dist) not in known:
-                told = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
-                known[id(entry.dist)] = told["Name"], told["Version"]
+                fields = entry.dist.metadata if entry.dist else {"Name": "(unknown)", "Version": ""}
+                known[id(entry.dist)] = fields["Name"], fields["Version"]
             origins.append((Origin(entry.name, entry.value, *known[id(entry.dist)]), entry))
-        # Bundled ones first: what they offer is theirs.
-        for origin, entry in sorted(origins, key=lambda one: (not one[0].bundled, one[1].name)):
+        # Bundled plugins first: their names are reserved.
+        for origin, entry in sorted(origins, key=lambda pair: (not pair[0].bundled, pair[1].name)):
             if origin.bundled:
                 self._reserved.add(entry.name)
             try:
                 plugin = entry.load()
             except (Exception, SystemExit) as error:
-                # A plugin is somebody else's code: whatever its import does wrong, the others go on.
+                # A plugin is foreign code: whatever fails in its import, continue with the others.
                 self._leave_out(Broken(entry.name, origin.distribution, origin.version, described(error, entry.module)))
                 continue
             self.register(plugin, origin)
 
     def register(self, plugin: Any, origin: Origin) -> None:
-        """Register one plugin, which came from `origin`."""
+        """Register one plugin."""
         name = f"{origin.plugin} ({origin})" if origin.version else origin.plugin
         with self._judged(origin):
             self._refuse_misspelt(plugin, name)
@@ -133,13 +133,13 @@ class Registry:
                 self.origin[registered] = origin
 
     def sensors(self) -> Mapping[str, Sensor]:
-        """Collect the sensors that plugins offer, by name."""
+        """Collect the sensors of all plugins, by name."""
         from ortho_pipeline.host.contract import sensor_faults
 
         return self.named("ortho_sensors", "sensor", Sensor, sensor_faults)
 
     def models(self) -> Mapping[str, type[SensorModel]]:
-        """Collect the model families that plugins offer, by kind."""
+        """Collect the model families of all plugins, by kind."""
         from ortho_pipeline.models import KINDS, SensorModel
 
         families: dict[str, type[SensorModel]] = {}
@@ -151,40 +151,40 @@ class Registry:
                     taken = KINDS.get(name, family)
                     if taken is not family:
                         raise PluginError(
-                            f"plugin {plugin} offers the model family {name!r}, but that name is taken by "
+                            f"plugin {plugin} offers the model family {name!r}, but this name belongs to "
                             f"{taken.__module__}.{taken.__qualname__}",
-                            remedy=f"give {family.__qualname__} another kind; or uninstall that plugin",
+                            remedy=f"give {family.__qualname__} another kind, or uninstall the plugin",
                         )
                     self._claim(plugin, name, "model family")
                     families[name] = family
         return MappingProxyType(families)
 
     def formats(self) -> Mapping[str, Format]:
-        """Collect the formats that plugins add to those of the host, by name; what they write is checked."""
+        """Collect the formats of all plugins, by name; their output is checked."""
         from ortho_pipeline.exchange.export import FORMATS, RESERVED
 
         self._reserved |= RESERVED
-        endings = {one.ending.casefold(): one.name for one in FORMATS.values()}
+        endings = {offer.ending.casefold(): offer.name for offer in FORMATS.values()}
         added = self.named("ortho_formats", "format", Format, lambda offer: _format_faults(offer, endings))
-        return {name: replace(one, write=_checked(one, self.owner[name])) for name, one in added.items()}
+        return {name: replace(offer, write=_checked(offer, self.owner[name])) for name, offer in added.items()}
 
     def commands(self) -> Mapping[str, Subcommand]:
-        """Collect the commands that packages add, by name."""
+        """Collect the commands of all packages, by name."""
         return self.named("ortho_commands", "command", Subcommand, _command_faults)
 
     def named(
         self, hook: str, what: str, kind: type[Any], faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
     ) -> Mapping[str, Any]:
-        """Collect what a hook offers, by name.
+        """Collect the offers of a hook, by name.
 
         Parameters
         ----------
         hook : str
-            It returns an iterable of values of `kind`.
+            Returns an iterable of values of `kind`.
         what : str
-            What people call such a value.
+            Word for such a value in messages.
         faults : callable(offer) -> iterator of str
-            What is wrong with an offer; the first fault is an error of its plugin.
+            Faults of an offer; the first one is an error of its plugin.
         """
         offers: dict[str, Any] = {}
         advice = f"yield the {kind.__name__}, or return [{kind.__name__}(...)]"
@@ -203,7 +203,7 @@ class Registry:
 
     @contextlib.contextmanager
     def _judged(self, origin: Origin) -> Iterator[None]:
-        """Let an error of a plugin pass, or note it and go on."""
+        """Raise an error of a plugin, or skip the plugin and continue."""
         try:
             yield
         except PluginError as error:
@@ -221,8 +221,8 @@ class Registry:
             if callable(getattr(plugin, hook, None)) and self._manager.parse_hookimpl_opts(plugin, hook) is None:
                 marker = "ortho_pipeline.plugin" if self._specs is hookspecs else self._specs.__name__
                 raise PluginError(
-                    f"plugin {name}: {hook} is not marked with @hookimpl",
-                    remedy=f"write @hookimpl of {marker} above it",
+                    f"plugin {name}: {hook} has no decorator @hookimpl",
+                    remedy=f"write @hookimpl (from {marker}) above it",
                 )
         for hook in dir(plugin):
             if hook in hooks or self._manager.parse_hookimpl_opts(plugin, hook) is None:
@@ -230,22 +230,22 @@ class Registry:
             for group, others in self._specs.GROUPS.items():
                 if hook in others:
                     raise PluginError(
-                        f"plugin {name}: {hook} is not called in plugins of the entry-point group {self._group}",
-                        remedy=f"its author: name its module in the group {group}",
+                        f"plugin {name}: {hook} has no effect in the entry-point group {self._group}",
+                        remedy=f"authors: declare its module in the group {group}",
                     )
             meant = difflib.get_close_matches(hook, hooks, 1) or hooks
-            raise PluginError(f"plugin {name}: there is no hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
+            raise PluginError(f"plugin {name}: unknown hook {hook!r}", remedy=f"did you mean {' or '.join(meant)}?")
 
     def _returned(self, hook: str, wanted: type, collect: type, advice: str) -> Iterator[tuple[str, Any]]:
-        # pluggy calls the hook once for each plugin, wrappers around it: so an error can name its plugin.
-        every = getattr(self._manager.hook, hook).get_hookimpls()
-        offering = [one for one in every if not (one.wrapper or one.hookwrapper)]
+        # Call the hook for each plugin separately, with its wrappers, so that an error can name its plugin.
+        implementations = getattr(self._manager.hook, hook).get_hookimpls()
+        offering = [item for item in implementations if not (item.wrapper or item.hookwrapper)]
         for implementation in offering:
             plugin = implementation.plugin_name
-            others = [one.plugin for one in offering if one is not implementation]
+            others = [item.plugin for item in offering if item is not implementation]
             with self._judged(self.origin[plugin]):
                 try:
-                    # pluggy returns no None.
+                    # pluggy drops None.
                     offered = next(iter(self._manager.subset_hook_caller(hook, others)()), None)
                     returned = collect(offered) if isinstance(offered, wanted) else None
                 except (Exception, SystemExit) as error:
@@ -253,60 +253,60 @@ class Registry:
                     raise PluginError(f"plugin {plugin}: {hook} failed ({text})") from error
                 if returned is None:
                     what = type(offered).__name__
-                    raise PluginError(f"plugin {plugin}: {hook} returned {what}", remedy=f"its author: {advice}")
+                    raise PluginError(f"plugin {plugin}: {hook} returned {what}", remedy=f"authors: {advice}")
                 yield plugin, returned
 
     def _claim(self, plugin: str, name: str, what: str) -> None:
         bundled = {key for key, origin in self.origin.items() if origin.bundled}
         if plugin not in bundled and (name in self._reserved or self.owner.get(name) in bundled):
             raise PluginError(
-                f"plugin {plugin} offers the {what} {name!r}, but that name belongs to {BUNDLED}",
-                remedy=f"its author: rename the {what}; its users: uninstall that plugin",
+                f"plugin {plugin} offers the {what} {name!r}, but this name belongs to {BUNDLED}",
+                remedy=f"authors: rename the {what}; users: uninstall the plugin",
             )
         # A sensor and a model family of one plugin may share a name.
         if self.owner.get(name, plugin) != plugin:
             raise PluginError(
                 f"two plugins offer the {what} {name!r}: {self.owner[name]} and {plugin}",
-                remedy=f"an author: rename the {what}; a user: uninstall one of the two",
+                remedy=f"authors: rename the {what}; users: uninstall one of the two",
             )
         self.owner[name] = plugin
 
 
 def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
-    """Yield what is wrong with an offered format; `endings` are those that are taken, with the formats' names."""
+    """Yield the faults of an offered format; `endings` are those in use, with the names of their formats."""
     if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
-        yield f"{offer.name!r} is not a name of a format: lower case, digits and dashes"
+        yield f"{offer.name!r} is not a valid format name; use lower case, digits and dashes"
     elif not isinstance(offer.title, str) or not offer.title.strip():
-        yield f"format {offer.name!r}: its title is empty"
+        yield f"format {offer.name!r}: the title is empty"
     elif not isinstance(offer.ending, str) or not _ENDING.fullmatch(offer.ending):
-        yield f"format {offer.name!r}: its ending {offer.ending!r} is not like '_name.json'"
+        yield f"format {offer.name!r}: the ending must be like '_name.json', not {offer.ending!r}"
     elif not callable(offer.write):
         yield f"format {offer.name!r}: write must be callable"
     elif (other := endings.setdefault(offer.ending.casefold(), offer.name)) != offer.name:
-        yield f"format {offer.name!r}: the files of the format {other!r} end with {offer.ending!r} too"
+        yield f"format {offer.name!r}: the format {other!r} has the same ending {offer.ending!r}"
 
 
 def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
-    """Return the function that writes a plugin's format, whole or not at all; its errors name the plugin."""
+    """Return a function that writes a plugin's format completely or not at all; its errors name the plugin."""
 
     def write(export: Any, path: Path) -> float:
         from ortho_pipeline.files import whole_or_nothing
 
-        said = f"format {offer.name!r} of plugin {plugin}"
+        label = f"format {offer.name!r} of plugin {plugin}"
         with whole_or_nothing(path) as temporary:
             try:
                 worst = offer.write(export, temporary)
             except OrthoError:
                 raise
             except (Exception, SystemExit) as error:
-                raise PluginError(f"{said} failed ({described(error, offer.write)})", file=path) from error
+                raise PluginError(f"{label} failed ({described(error, offer.write)})", file=path) from error
             if not temporary.stat().st_size:
-                raise PluginError(f"{said} wrote nothing", file=path, remedy="its author: write to the path by open()")
+                raise PluginError(f"{label} wrote nothing", file=path, remedy="authors: write to the given path")
             if isinstance(worst, bool) or not isinstance(worst, int | float) or not worst >= 0:
                 raise PluginError(
-                    f"{said}: write returned {worst!r}",
+                    f"{label}: write returned {worst!r}",
                     file=path,
-                    remedy="its author: return the largest distance in pixels between the file and the model",
+                    remedy="authors: return the largest distance between file and model, in pixels",
                 )
         return float(worst)
 
@@ -316,8 +316,8 @@ def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
 def _command_faults(command: Subcommand) -> Iterator[str]:
     texts = (command.name, command.summary, command.target)
     if not all(isinstance(text, str) for text in texts) or not _TYPED.fullmatch(command.name):
-        yield f"{command.name!r} is not a name of a command: lower case, digits and dashes"
+        yield f"{command.name!r} is not a valid command name; use lower case, digits and dashes"
     elif not _TARGET.fullmatch(command.target):
-        yield f"command {command.name!r}: its target {command.target!r} is not 'package.module:name'"
+        yield f"command {command.name!r}: the target must be 'package.module:name', not {command.target!r}"
     elif not command.summary.strip():
-        yield f"command {command.name!r}: its summary is empty"
+        yield f"command {command.name!r}: the summary is empty"

@@ -37,8 +37,8 @@ def ortho_sensors() -> Iterable[Sensor]:
         recognises,
         open_scene,
         options={
-            "camera": "the camera file, where it is not named as the image",
-            "adjust": "an adjustment (.adjust) of a CSM state of a line scanner, applied to it",
+            "camera": "the camera file, if it is not named like the image",
+            "adjust": "an adjustment (.adjust) for the CSM state of a line scanner",
         },
     )
 
@@ -70,7 +70,7 @@ def _kind(path: Path) -> str | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether a camera lies beside an image."""
+    """Return whether there is a camera beside an image."""
     return camera_of(dataset.GetDescription()) is not None
 
 
@@ -81,10 +81,10 @@ def open_scene(dataset: gdal.Dataset, *, camera: str | None = None, adjust: str 
     kind = None if path is None else _kind(path)
     if path is None or kind is None:
         raise InputError(
-            "there is no camera of this kind" + ("" if path is None else " in this file"),
+            "no camera file found for this image" if path is None else "this file has no supported camera",
             file=path or name,
             field="camera",
-            remedy="give the CSM state, .tsai or ASTER camera as camera=FILE",
+            remedy="give a CSM state, .tsai or ASTER camera as sensor option camera=FILE",
         )
     model: SensorModel = (
         read_csm(path) if kind == "csm" else read_tsai(path, size) if kind == "tsai" else read_aster(path)
@@ -94,7 +94,7 @@ def open_scene(dataset: gdal.Dataset, *, camera: str | None = None, adjust: str 
         its = model.interior.width, model.interior.height
     sources, warnings = [], []
     if its != size:
-        text = "the camera is of {} x {} pixels, this image has {} x {}: is it a crop?".format(*its, *size)
+        text = "the camera is for {} x {} pixels, but this image has {} x {}. Is it a crop?".format(*its, *size)
         warnings.append(Notice("maybe-a-crop", text, metadata_size=list(its)))
     if adjust is not None:
         model, sources = adjusted(model, *read_adjust(place(adjust))), [place(adjust)]

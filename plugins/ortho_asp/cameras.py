@@ -63,21 +63,21 @@ def read_tsai(path: PathLike[str], size: tuple[int, int]) -> FrameCamera:
     fields = dict(_FIELD.findall(text))
     lens = next((line.strip() for line in text.splitlines()[2:] if re.fullmatch(r"\s*[A-Za-z]+\s*", line)), "NULL")
     if lens.upper() != "NULL":
-        raise InputError(f"the distortion {lens[:20]} is not read", file=path, field="distortion")
+        raise InputError(f"the distortion {lens[:20]} is not supported", file=path, field="distortion")
 
     def numbers(name: str, count: int, default: str | None = None) -> Array:
         return _numbers(fields.get(name, default or ""), path, name, count)
 
     axes = [numbers(f"{name}_direction", 3, text) for name, text in (("u", "1 0 0"), ("v", "0 1 0"), ("w", "0 0 1"))]
     if not np.array_equal(axes, np.eye(3)):
-        raise InputError("turned axes of the image are not read", file=path, field="u_direction, v_direction")
+        raise InputError("rotated image axes are not supported", file=path, field="u_direction, v_direction")
     fu, fv, cu, cv, pitch = (float(numbers(name, 1)[0]) for name in ("fu", "fv", "cu", "cv", "pitch"))
     turn = numbers("R", 9).reshape(3, 3)
     if not are_rotations(turn[None]) or not (fu > 0 and fv > 0 and pitch > 0):
-        raise InputError("this is not a rotation, or not a camera", file=path, field="R, fu, fv, pitch")
+        raise InputError("R must be a rotation, and fu, fv and pitch positive", file=path, field="R, fu, fv, pitch")
     centre = numbers("C", 3)
     if not 6e6 < np.linalg.norm(centre) < 1e9:
-        raise InputError("this is not a place above the Earth", file=path, field="C")
+        raise InputError("this position is not above the Earth", file=path, field="C")
     # Different focal lengths of the axes are different pitches here; from the first centre to its outer corner.
     pitch_y, (width, height) = pitch * fu / fv, size
     interior = Interior(
@@ -107,15 +107,15 @@ def read_aster(path: PathLike[str]) -> Pushbroom:
     )
     columns = len(points) // max(1, len(places))
     if columns < 3 or len(places) < 4 or not len(points) == len(own) == len(world) == columns * len(places):
-        raise file.error("rows of points, their directions and places do not belong together", ", ".join(names))
+        raise file.error("the numbers of lattice points, directions and positions do not match", ", ".join(names))
     lattice = points.reshape(-1, columns, 2)
     even = (lattice[:, :, 0] == lattice[0, :, 0]).all() and (lattice[:, 0, 1] == lattice[:, :, 1].T).all()
     own, world = (part.reshape(-1, columns, 3) for part in (own, world))
     if not even or not (np.abs(own - own[0]) < 1e-9).all() or not (own[:, :, 2] > 0.1).all():
-        raise file.error("this is not a lattice of one line of detectors", "LATTICE_POINT, SIGHT_VECTOR")
+        raise file.error("this is not the lattice of one line of detectors", "LATTICE_POINT, SIGHT_VECTOR")
     turns = _turns(own[0], world)
     if turns is None:
-        raise file.error("directions in camera and world are not turned into each other", "WORLD_SIGHT_VECTOR")
+        raise file.error("no rotation maps the camera directions to the world directions", "WORLD_SIGHT_VECTOR")
     look = own[0] @ _VENDOR_FROM_CAMERA
     times = (lattice[:, 0, 1] + 0.5) * ASTER_PERIOD
     try:
@@ -140,12 +140,12 @@ def read_adjust(path: PathLike[str]) -> tuple[Array, Array]:
     """Return translation ``(3,)`` and rotation ``(3, 3)`` of an adjustment."""
     values = _numbers(_text(path), path, "numbers", 7)
     if not 0.99 < np.linalg.norm(values[3:]) < 1.01 or not np.abs(values[:3]).max() < 1e6:
-        raise InputError("this is not a translation and a rotation", file=path, field="numbers")
+        raise InputError("this must be a translation and a rotation", file=path, field="numbers")
     return values[:3], rotations_of_quaternions(values[None, 3:])[0]
 
 
 def adjusted(model: SensorModel, translation: Array, rotation: Array) -> SensorModel:
-    """Return a camera moved and turned in space as an adjustment says.
+    """Return a camera after the translation and rotation of an adjustment.
 
     Raises
     ------
@@ -164,14 +164,14 @@ def adjusted(model: SensorModel, translation: Array, rotation: Array) -> SensorM
         origin = rotation @ (model.origin - first) + first + translation
         return replace(model, origin=origin, orbital=rotation @ model.orbital)
     raise InputError(
-        f"an adjustment of a model of kind {model.kind!r} is not read",
+        f"adjustments of a model of kind {model.kind!r} are not supported",
         field="adjust",
-        remedy="give the adjusted camera, which bundle_adjust writes too",
+        remedy="give the adjusted camera that bundle_adjust also writes",
     )
 
 
 def _turns(own: Array, world: Array) -> Array | None:
-    """Return the rotations ``(rows, 3, 3)`` from camera to ECEF that turn directions best; None where none does."""
+    """Return the rotations ``(rows, 3, 3)`` from camera to ECEF that fit the directions best; None if none fits."""
     with np.errstate(all="ignore"):
         left, _, right = np.linalg.svd(np.einsum("rci,cj->rij", world, own))
         signs = np.ones((len(world), 3))
@@ -184,7 +184,7 @@ def _turns(own: Array, world: Array) -> Array | None:
 def _text(path: PathLike[str]) -> str:
     data = read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
-        raise InputError("this file has more than 100 kB, which no camera has", file=path, field="size")
+        raise InputError("this file is larger than 100 kB, too large for a camera", file=path, field="size")
     return decoded(data)
 
 
@@ -197,5 +197,5 @@ def _numbers(text: str, path: PathLike[str], field: str, count: int | None, widt
     except ValueError:
         values = np.array([np.nan])
     if wrong or not np.isfinite(values).all() or not np.abs(values).max(initial=0.0) < 1e15:
-        raise InputError(f"{count or 'rows of'} numbers belong here", file=path, field=field)
+        raise InputError(f"this must be {count or 'rows of'} numbers", file=path, field=field)
     return values if width == 1 else values.reshape(-1, width)

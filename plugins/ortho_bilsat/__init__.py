@@ -37,26 +37,26 @@ def ortho_sensors() -> Iterable[Sensor]:
         recognises,
         open_scene,
         options={
-            "survey": "the imaging survey file, where it is not <image>_survey.txt",
-            "attitude": "survey (default where there is one) or zero: start from equation 5 of the paper",
+            "survey": "the imaging survey file, if it is not <image>_survey.txt",
+            "attitude": "start of the attitude: survey (default if there is one) or zero (equation 5 of the paper)",
         },
         metadata_beside=survey_of,
     )
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether an imaging survey lies beside the image."""
+    """Return whether there is an imaging survey beside the image."""
     try:
         # A dataset in memory has no name: ValueError.
         survey = survey_of(dataset.GetDescription())
-        # A refusal of what is not there looks for names like it among all of its folder.
+        # Check first: the error for a missing file searches the whole folder for similar names.
         return survey.is_file() and read_bounded(survey, len(MARK)).startswith(MARK.encode())
     except (InputError, ValueError):
         return False
 
 
 def survey_of(image: str) -> Path:
-    """Return the path at which the survey of an image is looked for."""
+    """Return the expected path of the survey of an image."""
     path = place(image)
     return path.with_name(f"{path.stem}_survey.txt")
 
@@ -68,19 +68,19 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
     read = read_survey(path)
     if (dataset.RasterXSize, dataset.RasterYSize) != (read.interior.width, read.interior.height):
         raise InputError(
-            f"the survey is for {read.interior.width} x {read.interior.height} pixels, the image has "
+            f"the survey is for {read.interior.width} x {read.interior.height} pixels, but the image has "
             f"{dataset.RasterXSize} x {dataset.RasterYSize}",
             file=path,
             field="columns, rows",
-            remedy="give the whole frame and its own survey",
+            remedy="use the whole frame with its own survey",
         )
     if attitude not in ("survey", "zero"):
-        raise InputError(f"{attitude!r} is not a source of the attitude", field="attitude", remedy="survey or zero")
+        raise InputError(f"{attitude!r} is not a known attitude source", field="attitude", remedy="survey or zero")
     model = rigorous_model(read, use_attitude=attitude == "survey")
     warnings = []
     known = read.attitude is not None and attitude == "survey"
     if not known:
-        text = "the attitude is not known: the model only starts an adjustment to ground control points"
+        text = "the attitude is unknown. The model is only a start: adjust it to ground control points"
         warnings.append(Notice("only-a-start", text))
     elif not model.sees_ground:
         warnings.append(LOOKS_PAST)

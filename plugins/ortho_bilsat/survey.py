@@ -50,7 +50,7 @@ class Survey:
     attitude_sigma: float | None = None
 
 
-@reads("write the survey as docs/formats/bilsat.md has it")
+@reads("write the survey as in docs/formats/bilsat.md")
 def read_survey(path: str | PathLike[str]) -> Survey:
     """Read an imaging survey.
 
@@ -63,18 +63,16 @@ def read_survey(path: str | PathLike[str]) -> Survey:
     texts = {key: fields.pop(key) for key in TEXTS}
     numbers = {key: _numbers(path, key, text) for key, text in fields.items()}
     if texts["camera"] not in CAMERAS:
-        raise InputError(
-            f"there is no camera {texts['camera']!r}", file=path, field="camera", remedy=", ".join(CAMERAS)
-        )
+        raise InputError(f"unknown camera {texts['camera']!r}", file=path, field="camera", remedy=", ".join(CAMERAS))
     _check_time(path, texts["acquired"])
     _check_orbit(path, numbers["position_m"], numbers["velocity_m_s"])
     attitude, heights = numbers.get("attitude_deg"), numbers.get("heights_m", HEIGHTS)
     if not heights[0] < heights[1]:
-        raise InputError("the lower height comes first", file=path, field="heights_m")
+        raise InputError("the lower height must come first", file=path, field="heights_m")
     sigmas = {key: numbers.get(key, (None,))[0] for key in ("position_sigma_m", "attitude_sigma_deg")}
     for key, sigma in sigmas.items():
         if sigma is not None and not sigma > 0:
-            raise InputError("a standard deviation is positive", file=path, field=key)
+            raise InputError("standard deviations must be positive", file=path, field=key)
     turn = sigmas["attitude_sigma_deg"]
     return Survey(
         **texts,
@@ -109,7 +107,7 @@ def _fields(path: str | PathLike[str]) -> dict[str, str]:
     lines = _text(path).splitlines()
     if not lines or lines[0].strip() != MARK:
         raise InputError(
-            "this is not an imaging survey", file=path, field="line 1", remedy=f"its first line is {MARK!r}"
+            "this file is not an imaging survey", file=path, field="line 1", remedy=f"the first line must be {MARK!r}"
         )
     fields: dict[str, str] = {}
     ended = False
@@ -118,15 +116,15 @@ def _fields(path: str | PathLike[str]) -> dict[str, str]:
         if not plain:
             continue
         if ended:
-            raise InputError("there is something after END", file=path, field=f"line {number}")
+            raise InputError("there is text after END", file=path, field=f"line {number}")
         if plain == "END":
             ended = True
             continue
         key, sign, value = (part.strip() for part in plain.partition("="))
         if not sign or (key not in NUMBERS and key not in TEXTS):
-            raise InputError(f"{key[:60]!r} is not a key of a survey", file=path, field=f"line {number}")
+            raise InputError(f"{key[:60]!r} is not a known key", file=path, field=f"line {number}")
         if key in fields:
-            raise InputError("this key stands twice", file=path, field=key)
+            raise InputError("this key appears twice", file=path, field=key)
         fields[key] = value
     if not ended:
         raise InputError("the file is cut off: END is missing", file=path)
@@ -139,18 +137,18 @@ def _fields(path: str | PathLike[str]) -> dict[str, str]:
 def _text(path: str | PathLike[str]) -> str:
     data = read_bounded(path, MAX_BYTES, field="survey", remedy="give the option survey")
     if len(data) > MAX_BYTES:
-        raise InputError(f"a survey of more than {MAX_BYTES} bytes is not read", file=path)
+        raise InputError(f"this survey is larger than the limit of {MAX_BYTES} bytes", file=path)
     try:
         return data.decode("ascii")
     except ValueError as error:
-        raise InputError("a survey is plain ASCII text", file=path) from error
+        raise InputError("a survey must be plain ASCII text", file=path) from error
 
 
 def _numbers(path: str | PathLike[str], key: str, text: str) -> tuple[float, ...]:
     # float() also reads inf, nan, 1_000 and digits of other scripts.
     parts = text.split()
     if not all(re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", part) for part in parts):
-        raise InputError(f"{text[:60]!r} is not made of numbers", file=path, field=key)
+        raise InputError(f"{text[:60]!r} is not a list of numbers", file=path, field=key)
     values = tuple(float(part) for part in parts)
     if len(values) != NUMBERS[key] or not all(abs(value) < 1e12 for value in values):
         raise InputError(f"{text[:60]!r}: not {counted(NUMBERS[key], 'number')} in range", file=path, field=key)
@@ -170,12 +168,16 @@ def _check_time(path: str | PathLike[str], text: str) -> None:
 
 def _check_orbit(path: str | PathLike[str], position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
     if not 6.5e6 < math.hypot(*position) < 5e7:
-        raise InputError("no satellite is there", file=path, field="position_m", remedy="ECEF in metres")
+        raise InputError(
+            "this is not a possible satellite position", file=path, field="position_m", remedy="ECEF in metres"
+        )
     if not 1e3 < math.hypot(*velocity) < 1.2e4:
-        raise InputError("no satellite is so fast or slow", file=path, field="velocity_m_s", remedy="ECEF in m/s")
+        raise InputError(
+            "this is not a possible satellite speed", file=path, field="velocity_m_s", remedy="ECEF in m/s"
+        )
     cosine = sum(p * v for p, v in zip(position, velocity, strict=True)) / math.hypot(*position) / math.hypot(*velocity)
     if abs(cosine) > 0.5:
-        raise InputError("this velocity goes up or down", file=path, field="velocity_m_s")
+        raise InputError("this velocity is not horizontal", file=path, field="velocity_m_s")
 
 
 def _interior(path: str | PathLike[str], numbers: dict[str, tuple[float, ...]]) -> Interior:
@@ -186,7 +188,7 @@ def _interior(path: str | PathLike[str], numbers: dict[str, tuple[float, ...]]) 
             raise InputError(f"{value} is not a number of pixels", file=path, field=key)
     for key, value in (("focal_length_mm", focal), ("pixel_pitch_um", pitch)):
         if not 1e-6 < value < 1e6:
-            raise InputError(f"{value} is not possible", file=path, field=key)
+            raise InputError(f"{value} is out of range", file=path, field=key)
     return Interior(int(columns), int(rows), focal * 1e-3, pitch * 1e-6, pitch * 1e-6)
 
 

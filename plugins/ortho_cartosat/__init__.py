@@ -1,4 +1,4 @@
-"""Sensor plugin for CARTOSAT-1 Ortho Kit images: RPC, and a pushbroom from what the metadata tells (cartosat.md)."""
+"""Sensor plugin for CARTOSAT-1 Ortho Kit images: RPC, and a pushbroom from the metadata (cartosat.md)."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from ortho_pipeline.plugin import (
     rpc_of_fields,
 )
 
-#: Ground for which the pushbroom is meant where no RPC tells it.
+#: Height range (m) of the pushbroom without an RPC.
 HEIGHTS = (-500.0, 9000.0)
-#: The RPC that GDAL finds and the one used here are called different beyond this (px).
+#: RPCs of GDAL and of this plugin that differ by more than this (px) give a warning.
 DISAGREEMENT = 1.0
 FACTS = {
     "product_id": "ProductID",
@@ -54,11 +54,11 @@ def ortho_sensors() -> Iterable[Sensor]:
         recognises,
         open_scene,
         options={
-            "rpc": "which RPC to use: tag, sidecar, or an RPC file; by itself the first readable one of the delivery",
-            "rpc_origin": "line and sample that the RPC gives to the centre of the first pixel: 0 (default) or 1",
-            "view": "fore or aft, where neither name nor metadata say it",
+            "rpc": "which RPC to use: tag, sidecar, or an RPC file; default: the first readable one of the delivery",
+            "rpc_origin": "line and sample of the first pixel's centre in the RPC: 0 (default) or 1",
+            "view": "fore or aft, if neither file name nor metadata say it",
             **{
-                option: f"soft constraint of the pushbroom: sigma of the {what}, or none; by itself"
+                option: f"soft constraint of the pushbroom: sigma of the {what}, or none; default:"
                 f" {soft_facts(DEFAULT)[option]:g}"
                 for option, (_, _, what) in SOFT.items()
             },
@@ -67,7 +67,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether the metadata of a CARTOSAT-1 image lie beside this one."""
+    """Return whether there are CARTOSAT-1 metadata beside this image."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and read_metadata(path).is_cartosat1
@@ -94,7 +94,7 @@ def open_scene(
         raise InputError("there is no metadata beside this image", file=name, remedy=f"add {Path(name).stem}_MET.TXT")
     if rpc_origin not in ("0", "1") or view not in (None, "fore", "aft"):
         field, allowed = ("rpc_origin", "0 or 1") if rpc_origin not in ("0", "1") else ("view", "fore or aft")
-        raise InputError("there is no such choice", field=field, remedy=f"give {allowed}")
+        raise InputError(f"unknown value for {field}", field=field, remedy=f"give {allowed}")
     sigmas = soft_sigmas(
         {
             "sigma_plane_m": sigma_plane_m,
@@ -114,12 +114,14 @@ def open_scene(
     except InputError as error:
         if not models:
             raise
-        warnings.append(Notice("no-pushbroom", f"there is no pushbroom model: {error.message}"))
+        warnings.append(Notice("no-pushbroom", f"no pushbroom model, only the RPC: {error.message}"))
     if metadata.size not in (None, size):
-        text = "the metadata is for {} x {} pixels, this image has {} x {}: is it a crop?".format(*metadata.size, *size)
+        text = "the metadata are for {} x {} pixels, but this image has {} x {}. Is it a crop?".format(
+            *metadata.size, *size
+        )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=metadata.size))
     if found is None:
-        text = "there is no readable RPC: the model only starts an adjustment to at least nine control points"
+        text = "there is no readable RPC. The model is only a start: adjust it to at least nine control points"
         warnings.append(Notice("only-a-start", text))
     facts = _facts(name, metadata, warnings) | ({} if found is None else {"rpc_origin": int(rpc_origin)})
     facts = {"view": view} | facts if view else facts
@@ -129,7 +131,7 @@ def open_scene(
 
 
 def _facts(name: str, metadata: Metadata, warnings: list[Notice]) -> dict[str, object]:
-    """Return what the metadata tell people; what is damaged there is no reason to refuse the image."""
+    """Return facts of the metadata; damaged ones give a warning, not an error."""
     partner = partner_of(name, metadata)
     facts: dict[str, object] = {"partner": None if partner is None else str(partner), "acquired": metadata.acquired}
     for fact, key in {**FACTS, **NUMBERS}.items():
@@ -156,15 +158,15 @@ def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | 
 
 
 def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[Notice]:
-    """Return a warning where GDAL's own readers took another RPC than this plugin."""
+    """Return a warning if GDAL reads another RPC than this plugin."""
     try:
         other = rpc_of_fields(dataset.GetMetadata("RPC") or {})
     except (InputError, RuntimeError):
-        # None, or an encrypted file, which GDAL takes for a damaged one.
+        # There is none, or the file is encrypted.
         return []
     centre = np.array([[found.lon_off, found.lat_off, found.h_off]])
     apart = float(np.abs(other.ground_to_image(centre) - found.ground_to_image(centre)).max())
     if apart <= DISAGREEMENT:
         return []
-    text = f"GDAL reads another RPC for this image than {Path(source).name}; they differ by {apart:.1f} px"
+    text = f"this image uses the RPC in {Path(source).name}; GDAL reads another one, which differs by {apart:.1f} px"
     return [Notice("rpcs-differ", text, difference_px=apart)]

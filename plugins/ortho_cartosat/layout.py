@@ -21,16 +21,16 @@ from pathlib import Path
 from ortho_cartosat.metadata import Metadata, read_metadata
 from ortho_pipeline.plugin import RPC, InputError, Notice, place, read_rpc_text
 
-#: Where the name of an image says which of the two it is.
+#: Image names that show which of the two images it is.
 _SIDE = re.compile(r"(.*(?:band|_|-))([af])", re.IGNORECASE)
 _OTHER = {"a": "f", "f": "a", "A": "F", "F": "A"}
 _VIEW = {"a": "aft", "f": "fore"}
-#: No delivery has more folders beside its own; a shared disk does.
+#: Limit on sibling folders: no delivery has more, but a shared disk may.
 MAX_FOLDERS = 200
 
 
 def beside(image: str | PathLike[str], before: str, after: str) -> Path | None:
-    """Return the file ``<before><stem><after>`` beside an image, in one of the usual cases; None without it."""
+    """Return the file ``<before><stem><after>`` beside an image, in the usual cases of letters; None without it."""
     path = place(image)
     for stem in dict.fromkeys((path.stem, path.stem.upper(), path.stem.lower())):
         head, tail = before + stem, after.removesuffix("TXT")
@@ -49,7 +49,7 @@ def metadata_of(image: str | PathLike[str]) -> Path | None:
 
 
 def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[Notice]]:
-    """Return the first RPC beside an image that can be read, its file, and what was wrong with those before it."""
+    """Return the first readable RPC beside an image, its file, and warnings about unreadable ones."""
     warnings: list[Notice] = []
     for before, after in (("", "_RPC_ORG.TXT"), ("DECRYPTED_", "_RPC.TXT"), ("", "_RPC.TXT")):
         path = beside(image, before, after)
@@ -59,13 +59,13 @@ def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[No
             return read_rpc_text(path), path, warnings
         except InputError as error:
             what = error.message if error.field is None else f"{error.field}: {error.message}"
-            text = f"{path.name} is not used, it may be encrypted or damaged ({what})"
+            text = f"{path.name} cannot be read; it may be encrypted or damaged ({what})"
             warnings.append(Notice("rpc-not-used", text, file=path.name))
     return None, None, warnings
 
 
 def view_of(image: str | PathLike[str], metadata: Metadata) -> str | None:
-    """Return 'fore' or 'aft' by the name of the image, or else by its metadata; None where neither says.
+    """Return 'fore' or 'aft' from the file name, or else from the metadata; None if neither states it.
 
     Raises
     ------
@@ -76,10 +76,10 @@ def view_of(image: str | PathLike[str], metadata: Metadata) -> str | None:
     by_name, by_text = None if named is None else _VIEW[named[2].lower()], metadata.view
     if by_name and by_text and by_name != by_text:
         raise InputError(
-            f"the name of the image says {by_name}, the metadata {by_text}",
+            f"this is the {by_name} image by its file name, but the {by_text} image by its metadata",
             file=metadata.path,
             field="Sensor",
-            remedy="put the files of each image together again, or say which one it is with the option view",
+            remedy="keep the files of each image together, or state fore or aft with the sensor option view",
         )
     return by_text or by_name
 
@@ -87,7 +87,7 @@ def view_of(image: str | PathLike[str], metadata: Metadata) -> str | None:
 def partner_of(image: str | PathLike[str], metadata: Metadata) -> Path | None:
     """Return the other image of the stereo pair: beside this one, or in a folder beside its own.
 
-    None without it, and where several folders have one: which of them is meant cannot be told.
+    None without it, and if several folders have one.
     """
     path = place(image)
     named = _SIDE.fullmatch(path.stem)
@@ -104,7 +104,7 @@ def partner_of(image: str | PathLike[str], metadata: Metadata) -> Path | None:
 
 
 def _is_partner(candidate: Path, metadata: Metadata) -> bool:
-    """Tell whether an image is of the same pass and the other camera, as far as the two metadata files say."""
+    """Return whether an image is from the same pass and the other camera, according to both metadata files."""
     path = metadata_of(candidate) if candidate.is_file() else None
     if path is None:
         return False

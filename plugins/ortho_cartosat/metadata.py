@@ -1,7 +1,7 @@
 """The `_MET.TXT` of a CARTOSAT-1 product: ``key = value`` lines (docs/formats/cartosat.md), read with tolerance.
 
-Blanks are irregular, cases vary, ``-NA-`` stands for what is not known, and lines without an assignment are titles. A
-key is only judged when somebody asks for it: then a value that is none is an error that names file and key.
+Blanks are irregular, cases vary, ``-NA-`` means unknown, and lines without an assignment are titles. A key is only
+checked when it is read; an invalid value is an error that names file and key.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Metadata:
             values = {value for value in self.fields.get(key.lower(), ()) if value.upper() not in MISSING}
             if len(values) > 1:
                 raise InputError(
-                    "this key stands there twice, with two values", file=self.path, field=key, remedy=_REMEDY
+                    "this key appears twice, with different values", file=self.path, field=key, remedy=_REMEDY
                 )
             if values:
                 return values.pop()
@@ -77,7 +77,7 @@ class Metadata:
             raise InputError(f"{token[:60]!r} is not a number", file=self.path, field=key, remedy=_REMEDY)
         value = float(token)
         if not low <= value <= high or not math.isfinite(value):
-            raise InputError(f"{token[:60]} is not possible", file=self.path, field=key, remedy=f"{low:g} to {high:g}")
+            raise InputError(f"{token[:60]} is out of range", file=self.path, field=key, remedy=f"{low:g} to {high:g}")
         return value
 
     @property
@@ -88,7 +88,7 @@ class Metadata:
 
     @property
     def view(self) -> str | None:
-        """'fore' or 'aft', from the sensor's name or its angle along the track; None where neither says."""
+        """'fore' or 'aft', from the sensor's name or its angle along the track; None if neither states it."""
         sensor = re.sub(r"[\W_]", "", (self.text("Sensor", "BandNumbers") or "").upper())
         for name, view in (("FORE", "fore"), ("AFT", "aft"), ("PANF", "fore"), ("PANA", "aft")):
             if name in sensor:
@@ -132,12 +132,12 @@ class Metadata:
                 missing = next(
                     f"{prefix}{name}" for name, corner in zip(CORNERS, corners, strict=True) if None in corner
                 )
-                raise InputError("this corner is not whole", file=self.path, field=missing, remedy=_REMEDY)
+                raise InputError("this corner is incomplete", file=self.path, field=missing, remedy=_REMEDY)
         return None
 
     @property
     def acquired(self) -> str | None:
-        """Time of the middle of the scene, as ISO 8601 in UTC where it can be understood, or as it stands."""
+        """Time of the middle of the scene, as ISO 8601 in UTC if it can be parsed, otherwise unchanged."""
         text = self.text("SceneCenterTime", "SceneCentreTime", "DateOfPass")
         if text is None:
             return None
@@ -164,12 +164,12 @@ def read_metadata(path: str | PathLike[str]) -> Metadata:
     path = place(path)
     data = read_bounded(path, MAX_BYTES)
     if len(data) > MAX_BYTES or b"\0" in data:
-        raise InputError("this is not metadata: too large, or no text", file=path)
+        raise InputError("this is not a metadata file: it is too large, or not text", file=path)
     fields: dict[str, tuple[str, ...]] = {}
     for line in decoded(data).splitlines():
         key, sign, value = (part.strip() for part in line[:2000].partition("="))
         if sign and key:
             fields[key.lower()] = (*fields.get(key.lower(), ()), value.strip("\"'").strip())
     if not fields:
-        raise InputError("there is no 'key = value' in this file", file=path)
+        raise InputError("this file has no line 'key = value'", file=path)
     return Metadata(path, fields)

@@ -29,12 +29,12 @@ NONE = "none"
 
 
 def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
-    """Return the sigmas that the options of the sensor ask for, each a positive number or ``none``.
+    """Return the sigmas of the sensor options, each a positive number or ``none``.
 
     Raises
     ------
     InputError
-        If one is neither.
+        If a value is neither.
     """
     sigmas = asdict(DEFAULT)
     for option, text in given.items():
@@ -53,7 +53,7 @@ def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
 
 
 def soft_facts(sigmas: SoftSigmas) -> dict[str, float | None]:
-    """Return the sigmas by the names and in the units of the options; None where a constraint is left out."""
+    """Return the sigmas by name and in the units of the options; None without a constraint."""
     values = asdict(sigmas)
     return {
         option: None if values[name] is None else float(f"{values[name] / unit:.12g}")
@@ -80,8 +80,8 @@ def pushbroom(
     corners, altitude = metadata.corners, metadata.altitude
     if corners is None or altitude is None or view is None:
         field = "ImageULLat" if corners is None else "SatelliteAltitude" if altitude is None else "Sensor"
-        raise InputError("the metadata do not tell this", file=metadata.path, field=field)
-    # The images are 12000 columns; one that is not was reduced (or cut), and then its own swath tells the scale.
+        raise InputError("the metadata do not state this", file=metadata.path, field=field)
+    # Images have 12000 columns. If not, the image was reduced or cut, and its swath gives the scale.
     nominal = size[0] == COLUMNS
     middle = np.full((4, 1), min(max(0.0, heights[0]), heights[1]))
     return pushbroom_of_metadata(

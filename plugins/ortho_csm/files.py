@@ -42,7 +42,7 @@ CLOSE = 0.1
 
 
 def has_csm(path: str | PathLike[str]) -> bool:
-    """Tell whether a file is a CSM state, from its first line."""
+    """Return whether a file is a CSM state, from its first line."""
     try:
         return read_bounded(path, 200)[:200].lstrip().startswith(tuple(name.encode() for name in _NAMES))
     except InputError:
@@ -61,18 +61,21 @@ def read_csm(path: str | PathLike[str]) -> SensorModel:
     data = read_bounded(path, MAX_SIZE)
     if len(data) > MAX_SIZE:
         raise InputError(
-            f"a state of more than {MAX_SIZE // 1_000_000} MB is not read", file=path, field="size", remedy=REMEDY
+            f"this CSM state is larger than the limit of {MAX_SIZE // 1_000_000} MB",
+            file=path,
+            field="size",
+            remedy=REMEDY,
         )
     name, _, body = data.partition(b"\n")
     if name.strip() not in [one.encode() for one in _NAMES]:
         raise InputError(
-            f"this is not a CSM state of a line scanner or a frame: it begins with {name[:40]!r}",
+            f"this is not the CSM state of a line scanner or a frame; it begins with {name[:40]!r}",
             file=path,
             remedy=REMEDY,
         )
     fields = parse_json(body, path, REMEDY)
     if not isinstance(fields, dict):
-        raise InputError("a state is a JSON object", file=path, remedy=REMEDY)
+        raise InputError("a CSM state must be a JSON object", file=path, remedy=REMEDY)
     state = StateFields(fields, path)
     state.require_earth()
     try:
@@ -100,10 +103,10 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
         again, size = read_frame(StateFields(fields, "state")), (model.interior.width, model.interior.height)
     else:
         raise InputError(
-            f"a model of kind {model.kind!r} has no CSM state: line scanners and frames have one",
+            f"a CSM state can only be written for line scanners and frames, not for a model of kind {model.kind!r}",
             field="formats",
             remedy=Text(
-                "take a rigorous model, adjusted by its own parameters (",
+                "use a rigorous model, adjusted by its own parameters (",
                 Setting("points.correction", "model"),
                 "), or another format",
             ),
@@ -113,9 +116,9 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
     worst = max(middle, _apart(model, again, size, model.height_range))
     if not middle <= CLOSE and not force:
         raise InputError(
-            f"the state would be {middle:.2g} px off the model, whose lens it cannot have",
+            f"a CSM state cannot represent the lens of this model; the error would be {middle:.2g} px",
             field="formats",
-            remedy=Text("accept it with ", Setting("force"), ", or write an RPC"),
+            remedy=Text("accept this error with ", Setting("force"), ", or write an RPC"),
         )
     return f"{name}\n{json.dumps({'m_modelName': name, **fields}, indent=2, sort_keys=True)}\n", worst
 
@@ -128,7 +131,7 @@ def write_csm(model: SensorModel, path: str | PathLike[str], *, force: bool = Fa
 
 
 def _apart(model: SensorModel, again: SensorModel, size: tuple[int, int], heights: tuple[float, float]) -> float:
-    """Return by how many pixels two models of one image differ at most; infinite where one sees nothing."""
+    """Return the largest difference of two models of one image in pixels; infinite if one has no ground."""
     ground = ground_of_grid(model, size, 7, heights)
     ground = ground[np.isfinite(ground).all(axis=1)]
     theirs = ground_transform(model.crs, again.crs)(ground) if model.crs != again.crs else ground

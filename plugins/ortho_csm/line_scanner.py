@@ -36,24 +36,24 @@ from ortho_pipeline.plugin import (
 HEIGHTS = (-500.0, 9000.0)
 #: Lines whose times are further (lines) from one rate have no constant period.
 _EVEN = 0.01
-#: Positions are written so far apart (s), and angles so many times as often as the knots of their spline.
+#: Time step (s) of written positions, and number of written angles per knot of their spline.
 _EVERY, _OFTEN, _FEWEST = 0.25, 2, 16
-#: Columns at which a line of detectors is looked at to make it one of equal pixels, and how close (px) is exact.
+#: Columns at which a line of detectors is sampled to make its pixels equal, and tolerance (px) for exactness.
 _COLUMNS, _EXACT = 33, 1e-7
 _QUATERNIONS, _POSITIONS = "m_quaternions", "m_positions"
 
 
 def read_line_scanner(state: StateFields) -> Pushbroom:
-    """Make a line scanner of a state; free are offsets and drifts of its attitude."""
+    """Make a line scanner of a state. Its parameters are offsets and drifts of the attitude."""
     columns, rows = state.size()
     if state.numbers("m_currentParameterValue").any():
-        raise state.error("corrections beside the tables are not read", "m_currentParameterValue")
+        raise state.error("corrections of the tables are not supported", "m_currentParameterValue")
     start, period = _times(state)
     turn, camera = _camera(state, columns, rows)
     orbit = _table(state, _POSITIONS, 3, "Ephem")
     times, quaternions = _table(state, _QUATERNIONS, 4, "Quat")
     if not (np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= 0.01).all():
-        raise state.error("the quaternions are not of length one", _QUATERNIONS)
+        raise state.error("the quaternions do not have length one", _QUATERNIONS)
     model = pushbroom_of_tables(
         camera,
         line_period=period,
@@ -70,14 +70,16 @@ def _times(state: StateFields) -> tuple[float, float]:
     """Return the time of the upper edge of the first row and seconds per row."""
     lines, starts, periods = (state.numbers(name) for name in ("m_intTimeLines", "m_intTimeStartTimes", "m_intTimes"))
     if not 1 <= len(lines) == len(starts) == len(periods) <= 100_000 or not (np.diff(lines) > 0).all():
-        raise state.error("lines, times and periods belong together", "m_intTimeLines")
+        raise state.error(
+            "lines, times and periods must have the same length, and lines must increase", "m_intTimeLines"
+        )
     period = float(periods[0])
     if not 0 < abs(period) < 10:
-        raise state.error(f"{period} s is not a time for a row", "m_intTimes")
+        raise state.error(f"{period} s is not a possible line period", "m_intTimes")
     steady = starts[0] + (lines - lines[0]) * period
     # The period behind the last entry holds for the rest of the image only.
     if np.abs(periods / period - 1).max() * state.size()[1] > 1 or np.abs(starts - steady).max() > _EVEN * abs(period):
-        raise state.error("the lines have no constant period", "m_intTimes")
+        raise state.error("the line period is not constant", "m_intTimes")
     return float(starts[0] + period * (0.5 - lines[0])), period
 
 
@@ -87,7 +89,7 @@ def _camera(state: StateFields, columns: int, rows: int) -> tuple[Array, LineCam
     plane = np.array([line[1:], sample[1:]])
     focal, sign = state.number("m_focalLength"), state.number("m_zDirection", 1.0)
     if abs(np.linalg.det(plane)) < 1e-12 or not focal > 0 or sign not in (1.0, -1.0):
-        raise state.error("there is no way from pixels to the focal plane", "m_iTransS, m_iTransL, m_focalLength")
+        raise state.error("these values do not map pixels to the focal plane", "m_iTransS, m_iTransL, m_focalLength")
     back = np.linalg.inv(plane) * sign / focal
     step, first = state.number("m_detectorSampleSumming", 1.0), state.number("m_startingDetectorSample", 0.0)
     origin = first - state.number("m_detectorSampleOrigin") - sample[0]
@@ -95,7 +97,7 @@ def _camera(state: StateFields, columns: int, rows: int) -> tuple[Array, LineCam
     slope, start = back[:, 1] * step, back @ np.array([t1, origin])
     length = float(np.linalg.norm(slope))
     if not (np.isfinite([*slope, *start]).all() and 1e-10 < length < 0.1):
-        raise state.error("the columns do not look into different directions", "m_detectorSampleSumming")
+        raise state.error("all columns look in the same direction", "m_detectorSampleSumming")
     across = slope / length
     turn = np.array([[across[0], -across[1], 0.0], [across[1], across[0], 0.0], [0.0, 0.0, 1.0]])
     radial = state.radial()
@@ -106,7 +108,7 @@ def _camera(state: StateFields, columns: int, rows: int) -> tuple[Array, LineCam
     plane = (start + at[:, None] * slope) * sign * focal
     look = undistorted(plane, radial) @ turn[:2, :2] * sign / focal
     if not (np.isfinite(look).all() and np.abs(look).max() < 10):
-        raise state.error("this is not a distortion of a lens", "m_opticalDistCoeffs")
+        raise state.error("this is not a possible lens distortion", "m_opticalDistCoeffs")
     return turn, LineCamera.of_table(columns, rows, at, look[:, 0], look[:, 1])
 
 
@@ -114,7 +116,7 @@ def _table(state: StateFields, field: str, width: int, what: str) -> tuple[Array
     values = state.numbers(field)
     step = state.number(f"m_dt{what}")
     if len(values) % width or len(values) < 4 * width or not 0 < step < 1e4:
-        raise state.error(f"four times {width} numbers at least, at equal times, belong here", field)
+        raise state.error(f"this must be a list of at least 4 x {width} numbers, at equal time steps", field)
     values = values.reshape(-1, width)
     return np.asarray(state.number(f"m_t0{what}") + step * np.arange(len(values), dtype=np.float64)), values
 
@@ -168,7 +170,7 @@ def line_scanner_fields(model: Pushbroom) -> dict[str, Any]:
     }
 
 
-#: What is the same for every state that is written.
+#: Fields that have the same value in each state that is written.
 _FIXED: dict[str, Any] = {
     "m_imageIdentifier": "",
     "m_sensorName": "ortho-pipeline",
@@ -274,7 +276,7 @@ def _line(model: Pushbroom) -> _Line:
         centred = look @ tilted
         centred /= centred[:, 2:]
         first, third, fifth = np.linalg.lstsq(off[:, None] ** (1, 3, 5), centred[:, 0], rcond=None)[0]
-        # A line that is bent is one that the distortion bends: beside the axis, as far as it is bent.
+        # A bent line is represented by distortion: offset from the axis by the size of the bend.
         bent = float(np.polynomial.polynomial.polyfit(off, centred[:, 1], 2)[2])
         wanted = float(bent * first / third) if abs(third) > 1e-9 * abs(first) else 0.0
         tilt += float(np.clip(centred[:, 1].mean() - wanted, -0.1, 0.1))

@@ -10,7 +10,7 @@ import numpy as np
 from ortho_pipeline.plugin import SEMI_MAJOR, Array, InputError
 
 MOST_VALUES = 2_000_000
-REMEDY = "write the state again with the program that it is of"
+REMEDY = "write the state again with the program that made it"
 
 
 class StateFields:
@@ -27,7 +27,7 @@ class StateFields:
         """Return the numbers of a list."""
         value = self.fields.get(field)
         if not isinstance(value, list) or len(value) > MOST_VALUES or (count is not None and len(value) != count):
-            raise self.error(f"{count or 'a list of'} numbers belong here", field)
+            raise self.error(f"this must be a list of {count or 'at most ' + str(MOST_VALUES)} numbers", field)
         if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
             raise self.error("this is not a list of numbers", field)
         found = np.array(value, dtype=np.float64)
@@ -39,7 +39,7 @@ class StateFields:
         """Return a number."""
         value = self.fields.get(field, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
-            raise self.error("a number belongs here", field)
+            raise self.error("this must be a number", field)
         return float(value)
 
     def size(self) -> tuple[int, int]:
@@ -48,7 +48,7 @@ class StateFields:
         for field in ("m_nSamples", "m_nLines"):
             value = self.number(field)
             if value != int(value) or not 1 <= value <= 10_000_000:
-                raise self.error("this is not a size of an image", field)
+                raise self.error("this is not an image size", field)
             found.append(int(value))
         return found[0], found[1]
 
@@ -64,10 +64,10 @@ class StateFields:
         if not terms.any():
             return 0.0, 0.0, 0.0
         if self.number("m_distortionType", 0.0) != 0 or len(terms) != 3:
-            raise self.error("a distortion that is not radial is not read", "m_distortionType")
+            raise self.error("only radial distortion is supported", "m_distortionType")
         return float(terms[0]), float(terms[1]), float(terms[2])
 
     def require_earth(self) -> None:
         """Refuse other planets."""
         if abs(self.number("m_majorAxis") - SEMI_MAJOR) > 1.0:
-            raise self.error("this is another ellipsoid than that of the Earth", "m_majorAxis")
+            raise self.error("this is not the ellipsoid of the Earth", "m_majorAxis")

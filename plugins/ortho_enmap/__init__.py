@@ -1,10 +1,10 @@
 """Sensor plugin for EnMAP level 1B: the spectral image of a detector with the RPCs of its bands from METADATA.XML.
 
-Every band has an RPC, because the detectors look at a place one after the other: the short-wave infrared sees it 20
-rows from the visible, and not by the same amount at every height. One band's RPC is that of the image.
+Every band has its own RPC, because the detectors see a place one after the other. The short-wave infrared is about 20
+rows from the visible, depending on height. The scene uses the RPC of one band.
 
-Rows and columns of these RPCs count from 0 at the first centre: with the file's corners, whose heights are not said,
-the rows of the first and the last line are 0.0 and 1023.0 of 1024.
+Rows and columns of these RPCs count from 0 at the first pixel centre: at the corners of the file (without stated
+heights), the rows of the first and last line are 0.0 and 1023.0 of 1024.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _TERMS = {
     "COL_NUM": "SAMP_NUM_COEFF",
     "COL_DEN": "SAMP_DEN_COEFF",
 }
-#: Bands of one image that lie further (px) from the chosen one are worth a word.
+#: Bands that are further (px) from the chosen band give a warning.
 _SAME = 0.1
 _REMEDY = "copy the metadata again from the delivery"
 
@@ -65,7 +65,7 @@ def ortho_sensors() -> Iterable[Sensor]:
         "EnMAP level 1B: ...SPECTRAL_IMAGE_VNIR.TIF or _SWIR.TIF with ...METADATA.XML",
         recognises,
         open_scene,
-        options={"band": "the band whose RPC is taken, counted from 1 in this image; by itself the middle one"},
+        options={"band": "number of the band whose RPC is used, from 1; default: the middle band"},
     )
 
 
@@ -87,7 +87,7 @@ def metadata_of(name: str) -> tuple[Path, str] | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether an image is one of a detector of EnMAP with its metadata beside it."""
+    """Return whether this is the image of an EnMAP detector with its metadata beside it."""
     found = metadata_of(dataset.GetDescription())
     try:
         return found is not None and b"level_X" in read_bounded(found[0], 1000)
@@ -108,13 +108,13 @@ def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
     model = its[number - 1]
     warnings = []
     if facts["size"] != list(size):
-        text = "the metadata are for {} x {} pixels, this image has {} x {}: is it a crop?".format(
+        text = "the metadata are for {} x {} pixels, but this image has {} x {}. Is it a crop?".format(
             *facts["size"], *size
         )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=facts["size"]))
     apart = max(apart_of(one, model) for one in its)
     if apart > _SAME:
-        text = f"bands of this image lie up to {apart:.2f} px from band {number}, whose RPC is taken for all"
+        text = f"the RPC of band {number} is used for all bands; other bands are up to {apart:.2f} px away from it"
         warnings.append(Notice("bands-differ", text, difference_px=round(apart, 3)))
     other = rpcs[facts["bands_vnir"] + facts["bands_swir"] // 2 if detector == "VNIR" else facts["bands_vnir"] // 2]
     facts |= {"detector": detector, "band": number, "parallax_to_other_detector_px_per_km": parallax(model, other)}
@@ -123,20 +123,20 @@ def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
 
 @reads(_REMEDY)
 def read_enmap(path: Path) -> tuple[tuple[RPC, ...], dict[str, Any]]:
-    """Read the RPCs of all bands, visible ones first, and what is worth showing.
+    """Read the RPCs of all bands, visible ones first, and facts.
 
     Raises
     ------
     InputError
-        If it is no metadata of level 1B, or an RPC is damaged.
+        If the file is not metadata of level 1B, or an RPC is damaged.
     """
     file = XmlFields(path, remedy=_REMEDY, limit=MAX_SIZE)
     level = file.said("base/level") or "none"
     if level != "L1B":
-        raise file.error(f"a product of level {level[:10]} has no RPCs", "base/level", "take level 1B")
+        raise file.error(f"a product of level {level[:10]} has no RPCs", "base/level", "use level 1B")
     entries = file.all("product/navigation/RPC/bandID", MOST_BANDS) or file.all(".//RPC/bandID", MOST_BANDS)
     if not entries:
-        raise file.error("there are no RPCs", "RPC")
+        raise file.error("the metadata have no RPCs", "RPC")
     rpcs = []
     for entry in entries:
         fields = {gdals: file.text(name, entry) for name, gdals in _SCALARS.items()}
@@ -151,13 +151,13 @@ def read_enmap(path: Path) -> tuple[tuple[RPC, ...], dict[str, Any]]:
 
 
 def apart_of(one: RPC, other: RPC) -> float:
-    """Return how far (px) two bands are apart in the middle of the other, at its own height."""
+    """Return the distance (px) of two bands at the middle of the other, at its own height."""
     middle = np.array([[other.lon_off, other.lat_off, other.h_off]])
     return float(np.linalg.norm(one.ground_to_image(middle) - other.ground_to_image(middle)))
 
 
 def parallax(one: RPC, other: RPC) -> list[float]:
-    """Return by how many pixels (column, row) the place of `other` beside `one` grows with a kilometre of height."""
+    """Return the change of the offset between two bands (column, row; px) per kilometre of height."""
     ground = one.lon_off, one.lat_off
     low, high = (np.array([[*ground, one.h_off + h]]) for h in (-500.0, 500.0))
     apart = [other.ground_to_image(at) - one.ground_to_image(at) for at in (low, high)]
@@ -167,16 +167,14 @@ def parallax(one: RPC, other: RPC) -> list[float]:
 def _of_detector(
     rpcs: tuple[RPC, ...], facts: dict[str, Any], detector: str, bands: int, path: Path
 ) -> tuple[RPC, ...]:
-    """Return the RPCs of the bands of a detector, which the image has to have all."""
+    """Return the RPCs of the bands of a detector; the image must have all of them."""
     visible, infrared = facts["bands_vnir"], facts["bands_swir"]
     if visible + infrared != len(rpcs):
-        raise InputError(
-            f"{len(rpcs)} RPCs are not those of {visible} and {infrared} bands", file=path, field="RPC", remedy=_REMEDY
-        )
+        raise InputError(f"{len(rpcs)} RPCs for {visible} + {infrared} bands", file=path, field="RPC", remedy=_REMEDY)
     its = rpcs[:visible] if detector == "VNIR" else rpcs[visible:]
     if bands != len(its):
         raise InputError(
-            f"the image has {bands} bands, the metadata {len(its)} of {detector}",
+            f"the image has {bands} bands, but the metadata describe {len(its)} {detector} bands",
             file=path,
             field="channels",
             remedy="give the image with all its bands",
@@ -188,5 +186,5 @@ def _chosen(band: str | None, count: int) -> int:
     if band is None:
         return (count + 1) // 2
     if not band.isascii() or not band.isdigit() or not 1 <= int(band[:9]) <= count:
-        raise InputError(f"there is no band {band[:20]!r}", field="band", remedy=f"give a number from 1 to {count}")
+        raise InputError(f"unknown band {band[:20]!r}", field="band", remedy=f"give a number from 1 to {count}")
     return int(band)

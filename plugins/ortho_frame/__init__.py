@@ -1,6 +1,6 @@
 """Sensor plugin for frame images in general: a camera file, and a table of exterior orientations.
 
-It recognises nothing by itself: it is taken when its options are given (``camera``, ``exterior``).
+It recognises nothing automatically: it is used when its options are given (``camera``, ``exterior``).
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from ortho_pipeline.plugin import (
 OPTIONS = {
     "camera": "camera file: JSON (docs/formats/frame.md) or OpenSfM's cameras.json or reconstruction.json",
     "exterior": "CSV: filename, and x y z omega phi kappa or lon lat alt roll pitch yaw (degrees); or OpenSfM's "
-    "reconstruction.json, which holds the camera too",
+    "reconstruction.json, which also has the camera",
     "crs": "projected CRS of x and y",
-    "vertical": "what the camera heights are above: ellipsoid, egm96, egm2008, EPSG:n or a grid file",
+    "vertical": "height datum of the camera positions: ellipsoid, egm96, egm2008, EPSG:n or a grid file",
     "frame": "work in a topocentric frame (default) or directly in the map projection: topocentric, map",
-    "heights": "lowest and highest ground in ellipsoidal metres: low,high",
+    "heights": "lowest and highest ground, ellipsoidal metres: low,high",
     "sigmas": "standard deviations of position and angles for the correction 'model': metres,degrees",
-    "refraction": "bend rays by the standard atmosphere: yes or no (default)",
+    "refraction": "correct refraction in a standard atmosphere: yes or no (default)",
 }
 
 
@@ -86,7 +86,7 @@ def open_scene(
             ),
         )
     if refraction not in ("yes", "no"):
-        raise InputError(f"{refraction!r} is neither yes nor no", field="refraction")
+        raise InputError(f"{refraction!r} must be yes or no", field="refraction")
     pose = read_exterior(exterior, name)
     kind = pose.camera if isinstance(pose, Shot) else None
     interior = read_camera(camera, dataset.RasterXSize, dataset.RasterYSize, kind)
@@ -117,19 +117,21 @@ def _model(
     position, angles = np.array(pose.position), np.radians(pose.angles)
     if not pose.geographic and crs is None:
         raise InputError(
-            "the CRS of x and y is not known",
+            "the CRS of x and y is missing",
             file=pose.source,
             field="crs",
-            remedy="give the option crs, such as EPSG:32636",
+            remedy="give the sensor option crs, such as crs=EPSG:32636",
         )
     place = position if pose.geographic else ground_transform(str(crs), "EPSG:4979")([[*position[:2], 0.0]])[0]
     position[2] += float(vertical.undulation(place[:1], place[1:2])[0])
     if not np.isfinite(position).all():
-        raise InputError("this position is not on the map", file=pose.source, field=pose.where)
+        raise InputError("this position is outside the map projection", file=pose.source, field=pose.where)
     others = {"heights": _heights(heights, float(position[2])), "refraction": refraction}
     if pose.geographic:
         if frame != TOPOCENTRIC:
-            raise InputError("roll, pitch and yaw belong to no map", field="frame", remedy="leave the option out")
+            raise InputError(
+                "roll, pitch and yaw do not depend on a map projection", field="frame", remedy="leave the option out"
+            )
         return FrameCamera.from_roll_pitch_yaw(interior, position, *angles.tolist(), **others)
     return FrameCamera.from_map(interior, str(crs), np.concatenate([position, angles]), frame=frame, **others)
 
@@ -146,14 +148,14 @@ def _shot_model(
     lon, lat, altitude = shot.origin
     altitude += float(vertical.undulation(np.array([lon]), np.array([lat]))[0])
     if not math.isfinite(altitude):
-        raise InputError("the height datum does not reach here", file=shot.source, field="reference_lla")
+        raise InputError("the height datum does not cover this position", file=shot.source, field="reference_lla")
     exterior = shot.exterior()
     others = {"heights": _heights(heights, altitude + exterior[2]), "refraction": refraction}
     if frame == TOPOCENTRIC:
         return FrameCamera(interior, exterior, origin=(lon, lat, altitude), **others)
     if crs is None:
         raise InputError(
-            "a map projection is needed to work in", file=shot.source, field="crs", remedy="such as crs=EPSG:32636"
+            "frame=map needs a map projection", file=shot.source, field="crs", remedy="give one, such as crs=EPSG:32636"
         )
     # OpenDroneMap takes east and north for axes of the map.
     corner = ground_transform("EPSG:4979", crs)([[lon, lat, altitude]])[0]
@@ -162,12 +164,14 @@ def _shot_model(
 
 def _heights(text: str | None, camera: float) -> tuple[float, float]:
     if text is None:
-        # What is known is only that the ground is below the camera.
+        # Only one thing is known: the ground is below the camera.
         low = min(-100.0, camera - 1000.0)
         return low, min(9000.0, camera - 0.1 * (camera - low))
     low, high = _pair(text)
     if not low < high:
-        raise InputError(f"{text!r} is not a range of heights", field="heights", remedy="give low,high in metres")
+        raise InputError(
+            f"{text!r} is not a height range", field="heights", remedy="give low,high in metres, such as heights=0,800"
+        )
     return low, high
 
 
@@ -176,12 +180,12 @@ def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
         return {}
     metres, degrees = _pair(sigmas)
     if not (metres > 0 and degrees > 0):
-        raise InputError(f"{sigmas!r} are not standard deviations", field="sigmas", remedy="give metres,degrees")
+        raise InputError(f"{sigmas!r} are not two standard deviations", field="sigmas", remedy="give metres,degrees")
     return priors_at(model, exterior_sigmas(metres, math.radians(degrees)))
 
 
 def _pair(text: str) -> tuple[float, float]:
-    """Return two numbers; NaN for what is none."""
+    """Return two numbers; NaN if there are not two."""
     found = numbers_of(text)
     return (found[0], found[1]) if len(found) == 2 else (math.nan, math.nan)
 
@@ -189,7 +193,7 @@ def _pair(text: str) -> tuple[float, float]:
 def _facts(model: FrameCamera, pose: Pose | Shot, heights: str | None) -> dict[str, object]:
     centre: Array = model.perspective_centre
     tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(model.rotation[2, 2])))))
-    unknown = {"ground_heights": "not stated, so a guess: a DEM gives them, or the option heights=low,high"}
+    unknown = {"ground_heights": "assumed, because not stated; give a DEM or the sensor option heights=low,high"}
     return {
         **({} if heights else unknown),
         "exterior_orientation": pose.where,

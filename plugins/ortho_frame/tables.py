@@ -23,7 +23,7 @@ from ortho_pipeline.plugin import (
 )
 
 MAX_BYTES = 5_000_000
-#: A reconstruction holds the points of the whole block too.
+#: A reconstruction also has the points of the whole block.
 MAX_JSON_BYTES = 200_000_000
 #: Columns of a table, by the ways to write them; the first of each is the name in messages.
 MAP_COLUMNS = (("x",), ("y",), ("z",), ("omega",), ("phi",), ("kappa",))
@@ -50,7 +50,7 @@ DISTORTION_KEYS = ("k1", "k2", "k3", "p1", "p2")
 
 @dataclass(frozen=True)
 class Pose:
-    """One row of the table: position and angles (degrees) as they stand there."""
+    """One row of the table: position and angles (degrees) as written."""
 
     source: str
     where: str
@@ -83,7 +83,7 @@ class Shot:
 # -- the camera ------------------------------------------------------------------------------------------------------
 
 
-@reads("write the camera as docs/formats/frame.md has it")
+@reads("write the camera file as in docs/formats/frame.md")
 def read_camera(path: str | PathLike[str], width: int, height: int, name: str | None = None) -> Interior:
     """Read the interior orientation for an image of `width` x `height` pixels.
 
@@ -100,10 +100,10 @@ def read_camera(path: str | PathLike[str], width: int, height: int, name: str | 
     given = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
     if given.width * height != given.height * width:
         raise InputError(
-            f"the camera has {given.width} x {given.height} pixels, the image {width} x {height}",
+            f"the camera has {given.width} x {given.height} pixels, but the image {width} x {height}",
             file=path,
             field="width, height",
-            remedy="give the camera of this image; a crop is not the whole frame",
+            remedy="give the camera of this image; crops of a frame are not supported",
         )
     ratio = given.width / width
     fields = {**given.to_dict(), "width": width, "height": height}
@@ -112,23 +112,23 @@ def read_camera(path: str | PathLike[str], width: int, height: int, name: str | 
 
 def _own(path: str | PathLike[str], document: Any) -> Interior:
     if not isinstance(document, dict):
-        raise InputError("a camera file is a JSON object", file=path, remedy="see docs/formats/frame.md")
+        raise InputError("a camera file must be a JSON object", file=path, remedy="see docs/formats/frame.md")
     unknown = sorted(set(document) - CAMERA_KEYS)
     if unknown:
         raise InputError(
-            "there is no such field",
+            "unknown field",
             file=path,
             field=unknown[0] or repr(unknown[0]),
-            remedy=f"one of {sorted(CAMERA_KEYS)}",
+            remedy=f"use one of {', '.join(sorted(CAMERA_KEYS))}",
         )
     width, height = (_number(path, key, document.get(key)) for key in ("width", "height"))
     focal = _number(path, "focal_length_mm", document.get("focal_length_mm")) * 1e-3
     if ("sensor_mm" in document) == ("pixel_pitch_um" in document):
-        raise InputError("give one of sensor_mm and pixel_pitch_um", file=path, field="sensor_mm")
+        raise InputError("give either sensor_mm or pixel_pitch_um", file=path, field="sensor_mm")
     if "sensor_mm" in document:
         across, down = _pair(path, "sensor_mm", document["sensor_mm"])
         if not (width > 0 and height > 0):
-            raise InputError("a frame has a positive size", file=path, field="width, height")
+            raise InputError("the size of the frame must be positive", file=path, field="width, height")
         pitch = across * 1e-3 / width, down * 1e-3 / height
     else:
         across, down = _pair(path, "pixel_pitch_um", document["pixel_pitch_um"])
@@ -136,7 +136,9 @@ def _own(path: str | PathLike[str], document: Any) -> Interior:
     x0, y0 = _pair(path, "principal_point_mm", document.get("principal_point_mm", [0.0, 0.0]))
     lens = document.get("distortion", {})
     if not isinstance(lens, dict) or set(lens) - set(DISTORTION_KEYS):
-        raise InputError(f"distortion has the fields {', '.join(DISTORTION_KEYS)}", file=path, field="distortion")
+        raise InputError(
+            f"distortion can only have the fields {', '.join(DISTORTION_KEYS)}", file=path, field="distortion"
+        )
     brown = {key: _number(path, f"distortion.{key}", value) for key, value in lens.items()}
     return _interior(path, width, height, focal, *pitch, x0=x0 * 1e-3, y0=y0 * 1e-3, **brown)
 
@@ -160,7 +162,7 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
     camera = next(iter(cameras.values()), None)
     if len(cameras) != 1 or not isinstance(camera, dict):
         raise InputError(
-            f"{counted(len(cameras), 'camera is', 'cameras are')} in this file",
+            f"this file has {counted(len(cameras), 'camera')}",
             file=path,
             field="cameras",
             remedy="give a file with one camera",
@@ -168,10 +170,10 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
     kind = camera.get("projection_type")
     if kind not in ("brown", "perspective"):
         raise InputError(
-            f"cameras of the type {kind!r} are not known",
+            f"cameras of the type {kind!r} are not supported",
             file=path,
             field="projection_type",
-            remedy="brown, perspective",
+            remedy="use brown or perspective",
         )
     width, height = (_number(path, key, camera.get(key)) for key in ("width", "height"))
     size = max(width, height) * 1e-6  # with pixels of 1 µm
@@ -179,7 +181,7 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
     focal_x = _number(path, "focal_x", focal)
     focal_y = _number(path, "focal_y", camera.get("focal_y", focal))
     if not focal_x > 0 or not focal_y > 0:
-        raise InputError("a focal length is positive", file=path, field="focal_x")
+        raise InputError("the focal length must be positive", file=path, field="focal_x")
     brown = {key: _number(path, key, camera.get(key, 0.0)) for key in DISTORTION_KEYS}
     c_x, c_y = (_number(path, key, camera.get(key, 0.0)) for key in ("c_x", "c_y"))
     # Its y points down; different focal lengths of the axes are different pitches here.
@@ -199,7 +201,7 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
 def _interior(path: str | PathLike[str], width: float, height: float, *values: float, **others: float) -> Interior:
     try:
         if width != int(width) or height != int(height) or not 0 < width < 1e6 or not 0 < height < 1e6:
-            raise InputError("a frame has whole numbers of columns and rows", field="width, height")
+            raise InputError("width and height must be whole numbers", field="width, height")
         return Interior(int(width), int(height), *values, **others)
     except InputError as error:
         raise InputError(error.message, file=path, field=error.field, remedy=error.remedy) from error
@@ -207,7 +209,7 @@ def _interior(path: str | PathLike[str], width: float, height: float, *values: f
 
 def _pair(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
-        raise InputError("this is a list of two numbers, x first", file=path, field=field)
+        raise InputError("this must be a list of two numbers, x first", file=path, field=field)
     return _number(path, field, value[0]), _number(path, field, value[1])
 
 
@@ -220,14 +222,14 @@ def _number(path: str | PathLike[str], field: str, value: Any) -> float:
 # -- exterior orientations -------------------------------------------------------------------------------------------
 
 
-@reads("write one row per image, as docs/formats/frame.md has it")
+@reads("write one row per image, as in docs/formats/frame.md")
 def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose | Shot:
     """Return the row of a table of exterior orientations, or the shot of a reconstruction, of an image by its name.
 
     Raises
     ------
     InputError
-        If the table has no header, the image is not in it or stands twice, or a number is wrong.
+        If the table has no header, the image is missing or appears twice, or a number is wrong.
     """
     if is_reconstruction(path):
         return _shot(path, Path(image))
@@ -236,7 +238,7 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
     wanted = Path(image)
     found = [(line, row) for line, row in rows if row and row[0] in (wanted.name, wanted.stem)]
     if len(found) != 1:
-        what = "stands twice" if found else "is not in this table"
+        what = "appears twice" if found else "is not in this table"
         raise InputError(f"the image {wanted.name} {what}", file=path, field=header[0], remedy="give one row per image")
     line, row = found[0]
     values = []
@@ -249,13 +251,13 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
             raise InputError("this is not a number", file=path, field=f"line {line}, {name}")
         values.append(value)
     if geographic and not (abs(values[0]) <= 360 and abs(values[1]) <= 90):
-        raise InputError("this is not on Earth", file=path, field=f"line {line}, lon, lat")
+        raise InputError("this position is not on Earth", file=path, field=f"line {line}, lon, lat")
     x, y, z, first, second, third = values
     return Pose(str(path), f"line {line}", geographic, (x, y, z), (first, second, third))
 
 
 def is_reconstruction(path: str | PathLike[str]) -> bool:
-    """Tell whether a file of exterior orientations is OpenSfM's ``reconstruction.json``, and no table."""
+    """Tell whether a file of exterior orientations is OpenSfM's ``reconstruction.json``, not a table."""
     return Path(path).suffix.lower() == ".json"
 
 
@@ -264,13 +266,13 @@ def _shot(path: str | PathLike[str], image: Path) -> Shot:
     parts = [part for part in (document if isinstance(document, list) else [document]) if isinstance(part, dict)]
     shots = [(part, name) for part in parts for name in (image.name, image.stem) if name in _object(part, "shots")]
     if len(shots) != 1:
-        what = "stands twice" if shots else "is not in this reconstruction"
+        what = "appears twice" if shots else "is not in this reconstruction"
         raise InputError(f"the image {image.name} {what}", file=path, field="shots", remedy="give one shot per image")
     part, name = shots[0]
     shot, place = _object(_object(part, "shots"), name), part.get("reference_lla")
     if not isinstance(place, dict):
         raise InputError(
-            "the reconstruction does not lie on the Earth",
+            "the reconstruction is not georeferenced",
             file=path,
             field="reference_lla",
             remedy="give the georeferenced reconstruction.json, or a table (docs/formats/frame.md)",
@@ -278,7 +280,7 @@ def _shot(path: str | PathLike[str], image: Path) -> Shot:
     keys = ("longitude", "latitude", "altitude")
     lon, lat, altitude = (_number(path, f"reference_lla.{key}", place.get(key)) for key in keys)
     if not (abs(lon) <= 360 and abs(lat) <= 90):
-        raise InputError("this is not on Earth", file=path, field="reference_lla")
+        raise InputError("this position is not on Earth", file=path, field="reference_lla")
     where = f"shots.{name}"
     rotation, translation = (_triple(path, f"{where}.{key}", shot.get(key)) for key in ("rotation", "translation"))
     return Shot(str(path), where, (lon, lat, altitude), rotation, translation, str(shot.get("camera")))
@@ -291,7 +293,7 @@ def _object(parent: Any, key: str) -> dict[str, Any]:
 
 def _triple(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float, float]:
     if not isinstance(value, list) or len(value) != 3:
-        raise InputError("this is a list of three numbers", file=path, field=field)
+        raise InputError("this must be a list of three numbers", file=path, field=field)
     x, y, z = (_number(path, field, part) for part in value)
     return x, y, z
 
@@ -308,7 +310,7 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
         try:
             cells = next(csv.reader([line.strip()], delimiter=delimiter, quotechar=quote, skipinitialspace=True))
         except (csv.Error, StopIteration) as error:
-            raise InputError(f"this is not a row ({error})", file=path, field=f"line {number}") from error
+            raise InputError(f"this row cannot be read ({error})", file=path, field=f"line {number}") from error
         rows.append((number, [cell.strip() for cell in cells]))
     return [cell.lower() for cell in rows[0][1]], rows[1:]
 
@@ -319,10 +321,10 @@ def _columns(path: str | PathLike[str], header: list[str]) -> tuple[bool, list[t
         if len(found) == len(wanted):
             return geographic, found
     raise InputError(
-        f"the columns are {', '.join(header)[:120]}",
+        f"unexpected columns: {', '.join(header)[:120]}",
         file=path,
         field="header",
-        remedy="filename, then x y z omega phi kappa, or lon lat alt roll pitch yaw",
+        remedy="use filename, then x y z omega phi kappa or lon lat alt roll pitch yaw",
     )
 
 
@@ -336,11 +338,11 @@ def _json(path: str | PathLike[str]) -> Any:
 def _text(path: str | PathLike[str]) -> str:
     data = read_bounded(path, MAX_BYTES, remedy="check the path")
     if len(data) > MAX_BYTES:
-        raise InputError(f"a file of more than {MAX_BYTES // 1_000_000} MB is not read here", file=path)
+        raise InputError(f"this file is larger than the limit of {MAX_BYTES // 1_000_000} MB", file=path)
     try:
         text = data.decode("utf-8-sig")
     except ValueError as error:
-        raise InputError("this is not text in UTF-8", file=path) from error
+        raise InputError("this file is not UTF-8 text", file=path) from error
     if "\0" in text:
-        raise InputError("this is not text", file=path)
+        raise InputError("this file is not text", file=path)
     return text

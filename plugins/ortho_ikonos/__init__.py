@@ -1,8 +1,8 @@
 """Sensor plugin for IKONOS Geo products: ``po_<order>_<band>_<component>`` images with their metadata file.
 
-Two models: the vendor's RPC where there is one, and ``geo``, the plane at Reference Height from the metadata alone
-(docs/formats/ikonos.md). Bands in files of their own are stacked on request; points that were measured in another
-band or component of the same acquisition count for this image as well.
+There are two models: the vendor's RPC, if there is one, and ``geo``, the plane at Reference Height from the metadata
+alone (docs/formats/ikonos.md). Bands in separate files are stacked on request. Points that were measured in another
+band or component of the same acquisition also count for this image.
 """
 
 from __future__ import annotations
@@ -40,32 +40,47 @@ from ortho_pipeline.plugin import (
 )
 
 OPTIONS = {
-    "metadata": "the metadata file, where it is not po_<order>_metadata.txt beside the image",
+    "metadata": "the metadata file, if it is not po_<order>_metadata.txt beside the image",
     "rpc": "which RPC to use: tag, sidecar, or an RPC file",
-    "geometry": "the model to start from: rpc (default where there is one) or geo, the plane at Reference Height",
+    "geometry": "the first model: rpc (default if there is one) or geo (the plane at Reference Height)",
     "bands": "files to stack in the ortho: one (default), all separate bands, or names such as red,grn,blu",
-    "heights": "lowest and highest ground in ellipsoidal metres for geo: low,high",
+    "heights": "lowest and highest ground for geo, ellipsoidal metres: low,high",
 }
 #: Products on the plane at Reference Height.
 PRODUCT_LINE, LEVEL = "Geo", "Standard Geometrically Corrected"
-#: Half the range of heights that `geo` is meant for where nothing else is known (m).
+#: Half of the height range (m) of `geo` without other information.
 HALF_RANGE = 500.0
 #: What the vendor states of the first years is 50 m at 90 %: 23 m for each coordinate. Direction of relief: by how much
 #: it differs from the nominal one within a real scene (docs/engineering/block-adjustment.md).
 SIGMAS = {"shift_x": 25.0, "shift_y": 25.0, "relief_x": 0.01, "relief_y": 0.01}
 #: RPC and metadata that differ by more than this on the plane (px) belong to different images.
 DISAGREEMENT = 1.0
+_CHOOSE = Text(
+    "choose the RPC with ",
+    Setting("scene.rpc", "tag"),
+    ", ",
+    Setting("scene.rpc", "sidecar"),
+    " or ",
+    Setting("scene.rpc", "FILE"),
+    ", or the metadata with ",
+    Setting("scene.sensor_options", "geo", key="geometry"),
+)
 
 
 @hookimpl
 def ortho_sensors() -> Iterable[Sensor]:
     """Offer the sensor ``ikonos``."""
-    yield Sensor("ikonos", "IKONOS Geo products (po_* with metadata.txt, with or without RPC)", recognises, open_scene,
-                 options=OPTIONS)  # fmt: skip
+    yield Sensor(
+        "ikonos",
+        "IKONOS Geo products (po_* with metadata.txt, with or without RPC)",
+        recognises,
+        open_scene,
+        options=OPTIONS,
+    )
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether it is named like an image of an order whose metadata, which lie beside it, are of IKONOS."""
+    """Return whether the file is named like an image of an order, with IKONOS metadata beside it."""
     image = OrderImage.of(place(dataset.GetDescription()))
     if image is None:
         return False
@@ -89,9 +104,11 @@ def open_scene(
     image = OrderImage.of(path)
     if image is None and (metadata is None or bands != "one"):
         raise InputError(
-            "this is not a name of an image of an order", file=path, field="metadata",
-            remedy="name it po_<order>_<band>_<component of 7 digits>.tif, or give the option metadata=FILE",
-        )  # fmt: skip
+            "this is not the file name of an IKONOS order",
+            file=path,
+            field="metadata",
+            remedy="name it po_<order>_<band>_<component of 7 digits>.tif, or give the sensor option metadata=FILE",
+        )
     delivery = read_metadata(metadata or (image.metadata if image else ""))
     component = delivery.component(image.component if image else None)
     source = delivery.source_of(component)
@@ -107,13 +124,11 @@ def open_scene(
     contradiction = _disagreement(models)
     if contradiction and vendor is not None and rpc is None and geometry is None:
         raise InputError(
-            contradiction[0], file=vendor[1], field="rpc",
-            remedy=Text(
-                "choose one: the RPC with ", Setting("scene.rpc", "tag"), ", ", Setting("scene.rpc", "sidecar"),
-                " or ", Setting("scene.rpc", "FILE"), ", or the metadata with ",
-                Setting("scene.sensor_options", "geo", key="geometry")
-            ),
-        )  # fmt: skip
+            contradiction[0],
+            file=vendor[1],
+            field="rpc",
+            remedy=_CHOOSE,
+        )
     return Scene(
         sensor="ikonos",
         path=path,
@@ -134,7 +149,7 @@ def open_scene(
 
 
 def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
-    """Return the RPC and where it is from; GDAL does not attach a side-car to every format."""
+    """Return the RPC and its source; GDAL does not attach a sidecar to every format."""
     if choice is not None or has_rpc(dataset):
         return rpc_of_dataset(dataset, choice)
     found = rpc_file(place(dataset.GetDescription()))
@@ -142,7 +157,7 @@ def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
 
 
 def _lacking(position: Position, source: SourceImage) -> list[str]:
-    """Return the keys without which there is no plane."""
+    """Return missing keys that the plane needs."""
     wanted = {
         "Map Projection (UTM on WGS84, or of the image)": position.crs,
         "UL Map X, UL Map Y": position.corner,
@@ -156,9 +171,15 @@ def _lacking(position: Position, source: SourceImage) -> list[str]:
 
 def _plane(dataset: gdal.Dataset, position: Position, source: SourceImage, heights: tuple[float, float]) -> MapPlane:
     return MapPlane.from_view(
-        position.crs, position.corner, position.pixel, (dataset.RasterXSize, dataset.RasterYSize),
-        position.reference_height, math.radians(source.azimuth), math.radians(source.elevation), heights,
-    )  # fmt: skip
+        position.crs,
+        position.corner,
+        position.pixel,
+        (dataset.RasterXSize, dataset.RasterYSize),
+        position.reference_height,
+        math.radians(source.azimuth),
+        math.radians(source.elevation),
+        heights,
+    )
 
 
 def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[float, float]:
@@ -166,7 +187,11 @@ def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[
     if text is not None:
         given = numbers_of(text)
         if len(given) != 2 or not given[0] < given[1]:
-            raise InputError(f"{text!r} is not a range of heights", field="heights", remedy="give low,high in metres")
+            raise InputError(
+                f"{text!r} is not a height range",
+                field="heights",
+                remedy="give low,high in metres, such as heights=0,800",
+            )
         low, high = given
     else:
         low, high = vendor.height_range if vendor else (plane - HALF_RANGE, plane + HALF_RANGE)
@@ -178,24 +203,28 @@ def _first(
 ) -> str:
     """Return the name of the model to start from."""
     if geometry not in (None, "rpc", "geo"):
-        raise InputError(f"{geometry!r} is not a geometry", field="geometry", remedy="rpc or geo")
+        raise InputError(f"{geometry!r} is not a known geometry", field="geometry", remedy="rpc or geo")
     first = geometry or next(iter(models), "geo")
     if first == "rpc" and "rpc" not in models:
         raise InputError(
-            "there is no RPC",
+            "this image has no RPC",
             file=file,
             field="geometry",
-            remedy=Text("give it with ", Setting("scene.rpc"), ", or take geo"),
+            remedy=Text("give an RPC with ", Setting("scene.rpc"), ", or use geometry=geo"),
         )
     if first not in models:
         raise InputError(
-            f"there is no plane of Reference Height without {'; '.join(lacking)}", file=file,
+            f"the plane at Reference Height needs {'; '.join(lacking)}",
+            file=file,
             field=f"component {component.component}: {lacking[0]}",
             remedy=Text(
-                "give the whole metadata file, an RPC (", Setting("scene.rpc"), "), or fit a model to points (",
-                Setting("points.fit_model"), ")"
+                "give the complete metadata file or an RPC (",
+                Setting("scene.rpc"),
+                "), or fit a model to points (",
+                Setting("points.fit_model"),
+                ")",
             ),
-        )  # fmt: skip
+        )
     return first
 
 
@@ -206,7 +235,7 @@ def _priors(models: Mapping[str, SensorModel]) -> dict[str, Prior]:
 def _pieces(
     image: OrderImage, delivery: Delivery, component: Component, position: Position, with_models: bool
 ) -> tuple[tuple[Piece, ...], list[Notice]]:
-    """Return the other files of the acquisition, of the same plane and maybe other pixels, and what is wrong."""
+    """Return the other files of the acquisition (same plane, maybe other pixels), and warnings."""
     found: list[Piece] = []
     warnings: list[Notice] = []
     others = list(image.others())
@@ -224,7 +253,7 @@ def _pieces(
             place = position.place_of(position_of(opened, delivery, known[0]))
             vendor = _rpc(opened, None) if with_models and other.grid == image.grid else None
         except InputError as error:
-            text = f"points in {other.path.name} are not taken over: {error.message}"
+            text = f"points in {other.path.name} are not used: {error.message}"
             warnings.append(Notice("piece-left-out", text, file=other.path.name))
             continue
         if place is not None:
@@ -233,19 +262,19 @@ def _pieces(
     return tuple(found), warnings
 
 
-# -- what to say -----------------------------------------------------------------------------------------------------
+# -- facts and warnings ----------------------------------------------------------------------------------------------
 
 
 def _level_warnings(delivery: Delivery) -> list[Notice]:
     line, level = delivery.product_line, delivery.level
     if line is None and level is None:
-        text = "the metadata do not state the processing level: the models are those of a Geo product"
+        text = "the metadata do not state the processing level; a Geo product is assumed"
         return [Notice("processing-level", text)]
     if (line is None or line.lower().startswith(PRODUCT_LINE.lower())) and (level or LEVEL).lower() == LEVEL.lower():
         return []
     text = (
         f"this is a product {line or 'of an unknown line'}, {level or 'level not stated'}, not {PRODUCT_LINE}, {LEVEL}:"
-        " where the vendor has already corrected the relief it would be corrected twice"
+        " if relief is already corrected, it would be corrected twice"
     )
     return [Notice("processing-level", text, line=line, level=level)]
 
@@ -261,7 +290,7 @@ def _disagreement(models: dict[str, SensorModel]) -> list[Notice]:
     if off <= DISAGREEMENT:
         return []
     apart = f"{off:.1f} px" if math.isfinite(off) else "the whole scene"
-    text = f"RPC and metadata differ by {apart} at Reference Height: one of them belongs to another image"
+    text = f"RPC and metadata differ by {apart} at Reference Height. One of them belongs to another image"
     return [Notice("metadata-contradict", text, difference_px=off)]
 
 

@@ -1,8 +1,8 @@
 """The metadata file of an IKONOS order (``po_<order>_metadata.txt``) and the header of one image (``_hdr.txt``).
 
-Sections stand between lines of ``=``, are nested by blanks, and hold records that begin at ``Source Image ID`` or
-``Component ID`` (older orders: ``Tile ID``). A component names its product image, and that a source image
-(docs/formats/ikonos.md). What is not known is left alone; what is wanted and is not there is an error.
+Lines of ``=`` separate sections. Blanks nest entries. Records begin at ``Source Image ID`` or ``Component ID`` (older
+orders: ``Tile ID``). A component names its product image, which names a source image (docs/formats/ikonos.md). Unknown
+keys are ignored; a required key that is missing is an error.
 """
 
 from __future__ import annotations
@@ -42,26 +42,26 @@ class MetadataLine:
 
 @dataclass(frozen=True)
 class SectionRecord:
-    """The entries of one record of a section, looked up by key wherever they are nested."""
+    """The entries of one record of a section, by key at any level."""
 
     file: str
     name: str
     entries: tuple[MetadataLine, ...]
 
     def text(self, *keys: str) -> str | None:
-        """Return the value of the first of these keys that is there and not empty; None without.
+        """Return the value of the first of these keys that exists and is not empty; None without one.
 
         Raises
         ------
         InputError
-            If the key stands there twice with two values.
+            If the key appears twice with different values.
         """
         for key in keys:
             found = [entry for entry in self.entries if entry.key.lower() == key.lower() and entry.value]
             if len({entry.value for entry in found}) > 1:
                 lines = ", ".join(str(entry.line) for entry in found)
                 raise InputError(
-                    f"this key stands in lines {lines} with different values",
+                    f"this key has different values in lines {lines}",
                     file=self.file,
                     field=f"{self.name}: {key}",
                     remedy="remove the wrong one",
@@ -96,11 +96,11 @@ class SectionRecord:
         return number
 
     def count(self, *keys: str, units: tuple[str, ...] = PIXELS) -> int | None:
-        """Return a whole number that is not negative; None without."""
+        """Return a whole number that is not negative; None without one."""
         value = self.number(*keys, units=units, low=0, high=1e7)
         if value is not None and value != int(value):
             raise InputError(
-                f"{value} is not whole number",
+                f"{value} is not a whole number",
                 file=self.file,
                 field=f"{self.name}: {keys[0]}",
                 remedy="correct the file",
@@ -110,7 +110,7 @@ class SectionRecord:
 
 @dataclass(frozen=True)
 class SourceImage:
-    """One acquisition; angles in degrees, None for what the file does not say.
+    """One acquisition; angles in degrees, None if not stated.
 
     `azimuth` and `elevation` are of the satellite as seen from the scene, `azimuth` from true north clockwise.
     """
@@ -129,7 +129,7 @@ class SourceImage:
 
 @dataclass(frozen=True)
 class MapPlacement:
-    """How an image lies on the map; None for what the file does not say.
+    """Position of an image on the map; None if not stated.
 
     `upper_left` is the map position of the *centre* of the first pixel, `size` columns and rows.
     """
@@ -140,7 +140,7 @@ class MapPlacement:
     reference_height: float | None = None
 
     def completed_by(self, other: MapPlacement) -> MapPlacement:
-        """Return this placement with what it does not say taken from another."""
+        """Return this placement with missing values taken from another."""
         return MapPlacement(
             self.upper_left or other.upper_left,
             self.pixel or other.pixel,
@@ -162,8 +162,8 @@ class Component:
 class Delivery:
     """The statements of the metadata file of an order.
 
-    `crs` is None where the projection is another than UTM on WGS84, `projection` what the file calls it. `product`
-    is what the whole product has in common, where it does not belong to one component.
+    `crs` is None if the projection is not UTM on WGS84; `projection` is its name in the file. `product` has what
+    belongs to the whole product, not to one component.
     """
 
     file: str
@@ -194,7 +194,7 @@ class Delivery:
             raise InputError(
                 f"{problem} is called {name} (there are {known or 'none'})"
                 if name is not None
-                else f"the name of the image does not say which component it is (there are {known or 'none'})",
+                else f"the file name does not state the component (there are {known or 'none'})",
                 file=self.file,
                 field=f"{COMPONENTS}: Component ID",
                 remedy="give the metadata file that belongs to this image"
@@ -218,7 +218,7 @@ class Delivery:
                 f"{'no source image has' if not found else 'several source images have'}",
                 file=self.file,
                 field=f"{SOURCES}: Product Image ID",
-                remedy="ask for the whole metadata file",
+                remedy="get the complete metadata file",
             )
         return found[0]
 
@@ -248,7 +248,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
             raise InputError(
                 "the file is cut off: its last line does not end", file=path, field=COMPONENTS, remedy="copy it again"
             )
-        end = "the metadata file does not end with a line of =: was it cut off?"
+        end = "the metadata file does not end with a line of '='. Was it cut off?"
         notes.append(Notice("maybe-cut-off", end, file=str(path)))
     projection, crs = _projection(order)
     return Delivery(
@@ -269,7 +269,7 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
 
 @reads("copy the _hdr.txt again from the delivery")
 def read_header(path: str | PathLike[str]) -> MapPlacement:
-    """Read how an image lies on the map from its ``_hdr.txt``; its keys are those of a component.
+    """Read the position of an image on the map from its ``_hdr.txt``, with the keys of a component.
 
     Raises
     ------
@@ -284,14 +284,14 @@ def read_header(path: str | PathLike[str]) -> MapPlacement:
 
 
 def _text(path: str | PathLike[str]) -> str:
-    data = read_bounded(path, MAX_BYTES, field="metadata", remedy="give the option metadata=FILE")
+    data = read_bounded(path, MAX_BYTES, field="metadata", remedy="give the sensor option metadata=FILE")
     problem = None
     if len(data) > MAX_BYTES:
-        problem = f"a metadata file has not more than {MAX_BYTES // 1_000_000} MB"
+        problem = f"this file is larger than {MAX_BYTES // 1_000_000} MB, too large for metadata"
     elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
         problem = "this file is UTF-16 text"
     elif b"\0" in data:
-        problem = "this is a binary file, no metadata text"
+        problem = "this is a binary file, not metadata text"
     if problem:
         raise InputError(problem, file=path, field="metadata", remedy="give the _metadata.txt of the delivery")
     return decoded(data)
@@ -301,14 +301,17 @@ def _lines(path: str, text: str) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(text.splitlines(), start=1):
         if len(line) > MAX_LINE:
             raise InputError(
-                f"a line of {len(line)} characters", file=path, field=f"line {number}", remedy="copy the file again"
+                f"this line is too long ({len(line)} characters)",
+                file=path,
+                field=f"line {number}",
+                remedy="copy the file again",
             )
         if line.strip():
             yield number, line.expandtabs(3)
 
 
 def _sections(path: str, text: str) -> dict[str, list[SectionRecord]]:
-    """Return by title the records of each section; the first is what stands before any record."""
+    """Return the records of each section by title; the first one has the entries before all records."""
     blocks: list[list[tuple[int, str]]] = [[]]
     for number, line in _lines(path, text):
         if _RULE.fullmatch(line.strip()):
@@ -323,7 +326,7 @@ def _sections(path: str, text: str) -> dict[str, list[SectionRecord]]:
         number, title = block[0][0], " ".join(block[0][1].split())
         if title in sections:
             raise InputError(
-                f"this section stands there twice, again in line {number}",
+                f"this section appears again in line {number}",
                 file=path,
                 field=title[:60],
                 remedy="remove one of them",
@@ -359,7 +362,7 @@ def _records(path: str | PathLike[str], sections: dict[str, list[SectionRecord]]
             "this section is missing",
             file=path,
             field=title,
-            remedy="give the whole _metadata.txt of the delivery; a file that was cut off lacks the last sections",
+            remedy="give the complete _metadata.txt of the delivery",
         )
     return sections[title]
 
@@ -382,10 +385,11 @@ def _check_counts(
         stated = _head(path, sections, title, needed=False).count(key, units=("",))
         if found == 0 or (stated is not None and stated != found):
             raise InputError(
-                f"{found} are described, {'at least one' if stated is None else stated} should be",
+                f"the file describes {found} of these, but {'at least one' if stated is None else stated} "
+                f"should be there",
                 file=path,
                 field=f"{title}: {key}",
-                remedy="the file is cut off or was edited: copy it again",
+                remedy="the file was cut off or edited; copy it again",
             )
 
 
@@ -424,7 +428,7 @@ def _identity(record: SectionRecord, *keys: str) -> str:
             "this key is missing",
             file=record.file,
             field=f"{record.name}: {keys[0]}",
-            remedy="it links components with acquisitions: give the whole metadata file",
+            remedy="this key links components with acquisitions; give the complete metadata file",
         )
     return value
 
@@ -442,10 +446,10 @@ def _placement(record: SectionRecord) -> MapPlacement:
     ):
         if (first is None) != (second is None):
             raise InputError(
-                "one of the two is missing",
+                "give both values; one is missing",
                 file=record.file,
                 field=f"{record.name}: {key}",
-                remedy="the file is cut off or was edited: copy it again",
+                remedy="the file was cut off or edited; copy it again",
             )
     return MapPlacement(
         upper_left=None if x is None or y is None else (x, y),

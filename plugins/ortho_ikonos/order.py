@@ -1,4 +1,4 @@
-"""The files of an IKONOS order: which bands and components lie beside an image, and where each lies on the map."""
+"""The files of an IKONOS order: bands and components beside an image, and the map position of each."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class OrderImage:
 
     @classmethod
     def of(cls, path: Path) -> OrderImage | None:
-        """Return what the name says; None for a name that is not the vendor's."""
+        """Return the parts of the file name; None if it is not a name of the vendor."""
         match = _NAME.fullmatch(path.name)
         return match and cls(path, match["order"], match["band"].lower(), match["component"])
 
@@ -91,23 +91,25 @@ def bands_of(image: OrderImage, wanted: str) -> tuple[Path, ...]:
     missing = [name for name in names if name not in there]
     if missing or image.band not in names:
         raise InputError(
-            f"there is no band {missing[0]!r} beside it" if missing else f"band {image.band!r} is not one of them",
+            f"no file found for band {missing[0]!r}"
+            if missing
+            else f"the choice lacks this image's own band {image.band!r}",
             file=image.path,
             field="bands",
-            remedy=f"all, one, or some of {', '.join(sorted(there))} with the band of this image among them",
+            remedy=f"use all, one, or some of {', '.join(sorted(there))}, including the band of this image",
         )
     return tuple(there[name] for name in names)
 
 
-# -- where an image lies ---------------------------------------------------------------------------------------------
+# -- map position ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Position:
-    """Where an image lies on the map; None for what nothing says.
+    """Position of an image on the map; None if not stated.
 
     `corner` is the outer corner of the first pixel, `pixel` the size of a pixel of this image, both in metres;
-    `sources` are the files that say so.
+    `sources` are the files with this information.
     """
 
     crs: str | None
@@ -130,12 +132,12 @@ class Position:
 
 
 def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component) -> Position:
-    """Return where an image lies: by its header, its component, the product, and last by its own georeferencing.
+    """Return the position of an image: from its header, its component, the product, or last from its georeferencing.
 
     Raises
     ------
     InputError
-        If the image has not the size that is stated.
+        If the image has another size than stated.
     """
     path, size = place(dataset.GetDescription()), (dataset.RasterXSize, dataset.RasterYSize)
     header = beside(path, f"{path.stem}_hdr.txt")
@@ -153,13 +155,13 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
         own_crs, own_corner, own_pixel = own
         crs = crs or own_crs.to_string()
         if not same_crs(parse_crs(crs), own_crs):
-            text = f"the image says it is in {own_crs.name}, the metadata {delivery.projection}"
+            text = f"the CRS is {own_crs.name} in the image, but {delivery.projection} in the metadata"
             warnings.append(Notice("metadata-contradict", text))
         elif corner is not None and pixel is not None:
             off = _difference(corner, pixel, own_corner, own_pixel, size)
             if off > _SAME:
                 text = (
-                    f"the georeferencing of the image is {off:.2f} px off the metadata, which are believed "
+                    f"the georeferencing of the image is {off:.2f} px off the metadata; the metadata are used "
                     "(UL Map X and Y are the centre of the first pixel)"
                 )
                 warnings.append(Notice("metadata-contradict", text, difference_px=off))
@@ -168,10 +170,10 @@ def position_of(dataset: gdal.Dataset, delivery: Delivery, component: Component)
 
 
 def _factor(stated: MapPlacement, size: tuple[int, int], path: Path, own_pixel: tuple[float, float] | None) -> int:
-    """Return how many stated pixels are one pixel of the image: 4 for colours beside panchromatic metadata.
+    """Return the number of stated pixels per pixel of the image: 4 for colours with panchromatic metadata.
 
-    Colour and panchromatic images of one acquisition share their outer corner. A crop to a half, or to a quarter, has
-    such a size as well: its own pixels tell, and where it has none, only colours can be coarser.
+    Colour and panchromatic images of one acquisition share their outer corner. A crop to a half or a quarter can have
+    such a size too. Then its pixel size decides; without one, only colours can be coarser.
     """
     if stated.size is None or stated.size == size:
         return 1
@@ -188,10 +190,10 @@ def _factor(stated: MapPlacement, size: tuple[int, int], path: Path, own_pixel: 
         fits &= factor == COARSER and not (image is not None and image.grid == "pan")
     if not fits:
         raise InputError(
-            f"the image has {size[0]} x {size[1]} pixels, the metadata are of {stated.size[0]} x {stated.size[1]}",
+            f"the image has {size[0]} x {size[1]} pixels, but the metadata are for {stated.size[0]} x {stated.size[1]}",
             file=path,
             field="Columns, Rows",
-            remedy="give the whole image as delivered, and its own metadata",
+            remedy="use the complete image as delivered, with its own metadata",
         )
     return factor
 

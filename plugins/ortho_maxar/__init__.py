@@ -23,7 +23,7 @@ from ortho_pipeline.plugin import (
     rpc_of_dataset,
 )
 
-#: From here on (px) the rigorous model and the RPC are worth a word, and from here on they are of two images.
+#: If rigorous model and RPC differ by more (px), warn; if by more than the second value, they are of different images.
 APART, DISAGREEMENT = 5.0, 100.0
 
 
@@ -35,12 +35,12 @@ def ortho_sensors() -> Iterable[Sensor]:
         "WorldView 1 to 4, GeoEye-1, QuickBird with ISD XML: image, tile, part of a strip, or .TIL of all tiles",
         recognises,
         open_scene,
-        options={"rpc": "which RPC to use: tag, sidecar, or an RPC file; by itself that of the XML"},
+        options={"rpc": "which RPC to use: tag, sidecar, or an RPC file; default: that of the XML"},
     )
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether ISD XML of an image lies beside it."""
+    """Return whether there is ISD XML beside an image."""
     return metadata_of(dataset.GetDescription()) is not None
 
 
@@ -49,15 +49,16 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     path = metadata_of(name)
     if path is None:
-        raise InputError("there is no ISD XML beside this image", file=name, remedy="add it from the delivery")
+        raise InputError("no ISD XML found beside this image", file=name, remedy="add it from the delivery")
     isd, image = Isd(path), place(name)
     tile, warnings = tile_of(isd, image.name), []
     if tile is not None and (tile.width, tile.height) != size:
-        text = f"the XML calls this tile {tile.width} x {tile.height}, it has {size[0]} x {size[1]} pixels"
+        text = f"this tile has {tile.width} x {tile.height} pixels in the XML, but {size[0]} x {size[1]} in the image"
         warnings.append(Notice("maybe-a-crop", text, metadata_size=[tile.width, tile.height]))
     elif tile is None and isd.size != size:
-        text = "the XML is of {} x {} pixels, the image has {} x {}; its models are of its first corner".format(
-            *isd.size, *size
+        text = (
+            "the XML is for {} x {} pixels, but the image has {} x {}. If it is a crop, it is assumed to "
+            "begin at the first corner".format(*isd.size, *size)
         )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=list(isd.size)))
     found, source = _rpc(dataset, isd, rpc, tile)
@@ -72,7 +73,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     except InputError as error:
         if found is None:
             raise
-        text = f"{path.name} has a rigorous model that is left out: {error.field or 'model'}: {error.message}"
+        text = f"the rigorous model in {path.name} is not used: {error.field or 'model'}: {error.message}"
         warnings.append(Notice("rigorous-left-out", text, file=path.name))
     parts, said = parts_beside(isd, image, rigorous=found is None) if tile is None else ([], [])
     colours = colours_beside(isd, image, next(iter(models.values())))
@@ -90,7 +91,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
 
 
 def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None) -> tuple[RPC | None, str]:
-    """Return the RPC of an image in its own pixels, and where it is from."""
+    """Return the RPC of an image in its own pixels, and its source."""
     if choice is not None:
         return rpc_of_dataset(dataset, choice)
     if isd.rpc is None:
@@ -99,7 +100,7 @@ def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None)
 
 
 def _compared(rigorous: Pushbroom, rpc: RPC | None) -> list[Notice]:
-    """Return a warning where rigorous model and RPC of an image differ; refuse to take both where it is much."""
+    """Return a warning if rigorous model and RPC of an image differ; raise an error if they differ too much."""
     if rpc is None:
         return []
     middle = np.array([rigorous.camera.size]) / 2
@@ -110,7 +111,7 @@ def _compared(rigorous: Pushbroom, rpc: RPC | None) -> list[Notice]:
     if apart <= APART:
         return []
     text = (
-        f"the rigorous model and the RPC are {apart:.0f} px apart: programs that rewrite the XML write RPCs of their"
-        " own, without aberration; points tell which is right"
+        f"the rigorous model and the RPC are {apart:.0f} px apart. Programs that rewrite the XML write their own RPC, "
+        "without aberration. Compare both at check points"
     )
     return [Notice("rpc-and-rigorous-differ", text, difference_px=round(apart, 2))]

@@ -32,7 +32,7 @@ _XML = re.compile(r".+\.xml$", re.IGNORECASE | re.DOTALL)
 
 
 def is_isd(path: Path) -> bool:
-    """Tell whether a file is ISD XML, from its first bytes."""
+    """Return whether a file is ISD XML, from its first bytes."""
     try:
         return bool(_ISD.search(read_bounded(path, 2000)[:2000]))
     except InputError:
@@ -79,7 +79,7 @@ def tiles_beside(isd: Isd, image: Path, own: Tile | None) -> Iterator[Piece]:
 
 
 def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], list[Notice]]:
-    """Return the other parts of the strip, in the pixels of this one, and what is to be said of those not taken.
+    """Return the other parts of the strip in pixels of this one, and warnings about parts that are not used.
 
     Rows of parts follow each other in time; where they overlap, both have the same ground.
     """
@@ -98,7 +98,7 @@ def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], li
             if model is not None:
                 pieces.append(Piece(there, (0.0, round((its - start) / period, 3)), other.size, model))
         except InputError as error:
-            text = f"the part {path.name} is left out: {error.message}"
+            text = f"the part {path.name} is not used: {error.message}"
             notices.append(Notice("part-left-out", text, file=path.name))
     return pieces, notices
 
@@ -106,7 +106,7 @@ def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], li
 def colours_beside(isd: Isd, image: Path, model: SensorModel) -> Iterator[Piece]:
     """Yield the images of other bands that were taken with this one, panchromatic for colours or colours for it.
 
-    They lie in the same folder, or as they are delivered, in ``..._PAN`` and ``..._MUL`` beside each other.
+    They are in the same folder or, as delivered, in folders ``..._PAN`` and ``..._MUL`` beside each other.
     """
     for path in _of_other_bands(isd.path):
         try:

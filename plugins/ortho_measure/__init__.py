@@ -19,7 +19,7 @@ def ortho_commands() -> Iterable[Subcommand]:
         "ortho_measure.cli:measure",
         (
             (
-                "Points by hand, beside the reference, in the browser:",
+                "Measure points by hand in the browser, next to the reference:",
                 "ortho measure scene.tif --reference reference.tif --dem dem.tif -o points.geojson",
             ),
         ),

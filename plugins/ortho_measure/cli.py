@@ -37,10 +37,12 @@ if TYPE_CHECKING:
     "-o",
     type=click.Path(dir_okay=False),
     metavar="FILE.geojson",
-    help="Points, with their journal beside them.  [default: <stems>_points.geojson]",
+    help="File for the points; their journal is beside it.  [default: <stems>_points.geojson]",
 )
-@click.option("--no-browser", is_flag=True, help="Print the address, and open nothing.")
-@click.option("--port", type=click.IntRange(0, 65535), default=0, help="On this machine.  [default: any that is free]")
+@click.option("--no-browser", is_flag=True, help="Only print the address; do not open a browser.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free port]"
+)
 @scenes_options
 @json_option
 def measure(
@@ -63,7 +65,7 @@ def measure(
     """
     if not match.reference and len(images) == 1:
         raise InputError(
-            "there is nothing to measure against",
+            "a single image needs a reference to measure against",
             field="match.reference",
             remedy="give an orthoimage of the same place",
         )
@@ -97,7 +99,7 @@ def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -
 
     path = until_end.enter_context(private_file(address, points))
     if path is None:
-        say("Note: no private file can be written beside the points. Open the address yourself.", err=True)
+        say("Note: cannot write a private file beside the points. Open the address in your browser yourself.", err=True)
     else:
         webbrowser.open(path.as_uri())
 
@@ -126,10 +128,12 @@ def _session(
     for field in ("select", "fit_model", "model_crs", "prune", "params", "significance", "ridge", "near"):
         if getattr(points, field) != getattr(PointOptions, field):
             raise InputError(
-                "this is said of one image, and there are several", field=f"points.{field}", remedy="leave it out"
+                "this option is for a single image, but there are several",
+                field=f"points.{field}",
+                remedy="leave it out",
             )
     if points.gcps is not None and not isinstance(points.gcps, str):
-        raise InputError("several images begin with a file of points", field="points.gcps", remedy="give a file")
+        raise InputError("for several images, this must be a file of points", field="points.gcps", remedy="give a file")
     asked = BlockOptions(
         points=points.gcps,
         crs=points.crs,

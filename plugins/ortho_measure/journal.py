@@ -23,7 +23,7 @@ MAX_BYTES = 256_000_000
 #: What is appended to the name of a journal for what follows an impossible action.
 REST = ".rest"
 #: What helps where a journal cannot be opened.
-REMEDY = "move it away to begin anew, or restore it from a copy"
+REMEDY = "move the journal away to start again, or restore it from a backup"
 
 
 class Journal:
@@ -78,9 +78,9 @@ class Journal:
         """
         if self._lock is None:
             raise InputError(
-                "another process measures these points: this one only shows them",
+                "these points are open in another ortho measure process; this one is read-only",
                 file=self.path,
-                remedy="close the other one, and start again",
+                remedy="close the other process, and start again",
             )
         try:
             self._lock.append(_line(action))
@@ -140,7 +140,7 @@ def _line(action: Mapping[str, Any]) -> bytes:
 
 def _whole(descriptor: int, path: Path) -> bytes:
     if os.fstat(descriptor).st_size > MAX_BYTES:
-        raise InputError("this is no journal of measured points: it is too large", file=path, remedy=REMEDY)
+        raise InputError("this file is too large for a journal of measured points", file=path, remedy=REMEDY)
     parts = []
     while part := os.read(descriptor, 1 << 20):
         parts.append(part)
@@ -161,7 +161,7 @@ def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
                 # A power cut can leave the length of a line without its bytes.
                 return start, found
             raise InputError(
-                "this journal is damaged, and what follows rests on it",
+                "the journal is damaged at this line, and later actions depend on it",
                 file=path,
                 field=f"line {len(found) + 1}",
                 remedy=REMEDY,
@@ -185,5 +185,5 @@ def _unwritable(path: Path, error: OSError) -> InputError:
     return InputError(
         f"the journal cannot be written ({error.strerror or error})",
         file=path,
-        remedy="choose an output in a folder that you may write to and that has room",
+        remedy="choose an output in a folder with write permission and free space",
     )

@@ -133,37 +133,47 @@ def checked(mark: Mark) -> Mark:
     name = plain_id(mark.id)
     if not name or name != mark.id or len(name) > LONGEST_ID or not is_writable(name):
         raise InputError(
-            "this is no name of a point", field="id", remedy=f"1 to {LONGEST_ID} characters, single blanks only within"
+            "this is not a valid point name",
+            field="id",
+            remedy=f"use 1 to {LONGEST_ID} characters; no blank at the ends, no two blanks together",
         )
     if len(mark.note) > LONGEST_NOTE or not is_writable(mark.note):
-        raise InputError("this note cannot be kept", field="note", remedy=f"write at most {LONGEST_NOTE} characters")
+        raise InputError(
+            "this note is too long or has unusual characters",
+            field="note",
+            remedy=f"write at most {LONGEST_NOTE} characters",
+        )
     _check_measurement(mark, "")
     for name, ray in mark.rays.items():
         _check_measurement(ray, f"rays.{name}.")
     if mark.ground is not None:
         lon, lat, height = mark.ground
         if not (abs(lon) <= 360 and abs(lat) <= 90 and abs(height) <= 20_000):
-            raise InputError("this is no place on Earth", field="ground", remedy="check the coordinates and their CRS")
+            raise InputError(
+                "this position is not on Earth", field="ground", remedy="check the coordinates and their CRS"
+            )
     for key in ("sigma_xy", "sigma_h", "sigma_common", "sigma_alike"):
         if not 0 <= getattr(mark, key) <= 1e6:
-            raise InputError("a standard deviation is not negative", field=key, remedy="give 0 or more")
+            raise InputError("a standard deviation must not be negative", field=key, remedy="give 0 or more")
     if mark.group is not None and not 0 <= mark.group < _GROUPS:
-        raise InputError("this is no number of a group", field="group", remedy=f"give 0 to {_GROUPS - 1}")
+        raise InputError("this is not a group number", field="group", remedy=f"give 0 to {_GROUPS - 1}")
     return mark
 
 
 def _check_measurement(one: Mark | RayMark, where: str) -> None:
     if one.image is not None and max(map(abs, one.image)) > 1e8:
-        raise InputError("this is no place in an image", field=f"{where}image")
+        raise InputError("this is not an image position", field=f"{where}image")
     least, most = _SIGMAS
     if one.sigma_image is not None and not least <= one.sigma_image <= most:
-        raise InputError("a standard deviation is positive", field=f"{where}sigma_image", remedy="give pixels")
+        raise InputError(
+            "a standard deviation must be positive", field=f"{where}sigma_image", remedy="give it in pixels"
+        )
     if one.covariance is not None:
         column, row, both = one.covariance
         possible = least**2 <= min(column, row) and max(column, row) <= most**2
         # A power of a float, unlike a root, has no result beyond 1e308.
         if not (possible and abs(both) < math.sqrt(column * row * (1 - 1e-9))):
-            raise InputError("this is no covariance", field=f"{where}covariance")
+            raise InputError("this is not a covariance", field=f"{where}covariance")
 
 
 def mark_of(document: Any) -> Mark:
@@ -177,7 +187,7 @@ def mark_of(document: Any) -> Mark:
     try:
         return checked(Mark.read(document))
     except DocumentError as error:
-        raise InputError(f"not a mark: {error.fault}", field=error.place or "mark") from error
+        raise InputError(f"this is not a point: {error.fault}", field=error.place or "mark") from error
 
 
 @dataclass(frozen=True)
@@ -315,7 +325,7 @@ class History:
         if action.get("do") in ("undo", "redo"):
             _require_members(action, set())
             if not (self.can_undo if action["do"] == "undo" else self.can_redo):
-                raise InputError(f"there is nothing to {action['do']}", field="do")
+                raise InputError(f"nothing to {action['do']}", field="do")
             return -1 if action["do"] == "undo" else 1
         return _changed(self.marks, action)
 
@@ -332,38 +342,38 @@ def _changed(marks: Marks, action: Mapping[str, Any]) -> Marks:
     kind = action.get("do")
     members = {"begin": {"marks"}, "put": {"mark", "was"}, "remove": {"id"}, "correct": {"correction"}}
     if not isinstance(kind, str) or kind not in members:
-        raise InputError("this is no action", field="do", remedy=f"one of {', '.join(members)}, undo, redo")
+        raise InputError("unknown action", field="do", remedy=f"use one of {', '.join(members)}, undo, redo")
     _require_members(action, members[kind])
     if kind == "begin":
         if marks.by_id or not isinstance(action.get("marks"), list):
-            raise InputError("only an empty table is begun with marks", field="marks")
+            raise InputError("points can only be loaded into an empty table", field="marks")
         return _begun([mark_of(one) for one in action["marks"]])
     if kind == "put":
         return replace(marks, by_id=_with(marks.by_id, mark_of(action.get("mark")), action.get("was")))
     if kind == "remove":
         name = str(action.get("id"))
         if name not in marks.by_id:
-            raise InputError(f"there is no point {name}", field="id")
+            raise InputError(f"unknown point {name}", field="id")
         return replace(marks, by_id={key: mark for key, mark in marks.by_id.items() if key != name})
     chosen = action.get("correction")
     if chosen is not None and chosen not in CORRECTIONS:
-        raise InputError("there is no such correction", field="correction", remedy=f"one of {', '.join(CORRECTIONS)}")
+        raise InputError("unknown correction", field="correction", remedy=f"use one of {', '.join(CORRECTIONS)}")
     return replace(marks, correction=chosen)
 
 
 def _require_members(action: Mapping[str, Any], members: set[str]) -> None:
     if not set(action) <= members | {"do"}:
         raise InputError(
-            "this action has members that it cannot have",
+            "this action has unknown members",
             field="action",
-            remedy=f"leave out all but {', '.join(sorted(members | {'do'}))}",
+            remedy=f"use only {', '.join(sorted(members | {'do'}))}",
         )
 
 
 def _begun(marks: Sequence[Mark]) -> Marks:
     found = {mark.id: mark for mark in marks}
     if len(found) != len(marks) or len(found) > MOST_MARKS:
-        raise InputError(f"{counted(len(marks), 'point')}: too many, or two of one name", field="marks")
+        raise InputError(f"{counted(len(marks), 'point')}: too many, or two with the same name", field="marks")
     return Marks(found)
 
 
@@ -371,13 +381,13 @@ def _with(marks: Mapping[str, Mark], mark: Mark, was: object) -> dict[str, Mark]
     """Return marks with another one, in the place of the one that it replaces."""
     before = mark.id if was is None else str(was)
     if was is not None and before not in marks:
-        raise InputError(f"there is no point {before}", field="was")
+        raise InputError(f"unknown point {before}", field="was")
     if mark.id != before and mark.id in marks:
-        raise InputError(f"there is a point {mark.id} already", field="id", remedy="choose another name")
+        raise InputError(f"a point {mark.id} already exists", field="id", remedy="choose another name")
     _refuse_twin([other for key, other in marks.items() if key != before], mark)
     if before not in marks:
         if len(marks) >= MOST_MARKS:
-            raise InputError(f"there are {MOST_MARKS} points already", field="mark")
+            raise InputError(f"there are already {MOST_MARKS} points, the limit", field="mark")
         return {**marks, mark.id: mark}
     return {mark.id if key == before else key: mark if key == before else one for key, one in marks.items()}
 
@@ -390,5 +400,7 @@ def _refuse_twin(others: Sequence[Mark], mark: Mark) -> None:
         if other.counts and (same := mark.places & other.places):
             name = str(min(same, key=str)[0])
             raise InputError(
-                f"{other.id} has the same {name}", field=name, remedy=f"measure {other.id} anew, or switch it off"
+                f"{other.id} already has the same {name} position",
+                field=name,
+                remedy=f"measure {other.id} again, or switch it off",
             )

@@ -169,19 +169,19 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
         # What else PROJ understands may name files, and a page opens none.
         if not re.fullmatch(_NAMED, text.strip(), re.ASCII | re.IGNORECASE):
             raise InputError(
-                "this is not known by that name",
+                "unknown CRS" if field == "crs" else "unknown height datum",
                 field=field,
-                remedy="give EPSG:n, for heights also ellipsoid, egm96 or egm2008",
+                remedy="give EPSG:n; for heights also ellipsoid, egm96 or egm2008",
             )
     if len(values) != 3 or values[0] is None or values[1] is None:
-        raise InputError("ground has x and y, and a height or none", field="ground")
+        raise InputError("enter x and y; the height is optional", field="ground")
     plane = horizontal(parse_crs(crs))
     plan = np.array([[values[0], values[1]]], dtype=float)
     lonlat = ground_transform(plane, "EPSG:4326")(np.column_stack([plan, [0.0]]))[0, :2]
     if values[2] is None:
         height = float(surface.heights(plan, plane)[0])
         if not np.isfinite(height):
-            raise InputError("the DEM has no height here", field="ground", remedy="type the height")
+            raise InputError("the DEM has no height here", field="ground", remedy="enter the height")
     else:
         datum = Vertical.parse(vertical or "ellipsoid")
         undulation = 0.0 if datum.is_ellipsoid else float(datum.undulation(lonlat[:1], lonlat[1:])[0])

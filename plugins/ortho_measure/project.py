@@ -106,7 +106,7 @@ class _Shown(abc.ABC):
     def _geometry(self, name: str, version: int) -> Geometry:
         known = self._geometries(version)
         if name not in known:
-            raise InputError("there is no such view", field="at")
+            raise InputError("unknown view", field="at")
         return known[name]
 
     def predict(
@@ -254,17 +254,17 @@ class Project(_Shown):
                     self.journal.append(self._first())
             elif self.journal.actions[0].get("image") != self._identity():
                 raise InputError(
-                    "this journal is of another image",
+                    "this journal belongs to another image",
                     file=self.journal.path,
                     field="output",
                     remedy="choose another output, or move the journal away",
                 )
             elif source is not None and source != self.journal.actions[0].get("source"):
                 raise InputError(
-                    "there is a journal of these points, which began with others",
+                    "the journal of this output started with other points",
                     file=self.journal.path,
                     field="points.gcps",
-                    remedy=Text("leave out ", Setting("points.gcps"), " to go on, or choose another output"),
+                    remedy=Text("leave out ", Setting("points.gcps"), " to continue, or choose another output"),
                 )
             with completed(self.journal.path, remedy=JOURNAL_REMEDY):
                 count = self._take(self.journal.actions)
@@ -284,7 +284,7 @@ class Project(_Shown):
                 if action.get("do") == "begin":
                     raise
                 line = len(self.journal.actions) - len(actions) + number + 1
-                self.stopped = f"action {line} of the journal is impossible ({error.message})"
+                self.stopped = f"action {line} of the journal cannot be repeated ({error.message})"
                 return number
         return len(actions)
 
@@ -301,10 +301,12 @@ class Project(_Shown):
         given = self._given()
         if given is None and self.output.exists():
             raise InputError(
-                "there are points here, and no journal of them",
+                "this file already exists and was not made by ortho measure",
                 file=self.output,
                 field="output",
-                remedy=Text("give them as ", Setting("points.gcps"), " to go on, or choose another output"),
+                remedy=Text(
+                    "give it as ", Setting("points.gcps"), " to continue with its points, or choose another output"
+                ),
             )
         return {
             "do": "begin",
@@ -340,7 +342,7 @@ class Project(_Shown):
         """
         with self._lock:
             if action.get("do") == "begin":
-                raise InputError("this is no action", field="do")
+                raise InputError("unknown action", field="do")
             done = (
                 {**action, "mark": {**action["mark"], "at": now()}} if isinstance(action.get("mark"), dict) else action
             )
@@ -388,7 +390,7 @@ def points_file(output: str | os.PathLike[str]) -> Path:
     path = Path(output)
     if path.suffix.lower() != ".geojson":
         raise InputError(
-            "measured points are written as GeoJSON", file=path, field="output", remedy="a name with `.geojson`"
+            "measured points are written as GeoJSON", file=path, field="output", remedy="use a name with .geojson"
         )
     return path
 

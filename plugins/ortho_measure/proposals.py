@@ -84,7 +84,7 @@ def propose(places: SceneGeometry, image: Sequence[float], radius: float) -> Pro
     around = scene_chips(places.view, origin - reach * factor, SIDE + 2 * reach, factor)
     doubt = str(doubts(found, wide, around, reach)[0])
     if not np.isfinite(wide).any():
-        return _nothing("the reference shows nothing here")
+        return _nothing("the reference has no data here")
     shift, measured = found.shift[0] * factor, None
     for _ in range(_ROUNDS):
         measured = _measured(places, origin, shift, factor, scene)
@@ -117,18 +117,18 @@ def proposal_of(places: SceneGeometry, click: Array | None, ground: Array | None
     if ground is not None:
         expected = places.image_of([ground])[0]
         if click is None and not np.isfinite(expected).all():
-            raise InputError("the model leads outside of the scene", field="ground", remedy="click it in the scene")
+            raise InputError("this place is outside the scene", field="ground", remedy="click it in the scene")
         about = expected if click is None else click
         found = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
         place, on_ground = about - found.shift, ground
     elif click is None:
-        raise InputError("there is no place to match", field="image")
+        raise InputError("no position to match", field="image")
     else:
         found = propose(places, click.tolist(), radius)
         place, on_ground = click, np.full(3, np.nan)
         if np.isfinite(found.shift).all():
             on_ground = places.ground_of([click + found.shift])[0]
-    reason = found.reason or ("" if np.isfinite(on_ground).all() else "the heights do not reach here")
+    reason = found.reason or ("" if np.isfinite(on_ground).all() else "the DEM does not cover this place")
     (column, both), (_, row) = found.covariance
     told: dict[str, Any] = json_value(
         {

@@ -94,7 +94,7 @@ class Session(Project):
         for mark in marks:
             if mark.rays or mark.role == "tie":
                 raise InputError(
-                    "there is one image, and this is a point of several", field="rays", remedy="load the page anew"
+                    "this point belongs to several images, but there is one", field="rays", remedy="reload the page"
                 )
 
     def _solve(self) -> None:
@@ -136,7 +136,7 @@ class Session(Project):
     def at(self, version: int) -> SceneGeometry:
         """Return the geometry that the reference was rendered with."""
         if not 0 <= version < len(self.rendered):
-            raise InputError("there is no such rendering", field="version")
+            raise InputError("unknown rendering", field="version", remedy="reload the page")
         return self.places.by(self.rendered[version])
 
     def _geometries(self, version: int) -> dict[str, Geometry]:
@@ -231,9 +231,9 @@ def open_session(
     path = points_file(output)
     if points.fit_model is not None:
         raise InputError(
-            "the reference is shown by the scene's own model",
+            "ortho measure works with the scene's own model",
             field="points.fit_model",
-            remedy="leave it out, and fit the model to the saved points",
+            remedy="leave it out; fit this model later to the saved points",
         )
     require_heights(surface)
     request = Request(image, scene, points, surface, match)

@@ -137,21 +137,21 @@ def normalised_residuals(fit: Fit) -> Array:
 def _headline(fit: Fit | None) -> dict[str, Any]:
     """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
     if fit is None:
-        return {"px": None, "m": None, "what": "not tested: no points yet"}
+        return {"px": None, "m": None, "what": "no points yet"}
     relative = bool((fit.points.groups[fit.used] >= 0).any())
     to = ", relative to the reference" if relative else ""
     check, loo = fit.rmse("check"), fit.rmse("loo") if fit.redundancy else None
     checks = 0 if check is None else check.n
     which, found = ("loo", loo) if loo is not None and checks < LEAST_CHECK_POINTS else ("check", check)
     if found is None:
-        return {"px": None, "m": None, "what": "not tested: nothing is left over to test the fit with"}
+        return {"px": None, "m": None, "what": "no redundancy: add points to test the fit"}
     if which == "check":
-        what = f"{counted(checks, 'check point')} that took no part{to}"
-        few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if checks < ENOUGH_CHECK_POINTS else ""
+        what = f"{counted(checks, 'check point')}{to}"
+        few = f". Indicative: fewer than {ENOUGH_CHECK_POINTS} check points" if checks < ENOUGH_CHECK_POINTS else ""
     else:
-        what = f"{counted(found.n, 'control point')}, each left out in turn{to}"
-        few = "; no check points were kept apart"
+        what = f"{counted(found.n, 'control point')} (leave-one-out){to}"
+        few = ". No check points"
         if check is not None:
-            few = f"; {counted(checks, 'check point')} ({check.total:.2f} px): too few to judge by"
+            few = f". Only {counted(checks, 'check point')} ({check.total:.2f} px)"
     ground = getattr(rmse_metres(fit), which)
     return {"px": found.total, "m": ground and json_value(ground.total), "n": found.n, "what": f"RMSE at {what}{few}"}

@@ -21,8 +21,8 @@ BANDS = ("blue", "green", "red", "nir")
 FAMILIES = ("affine14", "affine12", "affine3d", "dlt")
 UNSUITED = dict.fromkeys(
     FAMILIES[1:],
-    "this is an original scene, not projected to a plane: affine12, affine3d and dlt leave several metres; of the "
-    "families only affine14 comes near the RPC",
+    "this scene is not projected to a plane, so affine12, affine3d and dlt leave several metres. Only affine14 comes "
+    "close to the RPC",
 )
 #: Ground speed (m/s) below a circular orbit at 470 km, and the most panchromatic lines per second (staggered).
 GROUND_SPEED, LINES_PER_SECOND = 7100.0, {"panchromatic": 5000.0, "multispectral": 1250.0}
@@ -41,14 +41,14 @@ def ortho_sensors() -> Iterable[Sensor]:
         recognises,
         open_scene,
         options={
-            "rpc": "which RPC to use: text (default), label, or an RPC file",
-            "label": "the label, where it is not <image>.pvl",
+            "rpc": "which RPC to use: text (default), label or an RPC file",
+            "label": "the label, if it is not <image>.pvl",
         },
     )
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether a label of OrbView-3 lies beside the image."""
+    """Return whether there is an OrbView-3 label beside the image."""
     path = label_of(dataset.GetDescription())
     if path is None:
         return False
@@ -56,7 +56,7 @@ def recognises(dataset: gdal.Dataset) -> bool:
         text = read_bounded(path, 100_000)
     except InputError:
         return False
-    # A label that is cut off should say so, and not be passed over: the name of the satellite comes late in it.
+    # Also accept a truncated label, so that the error says so: the name of the satellite is near its end.
     return b"OV-3" in text or (b"productInfo" in text and b"numScanLines" in text) or bool(_NAME.match(path.name))
 
 
@@ -65,16 +65,21 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
     name = dataset.GetDescription()
     path = place(label) if label else label_of(name)
     if path is None:
-        raise InputError("there is no label beside this image", file=name, field="label", remedy="give label=FILE")
+        raise InputError(
+            "no label (.pvl) found beside this image",
+            file=name,
+            field="label",
+            remedy="give it as sensor option label=FILE",
+        )
     product = read_product(path)
     size = dataset.RasterXSize, dataset.RasterYSize
     if size != (product.columns, product.rows):
         raise InputError(
-            f"the label is for {product.columns} x {product.rows} pixels, the image has {size[0]} x {size[1]}",
+            f"the label is for {product.columns} x {product.rows} pixels, but the image has {size[0]} x {size[1]}",
             file=path,
             field="productInfo.pixelsPerScanLine, productInfo.numScanLines",
             remedy=Text(
-                "give the whole scene and its own label, or an image with an RPC of its own (",
+                "use the whole scene with its own label, or an image that has its own RPC (",
                 Setting("scene.sensor", "rpc"),
                 ")",
             ),
@@ -135,5 +140,5 @@ def _contradictions(product: Product) -> Iterator[Notice]:
     misses = product.corner_misses
     worst = float(np.abs(misses).max()) if np.isfinite(misses).all() else math.inf
     if not worst <= _CORNER_MISS:
-        text = f"the label contradicts itself: its RPC projects its corners up to {worst:.3g} px beside the image's"
+        text = f"the label contradicts itself: its RPC projects its corners up to {worst:.3g} px off the image corners"
         yield Notice("metadata-contradict", text, difference_px=worst)

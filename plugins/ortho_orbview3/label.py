@@ -59,7 +59,7 @@ class LabelGroup:
         return self.groups[name]
 
     def text(self, key: str) -> str:
-        """Return a value as it stands there, without its quotes.
+        """Return a value as written, without quotes.
 
         Raises
         ------
@@ -68,7 +68,7 @@ class LabelGroup:
         """
         value = self._value(key)
         if isinstance(value, tuple):
-            raise InputError("here one value is expected, not a list", file=self.file, field=self.place(key))
+            raise InputError("expected one value, not a list", file=self.file, field=self.place(key))
         return value
 
     def number(self, key: str) -> float:
@@ -77,7 +77,7 @@ class LabelGroup:
         Raises
         ------
         InputError
-            If it is missing, or is none.
+            If it is missing or invalid.
         """
         return self._number(key, self.text(key))
 
@@ -87,33 +87,33 @@ class LabelGroup:
         Raises
         ------
         InputError
-            If it is missing, or is none.
+            If it is missing or invalid.
         """
         value = self.number(key)
         if value != int(value) or not 0 < value < 1e9:
-            raise InputError(f"{self.text(key)} is not a count of pixels", file=self.file, field=self.place(key))
+            raise InputError(f"{self.text(key)} is not a number of pixels", file=self.file, field=self.place(key))
         return int(value)
 
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return a list of so many finite numbers.
+        """Return a list of this many finite numbers.
 
         Raises
         ------
         InputError
-            If it is missing, or is not that.
+            If it is missing or invalid.
         """
         value = self._value(key)
         if not isinstance(value, tuple) or len(value) != count:
-            found = f"a list of {len(value)}" if isinstance(value, tuple) else "no list"
+            actual = f"a list of {len(value)}" if isinstance(value, tuple) else "one value"
             raise InputError(
-                f"here {counted(count, 'number is', 'numbers are')} expected, not {found}",
+                f"expected a list of {counted(count, 'number')}, not {actual}",
                 file=self.file,
                 field=self.place(key),
             )
         return tuple(self._number(key, part) for part in value)
 
     def has(self, key: str) -> bool:
-        """Tell whether there is a value of this key."""
+        """Return whether this key has a value."""
         return key in self.values
 
     def _value(self, key: str) -> str | tuple[str, ...]:
@@ -145,9 +145,9 @@ def read_label(path: str | PathLike[str]) -> LabelGroup:
 def _text(path: str | PathLike[str]) -> str:
     data = read_bounded(path, MAX_BYTES)
     if len(data) > MAX_BYTES:
-        raise InputError(f"a label of more than {MAX_BYTES} bytes is not read", file=path)
+        raise InputError(f"this label is larger than the limit of {MAX_BYTES} bytes", file=path)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in data:
-        raise InputError("a label is plain text, not a binary file or UTF-16", file=path)
+        raise InputError("a label must be plain text; this is a binary file or UTF-16", file=path)
     return decoded(data)
 
 
@@ -188,7 +188,7 @@ class _Reader:
     def read(self) -> LabelGroup:
         found = self.group("", 0)
         if not found.values and not found.groups:
-            raise InputError("there is nothing in this label", file=self.file)
+            raise InputError("this label is empty", file=self.file)
         return found
 
     def group(self, path: str, depth: int) -> LabelGroup:
@@ -207,11 +207,11 @@ class _Reader:
                 continue
             place = f"{path}.{token.text[:60]}" if path else token.text[:60]
             if token.kind != "word":
-                raise self.wrong(f"{token.text[:40]!r} is not where a key can be", f"{path}.{last}" if last else path)
+                raise self.wrong(f"{token.text[:40]!r} is not a key", f"{path}.{last}" if last else path)
             word = token.text.upper()
             if word == "END" and not (self.next is not None and self.next.text == "="):
                 if path:
-                    raise self.wrong("END stands within this group: its END_GROUP is missing", path)
+                    raise self.wrong("this group has no END_GROUP before END", path)
                 return LabelGroup(self.file, path, values, groups)
             if word in _CLOSE:
                 self.close(path)
@@ -221,23 +221,23 @@ class _Reader:
                 last = value if isinstance(value, str) else ""
                 inner = f"{path}.{last[:60]}" if path else last[:60]
                 if not last or last in groups:
-                    raise self.wrong("this group stands twice" if last else "a group has a name", inner)
+                    raise self.wrong("this group appears twice" if last else "this group has no name", inner)
                 groups[last] = self.group(inner, depth + 1)
             elif token.text in values:
-                raise self.wrong("this key stands twice", place)
+                raise self.wrong("this key appears twice", place)
             else:
                 last = token.text
                 values[last] = value
 
     def close(self, path: str) -> None:
-        """Read what follows END_GROUP: nothing, or the name of the group."""
+        """Read the rest of END_GROUP: nothing, or the name of the group."""
         if not path:
-            raise self.wrong("END_GROUP stands outside of all groups", f"line {self.line}")
+            raise self.wrong("END_GROUP without a group", f"line {self.line}")
         if self.next is None or self.next.text != "=":
             return
         name = self.value(path)
         if name != path.rpartition(".")[2]:
-            raise self.wrong(f"this group is closed by END_GROUP = {str(name)[:40]}", path)
+            raise self.wrong(f"this group ends with END_GROUP = {str(name)[:40]}, not with its own name", path)
 
     def value(self, place: str) -> str | tuple[str, ...]:
         sign = self.advance()
@@ -257,11 +257,11 @@ class _Reader:
         while True:
             token = self.advance()
             if token is None:
-                raise self.wrong("the file is cut off within this list", place)
+                raise self.wrong("the file is cut off in this list", place)
             if token.kind == "mark" and token.text in ")}":
                 return tuple(parts)
             if token.kind not in ("word", "quoted"):
-                raise self.wrong(f"{token.text[:40]!r} is not a value of a list", place)
+                raise self.wrong(f"{token.text[:40]!r} is not a list value", place)
             parts.append(token.text)
             if self.next is not None and self.next.text == ",":
                 self.advance()

@@ -1,4 +1,4 @@
-"""An OrbView-3 Basic product: what its label says, translated, and its RPC from the label and from the text file."""
+"""An OrbView-3 Basic product: its translated label, and its RPC from the label and from the text file."""
 
 from __future__ import annotations
 
@@ -102,12 +102,12 @@ class Product:
 
 
 def label_of(image: str | PathLike[str]) -> Path | None:
-    """Return the label beside an image, None if there is none."""
+    """Return the label beside an image; None without one."""
     return _beside(place(image), ".pvl")
 
 
 def rpc_text_of(image: str | PathLike[str]) -> Path | None:
-    """Return the RPC text beside an image, None if there is none."""
+    """Return the RPC text beside an image; None without one."""
     return _beside(place(image), "_rpc.txt")
 
 
@@ -155,17 +155,17 @@ def read_product(path: str | PathLike[str]) -> Product:
 
 
 def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple[RPC, str, tuple[Notice, ...]]:
-    """Return the RPC to use, its file, and what there is to say about it.
+    """Return the RPC to use, its file, and warnings.
 
     Parameters
     ----------
     choice : {None, 'label', 'text', 'sidecar'} or path
-        Which one, where they differ; the text is the side-car that GDAL reads.
+        Which RPC to use if they differ; the text is the sidecar that GDAL reads.
 
     Raises
     ------
     InputError
-        If the text is damaged or absent, or both differ by more than a pixel and none is chosen.
+        If the text is damaged or missing, or if both differ by more than a pixel and none is chosen.
     """
     if choice == "label":
         return product.rpc, product.file, ()
@@ -174,11 +174,11 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
     if text is None:
         if choice is not None:
             raise InputError(
-                "there is no RPC text beside the image",
+                "no RPC text file found beside the image",
                 field="rpc",
                 remedy=Text("take ", Setting("scene.rpc", "label")),
             )
-        text_missing = "there is no RPC text beside the label, whose own RPC is taken"
+        text_missing = "no RPC text file found beside the label, so the RPC of the label is used"
         return product.rpc, product.file, (Notice("no-rpc-text", text_missing),)
     rpc = read_rpc_text(text)
     difference = _difference(product.rpc, rpc)
@@ -186,11 +186,11 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
         return rpc, str(text), ()
     if not difference <= CONTRADICTORY:
         raise InputError(
-            f"the RPC in this file and that of {Path(product.file).name} differ by {difference:.3g} px",
+            f"the RPCs in this file and in {Path(product.file).name} differ by {difference:.3g} px",
             file=text,
             field="rpc",
             remedy=Text(
-                "choose one: ",
+                "choose one with ",
                 Setting("scene.rpc", "label"),
                 ", ",
                 Setting("scene.rpc", "text"),
@@ -198,7 +198,7 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
                 Setting("scene.rpc", "FILE"),
             ),
         )
-    differ = f"the RPCs of label and text differ by {difference:.2g} px; that of the text is taken"
+    differ = f"the RPCs of label and text file differ by {difference:.2g} px; the text file is used"
     return rpc, str(text), (Notice("rpcs-differ", differ, difference_px=difference),)
 
 
@@ -217,7 +217,7 @@ def _box(rpc: RPC) -> Array:
 def _positive(group: LabelGroup, key: str) -> float:
     value = group.number(key)
     if not value > 0:
-        raise InputError(f"{value:g} is not a spacing", file=group.file, field=group.place(key))
+        raise InputError(f"{value:g} is not a possible spacing", file=group.file, field=group.place(key))
     return value
 
 

@@ -1,7 +1,7 @@
 """Sensor plugin for Planet's basic products: PlanetScope level 1B and SkySat level 1A/1B, by their RPC.
 
-The metadata of an item (``<id>_metadata.json``) lie beside its assets, whose names begin with the item's. Frames of one
-strip are images of their own: `ortho adjust` takes them together.
+The metadata of an item (``<id>_metadata.json``) are beside its assets, whose names begin with that of the item. Frames
+of a strip are separate images; `ortho adjust` adjusts them together.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from ortho_pipeline.plugin import (
 
 MAX_SIZE = 5_000_000
 _METADATA = re.compile(r".*_metadata\.json$", re.IGNORECASE | re.DOTALL)
-_REMEDY = "download the item's metadata again"
-#: What of an item is worth showing, and what it is called here.
+_REMEDY = "download the metadata of this item again"
+#: Facts of an item, with their names here.
 _TEXTS = {
     "acquired": "acquired",
     "satellite_id": "satellite",
@@ -75,7 +75,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether metadata of an item of Planet lie beside an image."""
+    """Return whether there are metadata of a Planet item beside an image."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and b'"item_type"' in read_bounded(path, MAX_SIZE)
@@ -88,18 +88,20 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     name = dataset.GetDescription()
     path = metadata_of(name)
     if path is None:
-        raise InputError("there is no <id>_metadata.json beside this image", file=name, remedy="download it")
+        raise InputError("no <id>_metadata.json found beside this image", file=name, remedy="download it")
     facts = read_item(path)
     if rpc is None and not has_rpc(dataset):
         raise InputError(
-            "there is no RPC: orthorectified assets have none, and are orthoimages already",
+            "there is no RPC. Orthorectified assets have none, because they are already orthoimages",
             file=name,
-            remedy="take the basic product (level 1B, or SkySat's 1A) with its RPC",
+            remedy="use the basic product (level 1B, or SkySat level 1A) with its RPC",
         )
     model, source = rpc_of_dataset(dataset, rpc)
     warnings = []
     if not str(facts.get("item_type", "PS")).startswith(("PS", "SkySat")):
-        text = f"items of the type {facts['item_type']} were not at hand to check this reader with"
+        text = (
+            f"this reader was never tested with an item of the type {facts['item_type']}. Compare with control points"
+        )
         warnings.append(Notice("unchecked-product", text))
     return Scene(
         "planet",
@@ -116,17 +118,17 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
 
 @reads(_REMEDY)
 def read_item(path: Path) -> dict[str, Any]:
-    """Read what is worth showing of an item's metadata.
+    """Read the facts of an item's metadata.
 
     Raises
     ------
     InputError
-        If it is no JSON of an item.
+        If the file is not the JSON of an item.
     """
     document = read_json(path, MAX_SIZE, _REMEDY)
     properties = document.get("properties") if isinstance(document, dict) else None
     if not isinstance(properties, dict):
-        raise InputError("this is not the metadata of an item", file=path, field="properties", remedy=_REMEDY)
+        raise InputError("this file is not the metadata of an item", file=path, field="properties", remedy=_REMEDY)
     texts = {ours: properties.get(theirs) for theirs, ours in _TEXTS.items()}
     facts: dict[str, Any] = {name: text[:200] for name, text in texts.items() if isinstance(text, str)}
     for theirs, ours in _NUMBERS.items():

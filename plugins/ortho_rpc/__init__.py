@@ -1,7 +1,7 @@
 """Sensor plugin for every product that comes with an RPC: TIFF tag, side-car, DIMAP, NITF, VRT, or a file given.
 
-It is a fallback: a plugin that knows the product itself goes first. Where DIMAP metadata with the rigorous model of the
-same image lie beside it, the scene has the model ``pushbroom`` as well.
+It is a fallback: plugins that know the product have priority. If there are DIMAP metadata with the rigorous model of
+the same image beside it, the scene also has the model ``pushbroom``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ IMAGERY = {"SATELLITEID": "satellite", "ACQUISITIONDATETIME": "acquired", "CLOUD
 
 @hookimpl
 def ortho_sensors() -> Iterable[Sensor]:
-    """Offer the sensors ``rpc`` and ``geolocation``: what images say in GDAL's own words."""
+    """Offer the sensors ``rpc`` and ``geolocation``, for metadata that GDAL reads."""
     yield Sensor(
         "rpc",
         "any image with an RPC (tag, .RPB, _RPC.TXT, DIMAP, NITF, VRT)",
@@ -34,7 +34,7 @@ def ortho_sensors() -> Iterable[Sensor]:
     )
     yield Sensor(
         "geolocation",
-        "images with geolocation arrays (GDAL's domain, or files of longitudes and latitudes), as a start for matching",
+        "images with geolocation arrays (GDAL's domain, or files of longitudes and latitudes), to start matching",
         lambda dataset: geolocation.has_arrays(dataset) and not has_rpc(dataset),
         geolocation.open_scene,
         options=geolocation.OPTIONS,
@@ -43,7 +43,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether an image has an RPC, or is DIMAP metadata that have one beside them."""
+    """Return whether an image has an RPC, or is a DIMAP metadata file with one beside it."""
     return has_rpc(dataset) or _of_dimap(dataset) is not None
 
 
@@ -53,7 +53,7 @@ def _of_dimap(dataset: gdal.Dataset) -> Path | None:
 
 
 def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
-    """Open an image with its RPC, or with the one given."""
+    """Open an image with its RPC, or with a given one."""
     if rpc is None and not has_rpc(dataset) and (beside := _of_dimap(dataset)) is not None:
         rpc = str(beside)
     model, source = rpc_of_dataset(dataset, rpc)
@@ -98,6 +98,6 @@ def _facts_of(rigorous: Rigorous) -> dict[str, Any]:
 def _warnings(dataset: gdal.Dataset, model: RPC) -> tuple[Notice, ...]:
     warnings = []
     if dataset.GetGCPCount():
-        text = f"the file also has {dataset.GetGCPCount()} GCPs of its own, which GDAL programs prefer to RPC"
+        text = f"the file also has {dataset.GetGCPCount()} GCPs; GDAL programs use these instead of the RPC"
         warnings.append(Notice("gcps-beside-rpc", text, count=dataset.GetGCPCount()))
     return tuple(warnings)

@@ -12,7 +12,7 @@ from ortho_rpc.dimap import images_of, tile_of
 from ortho_rpc.dimap_file import DimapFile
 
 DIMAP = re.compile(r"(DIM|PHRDIMAP)[\w.-]*\.XML", re.IGNORECASE)
-#: Folders of one delivery, and metadata in each, that are looked at.
+#: Limits on the folders of one delivery, and on metadata files in each.
 _MOST = 20
 #: Bands whose pixels differ by less are registered in one image.
 _SAME_SCALE = 0.05
@@ -53,9 +53,9 @@ def _tiles(file: DimapFile, image: str, beside: dict[str, Path]) -> Iterator[Pie
 
 
 def _other_bands(file: DimapFile, model: SensorModel) -> Iterator[Piece]:
-    """Yield the images that were made of the same strip in other bands, each with its RPC.
+    """Yield the images of the same strip in other bands, each with its RPC.
 
-    They lie in the same folder, or as they are delivered, in folders ``IMG_...`` beside each other.
+    They are in the same folder or, as delivered, in folders ``IMG_...`` beside each other.
     """
     strip, bands = _strip(file), file.said(_SPECTRAL)
     folder = place(file.path).parent.absolute()  # a folder that is entered has no name of its own
@@ -87,7 +87,7 @@ def _of_bands(file: DimapFile, beside: dict[str, Path], rpc_file: Path, model: S
 
 
 def _strip(file: DimapFile) -> str | None:
-    """Return the name of the strip that an image was made of."""
+    """Return the name of the strip of an image."""
     found = (one for one in file.all(_SOURCES) if (one.findtext("SOURCE_TYPE") or "").strip() == "Strip_Source")
     return next(((one.findtext("SOURCE_ID") or "").strip() or None for one in found), None)
 
@@ -97,7 +97,7 @@ def _metadata(beside: dict[str, Path]) -> list[Path]:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """Return the files of a folder by their names in lower case; none where it cannot be read."""
+    """Return the files of a folder by their names in lower case; none if it cannot be read."""
     return {name.lower(): folder / name for name in _names(folder).names}
 
 

@@ -1,11 +1,11 @@
 """The rigorous model in DIMAP metadata: orbit, attitude and look directions instead of an RPC.
 
-Read are version 1 of Pleiades (`Sensor_Model_Characteristics`) and version 2 of Pleiades, Pleiades Neo, SPOT 6 and 7
-(`Refined_Model`). What the vendor's numbers mean:
+Supported are version 1 of Pleiades (`Sensor_Model_Characteristics`) and version 2 of Pleiades, Pleiades Neo, SPOT 6 and
+7 (`Refined_Model`). Conventions of the vendor:
 
 - the *centre* of row 1 is exposed at START, the next ones every line period;
-- positions (ECEF) between those of the table follow from Lagrange's polynomial through eight of them; the velocities
-  are left alone, they lack the rotation of the Earth;
+- positions (ECEF) are interpolated by Lagrange's polynomial through eight rows of the table; the velocities are not
+  used, because they lack the rotation of the Earth;
 - the attitude is a quaternion to ECEF, scalar first, to be normalised: each part a polynomial in (seconds of the day -
   OFFSET) / SCALE (Pleiades), or a table of them (Pleiades Neo, SPOT);
 - a column looks along (psi_Y, -psi_X, 1): both are polynomials in the column counted from 0 at the first centre, and
@@ -48,12 +48,12 @@ from ortho_rpc.scan import FIRST, SECOND, first_version, second_version
 
 Array = NDArray[np.float64]
 
-#: Heights (m) of the ground where nothing is said of them.
+#: Height range (m) of the ground if not stated.
 HEIGHTS = (-100.0, 3000.0)
 
 
 def has_dimap_pushbroom(path: str | PathLike[str]) -> bool:
-    """Tell whether a file is DIMAP metadata with a rigorous model, from its text alone."""
+    """Return whether a file is DIMAP metadata with a rigorous model, from its text alone."""
     try:
         data = read_bounded(path, MAX_SIZE)
     except InputError:
@@ -66,20 +66,20 @@ def has_dimap_pushbroom(path: str | PathLike[str]) -> bool:
 def read_dimap_pushbroom(
     source: str | PathLike[str] | DimapFile, *, image: str | None = None, heights: tuple[float, float] | None = None
 ) -> Pushbroom:
-    """Read the rigorous model of a Pleiades or SPOT 6/7 product; free are offsets and drifts of the attitude.
+    """Read the rigorous model of a Pleiades or SPOT 6/7 product. Its parameters are offsets and drifts of the attitude.
 
     Parameters
     ----------
     source : path or DimapFile
     image : str, optional
-        Name of a tile that the metadata list: its model then, in its own pixels, instead of that of the whole scene.
+        Name of a tile in the metadata: return its model in its own pixels, instead of that of the whole scene.
     heights : (float, float), optional
-        Range of ellipsoidal heights (m) of the ground where the metadata themselves give none.
+        Range of ellipsoidal heights (m) of the ground if the metadata have none.
 
     Raises
     ------
     InputError
-        If the file is no such metadata, something is missing or impossible in it, or its conventions are not known.
+        If the file is not such metadata, a value is missing or impossible, or its conventions are not supported.
     """
     file = source if isinstance(source, DimapFile) else DimapFile(place(source))
     if file.has(FIRST):
@@ -87,9 +87,9 @@ def read_dimap_pushbroom(
     elif file.has(SECOND):
         scan = second_version(file)
     else:
-        raise file.error("there is no rigorous model in this file", SECOND, "use its RPC instead")
+        raise file.error("this file has no rigorous model", SECOND, "use the RPC")
     left, top, columns, rows = tile_of(file, image) or (0, 0, scan.columns, scan.rows)
-    # Their columns count from 0 at the first centre of the whole.
+    # Columns count from 0 at the first pixel centre of the whole image.
     across, along = (Polynomial(psi)(Polynomial([left - 0.5, 1.0])).coef for psi in (scan.psi_x, scan.psi_y))
     first = scan.start + (top - 0.5) * scan.period
     times, turns = scan.attitude(first, rows * scan.period)
@@ -104,14 +104,14 @@ def read_dimap_pushbroom(
             splines=SplineForm(3, attitude=scan.pieces),
         )
         model = replace(model, light=scan.light)
-        require_view(model)  # damaged numbers may well make a camera that looks into the sky
+        require_view(model)  # damaged numbers can give a camera that looks into the sky
     except InputError as error:
         raise InputError(error.message, file=file.path, field=error.field, remedy=error.remedy) from error
     return model
 
 
 def images_of(file: DimapFile) -> dict[str, Element]:
-    """Return the images that the metadata are of, by the name of their file in lower case."""
+    """Return the images of the metadata, by file name in lower case."""
     listed = {}
     for entry in file.all("Raster_Data/Data_Access/Data_Files/Data_File"):
         path = entry.find("DATA_FILE_PATH")
@@ -121,7 +121,7 @@ def images_of(file: DimapFile) -> dict[str, Element]:
 
 
 def tile_of(file: DimapFile, image: str | None) -> tuple[int, int, int, int] | None:
-    """Return first column, first row, columns and rows of an image that is one of several tiles; None if it is not."""
+    """Return first column, first row, columns and rows of a tile; None if the image is not a tile."""
     listed = images_of(file)
     entry = listed.get((image or "").lower())
     tiling = file.root.find("Raster_Data/Raster_Dimensions/Tile_Set/Regular_Tiling")
@@ -129,18 +129,18 @@ def tile_of(file: DimapFile, image: str | None) -> tuple[int, int, int, int] | N
         return None
     field = "Tile_Set/Regular_Tiling"
     if any((tiling.findtext(f"OVERLAP_{name}") or "0").strip() not in ("0", "0.0") for name in ("ROW", "COL")):
-        raise file.error("the tiles overlap, and how they then count is not known", field)
+        raise file.error("the tiles overlap; such products are not supported", field)
     size = tiling.find("NTILES_SIZE")
     texts = [] if size is None else [size.get("ncols"), size.get("nrows")]
     texts += [entry.get("tile_C"), entry.get("tile_R")]
     if len(texts) != 4 or not all(text and re.fullmatch(r"\d{1,8}", text, re.ASCII) for text in texts):
-        raise file.error("size or place of the tiles is missing", field)
+        raise file.error("size or position of the tiles is missing", field)
     columns, rows, column, row = (int(text or 0) for text in texts)
     left, top = columns * (column - 1), rows * (row - 1)
     width = min(columns, file.integer("Raster_Data/Raster_Dimensions/NCOLS") - left)
     height = min(rows, file.integer("Raster_Data/Raster_Dimensions/NROWS") - top)
     if min(left, top) < 0 or min(width, height) < 1:
-        raise file.error(f"tile {row}, {column} lies outside of the scene", field)
+        raise file.error(f"tile {row}, {column} is outside the scene", field)
     return left, top, width, height
 
 

@@ -25,5 +25,5 @@ class DimapFile(XmlFields):
         """Return the coefficients, lowest power first, of a polynomial with its degree."""
         terms = self.numbers(f"{field}/COEFFICIENTS", None)
         if len(terms) > MOST_TERMS or len(terms) != self.number(f"{field}/DEGREE") + 1:
-            raise self.error("degree and coefficients do not match", field)
+            raise self.error("the number of coefficients does not match the degree", field)
         return np.array(terms)

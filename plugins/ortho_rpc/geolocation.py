@@ -1,7 +1,7 @@
 """Images with geolocation arrays: longitude and latitude of every pixel, or of every few, in GDAL's domain or in files.
 
-Such arrays are of one height for each pixel, which nobody states, so they tell where an image lies and not how its
-relief is displaced: a start for matching. The model is the lowest polynomial that follows them; what it leaves is said.
+Such arrays are for one unknown height per pixel. So they give the position of an image without relief displacement: a
+start for matching. The model is the simplest polynomial that fits them; a warning states its error.
 """
 
 from __future__ import annotations
@@ -35,15 +35,17 @@ from ortho_pipeline.plugin import (
 Array = NDArray[np.float64]
 
 OPTIONS = {
-    "lon": "file with the longitude of every pixel, or of every few, where the image does not name it",
-    "lat": "the same with the latitude",
+    "lon": "file with the longitudes of the pixels (or of every n-th), if the image does not name it",
+    "lat": "file with the latitudes, in the same way",
 }
-#: Largest arrays (pixels), and how many of their rows and columns are looked at.
+#: Largest arrays (pixels), and number of sampled rows and columns.
 _MOST, _NODES = 100_000_000, 60
 #: Polynomials are tried until one follows the arrays to this (px).
 _FOLLOWS = 0.1
 _HEIGHTS = (-500.0, 9000.0)
-_REMEDY = "write longitudes and latitudes as GeoTIFF (gdal_translate), and give them with lon=FILE and lat=FILE"
+_REMEDY = (
+    "write longitudes and latitudes as GeoTIFF (gdal_translate), and give both as sensor options lon=FILE and lat=FILE"
+)
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Layout:
 
 
 def has_arrays(dataset: gdal.Dataset) -> bool:
-    """Tell whether an image names its geolocation arrays."""
+    """Return whether an image has geolocation arrays."""
     return bool((dataset.GetMetadata("GEOLOCATION") or {}).get("X_DATASET"))
 
 
@@ -67,7 +69,7 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
     """Open an image by its geolocation arrays."""
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     if (lon is None) != (lat is None):
-        raise InputError("longitudes and latitudes belong together", file=name, field="lon, lat", remedy=_REMEDY)
+        raise InputError("give both longitudes and latitudes", file=name, field="lon, lat", remedy=_REMEDY)
     layout = _layout_of(dataset) if lon is None else None
     files = layout.files if layout else (str(lon), str(lat))
     sources = tuple(open_dataset(one) for one in files)
@@ -81,9 +83,9 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
     except OrthoError as error:
         raise InputError(error.message, file=name, field="GEOLOCATION", remedy=_REMEDY) from error
     text = Text(
-        "geolocation arrays know no height: they are a start for ",
+        "geolocation arrays have no heights; use them only as a start for ",
         Setting("match.reference"),
-        f", and what rises is displaced; the model {family} stands for them to {worst:.2g} px",
+        f". Relief displacement remains. The model {family} represents them within {worst:.2g} px",
     )
     facts: dict[str, Any] = {"arrays": [Path(one).name for one in files], "max_error_px": round(worst, 3)}
     return Scene(
@@ -99,23 +101,23 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
 
 
 def _layout_of(dataset: gdal.Dataset) -> Layout:
-    """Return what the domain ``GEOLOCATION`` says; its files have to lie beside the image."""
+    """Return the contents of the domain ``GEOLOCATION``; its files must be beside the image."""
     name = dataset.GetDescription()
-    # GDAL gives bytes where a text is none.
+    # GDAL returns bytes for invalid text.
     fields = {
         key: text if isinstance(text, str) else "?" for key, text in (dataset.GetMetadata("GEOLOCATION") or {}).items()
     }
     if not has_arrays(dataset) or not fields.get("Y_DATASET"):
-        raise InputError("this image names no geolocation arrays", file=name, field="GEOLOCATION", remedy=_REMEDY)
+        raise InputError("this image has no geolocation arrays", file=name, field="GEOLOCATION", remedy=_REMEDY)
     folder = place(name).parent
     files = []
     for axis in "XY":
         text = fields[f"{axis}_DATASET"]
         beside = folder / text.replace("\\", "/").rpartition("/")[2]
-        # Whatever folder the metadata name, only the image's own is looked into.
+        # Only the folder of the image is searched, whatever folder the metadata name.
         if ":" in text or not _is_file(beside):
             raise InputError(
-                f"the array {text[:200]!r} is no file beside the image",
+                f"the array {text[:200]!r} is not a file beside the image",
                 file=name,
                 field=f"{axis}_DATASET",
                 remedy=_REMEDY,
@@ -128,13 +130,13 @@ def _layout_of(dataset: gdal.Dataset) -> Layout:
         except ValueError:
             value = np.nan
         if not abs(value) < 1e7 or (key.endswith("STEP") and value <= 0):
-            raise InputError(f"{fields[key][:20]!r} is no number for {key}", file=name, field=key, remedy=_REMEDY)
+            raise InputError(f"{fields[key][:20]!r} is not a number", file=name, field=key, remedy=_REMEDY)
         return value
 
     try:
         crs = parse_crs(fields.get("SRS") or "EPSG:4326")
     except CrsError as error:
-        raise InputError("the SRS of the arrays is not known", file=name, field="SRS", remedy=_REMEDY) from error
+        raise InputError("the CRS of the arrays is unknown", file=name, field="SRS", remedy=_REMEDY) from error
     return Layout(
         files=(files[0], files[1]),
         bands=(int(number("X_BAND", "1")), int(number("Y_BAND", "1"))),
@@ -157,7 +159,9 @@ def _nodes(name: str, layout: Layout, sources: tuple[gdal.Dataset, ...], size: t
     first, last = sources
     shape = first.RasterXSize, first.RasterYSize
     if (last.RasterXSize, last.RasterYSize) != shape or shape[0] * shape[1] > _MOST:
-        raise InputError("the arrays are not of one size, or too large", file=name, field="Y_DATASET", remedy=_REMEDY)
+        raise InputError(
+            "the arrays have different sizes, or are too large", file=name, field="Y_DATASET", remedy=_REMEDY
+        )
     columns, rows = (np.unique(np.linspace(0, count - 1, _NODES).round().astype(int)) for count in shape)
     values = []
     for source, band, file in zip(sources, layout.bands, layout.files, strict=True):
@@ -175,7 +179,7 @@ def _nodes(name: str, layout: Layout, sources: tuple[gdal.Dataset, ...], size: t
     good &= np.isfinite(ground).all(axis=1) & (np.abs(ground[:, 1]) <= 90) & (np.abs(ground[:, 0]) <= 360)
     if good.sum() < max(16, 0.5 * len(good)):
         raise InputError(
-            f"{good.sum()} of {len(good)} nodes have a longitude and a latitude",
+            f"{good.sum()} of {len(good)} nodes have both a longitude and a latitude",
             file=name,
             field="GEOLOCATION",
             remedy=_REMEDY,
@@ -208,5 +212,7 @@ def _fitted(image: Array, ground: Array, size: tuple[int, int]) -> tuple[SensorM
         if worst < _FOLLOWS:
             break
     if found is None or not found[2] < max(size):
-        raise InputError("no polynomial follows the arrays: they are damaged", field="GEOLOCATION", remedy=_REMEDY)
+        raise InputError(
+            "no polynomial fits the arrays; they are probably damaged", field="GEOLOCATION", remedy=_REMEDY
+        )
     return found

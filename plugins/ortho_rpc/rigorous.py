@@ -1,4 +1,4 @@
-"""Which DIMAP metadata beside an image are of it, and what is to be said of a rigorous model that is not read."""
+"""Find the DIMAP metadata of an image beside it, and warn about rigorous models that are not used."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ortho_rpc.dimap import has_dimap_pushbroom, images_of, read_dimap_pushbroom
 from ortho_rpc.dimap_file import DimapFile
 
 #: A vendor's RPC follows its rigorous model to a fraction of a pixel, a corrected one to some tens; beyond this (px)
-#: they are of two images.
+#: they belong to different images.
 DISAGREEMENT = 100.0
-#: The same (px) of products whose look angles were not at hand to check from where they count.
+#: The same (px) for products whose look angles could not be checked.
 UNSEEN = {"PNEO_SENSOR": 2.0}
 #: Where models are compared: parts of the width, of the height, and of the heights of the RPC.
 _MIDDLE = np.array([[0.5, 0.5, 0.0]])
@@ -24,14 +24,14 @@ _WITHIN = np.array([[x, y, h] for x in (0.05, 0.5, 0.95) for y in (0.05, 0.5, 0.
 
 @dataclass(frozen=True)
 class Rigorous:
-    """The rigorous model beside an image, if there is one to read, and why others were not read.
+    """The rigorous model beside an image, if there is one, and the reasons why others are not used.
 
     Parameters
     ----------
     model, path
-        None where none is read.
+        None without a model.
     left : dict of str to str
-        Reasons, by the name of the file.
+        Reasons by file name.
     """
 
     model: Pushbroom | None = None
@@ -42,7 +42,7 @@ class Rigorous:
     def warnings(self) -> tuple[Notice, ...]:
         """A sentence for each model that was not read."""
         return tuple(
-            Notice("rigorous-left-out", f"{name} has a rigorous model that is left out: {reason}", file=name)
+            Notice("rigorous-left-out", f"the rigorous model in {name} is not used: {reason}", file=name)
             for name, reason in self.left.items()
         )
 
@@ -79,16 +79,20 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
         if its == size:
             found[file.path] = model, UNSEEN.get(file.said("Metadata_Identification/METADATA_PROFILE") or "")
         else:
-            others[file.path.name] = "it is of {} x {} pixels, this image has {} x {}".format(*its, *size)
+            others[file.path.name] = "it is for {} x {} pixels, but this image has {} x {}".format(*its, *size)
     if len(found) > 1:
         several = ", ".join(path.name for path in found)
-        reason = f"several rigorous models of this size lie beside the image, none is taken: {several}"
+        reason = f"there are several rigorous models of this size beside the image, so none is used: {several}"
         return Rigorous(left=left | {path.name: reason for path in found})
     for path, (model, limit) in found.items():
         apart = _apart(model, rpc, _MIDDLE if limit is None else _WITHIN)
         if apart > (DISAGREEMENT if limit is None else limit):
             place = "in the middle of" if limit is None else "within"
-            why = "they are of two images" if limit is None else "no look angles of this product were at hand to check"
+            why = (
+                "they belong to different images"
+                if limit is None
+                else "the reader of its look angles was never tested with a real product"
+            )
             left[path.name] = f"it is {apart:.3g} px off the RPC {place} the image: {why}"
             return Rigorous(left=left)
         return Rigorous(model, path, left)
@@ -101,12 +105,12 @@ def _reason(error: InputError) -> str:
 
 
 def _apart(model: Pushbroom, rpc: RPC, places: Array) -> float:
-    """Return by how many pixels model and RPC differ at places of the image; infinite where one sees nothing.
+    """Return the largest difference (px) of model and RPC at positions of the image; infinite if one has no ground.
 
     Parameters
     ----------
     places : (N, 3)
-        Parts of its width and height, and of the heights of the RPC.
+        As parts of the image's width and height, and of the height range of the RPC.
     """
     image = places[:, :2] * (model.camera.width, model.camera.height)
     seen = rpc.ground_to_image(model.image_to_ground(image, rpc.h_off + places[:, 2] * rpc.h_scale))

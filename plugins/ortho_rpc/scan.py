@@ -24,7 +24,7 @@ PROFILES = {
     "S7_SENSOR": _NO_LIGHT,
     "PNEO_SENSOR": LightPath(refraction=True),
 }
-#: Seconds of the units in which line periods stand; Pleiades names none.
+#: Units of line periods in seconds; Pleiades states none.
 _UNITS = {None: 1e-3, "ms": 1e-3, "millisecond": 1e-3, "microsecond": 1e-6, "us": 1e-6}
 #: How often an attitude polynomial is sampled, and by how many cubic polynomials it is followed: to 1e-12 rad.
 _SAMPLES, _PIECES = 96, 24
@@ -36,21 +36,21 @@ _VENDOR_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.
 
 @dataclass(frozen=True)
 class Scan:
-    """A scene as either version describes it; times are seconds of the day.
+    """A scene as described by either version; times are seconds of the day.
 
     Parameters
     ----------
     start : float
-        When the centre of the first row is exposed.
+        Exposure time of the centre of the first row.
     psi_x, psi_y : (k,)
         Polynomials, lowest power first, of the column counted from 0 at the first centre.
     orbit : (N,), (N, 3)
     attitude : callable(first, duration) -> (N,), (N, 3, 3)
-        Times and rotations around so many seconds from `first` on.
+        Times and rotations for a duration in seconds, from `first` on.
     pieces : int, optional
-        By how many polynomials the attitude is followed; through all its rows without it.
+        Number of polynomials for the attitude; default: through all its rows.
     light : LightPath
-        What the angles leave out.
+        Effects that the angles do not include.
     """
 
     columns: int
@@ -84,7 +84,7 @@ def second_version(file: DimapFile) -> Scan:
     profile = file.text("Metadata_Identification/METADATA_PROFILE")
     if profile not in PROFILES:
         raise file.error(
-            f"the conventions of {profile[:40]} could not be checked against numbers of the vendor; read are"
+            f"products of {profile[:40]} are not supported, because they could not be tested. Supported are"
             f" {', '.join(PROFILES)}",
             "METADATA_PROFILE",
         )
@@ -94,7 +94,7 @@ def second_version(file: DimapFile) -> Scan:
     value, element = file.number(stamp), file.root.find(stamp)
     unit = None if element is None else element.get("unit")
     if unit not in _UNITS:
-        raise file.error(f"{unit[:20]!r} is an unknown unit", "LINE_PERIOD")
+        raise file.error(f"{unit[:20]!r} is not a known unit", "LINE_PERIOD")
     period = _possible_period(file, value * _UNITS[unit], "LINE_PERIOD")
     start = file.time(f"{SECOND}/Time/Time_Range/START")
     _refuse_other_duration(file, f"{SECOND}/Time/Time_Range", start, rows * period)
@@ -110,12 +110,12 @@ def second_version(file: DimapFile) -> Scan:
 
 
 def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
-    """Return the polynomials of both angles, which all bands of the image have to share."""
+    """Return the polynomials of both angles; all bands of the image must share them."""
     base = f"{SECOND}/Geometric_Calibration/Instrument_Calibration"
     for name in ("YAW", "PITCH", "ROLL"):
         field = f"{base}/Instrument_Biases/{name}"
         if file.has(field) and file.number(field) != 0:
-            raise file.error("a bias of the instrument, of which the sense of turning is not known", field)
+            raise file.error("an instrument bias with an unknown direction of rotation is not supported", field)
     bands = file.all(f"{base}/Band_Calibration_List/Band_Calibration", 100)
     places = [f"{base}/Band_Calibration_List/Band_Calibration[{k + 1}]" for k in range(len(bands))] or [base]
     found = []
@@ -123,55 +123,53 @@ def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
         _refuse_part_of_a_line(file, f"{one}/Swath_Range", columns)
         found.append([_angle(file, f"{one}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
     if any(not np.array_equal(*pair) for other in found for pair in zip(other, found[0], strict=True)):
-        raise file.error("the bands have look angles of their own, an image has one model", "Band_Calibration_List")
+        raise file.error("each band has its own look angles; this is not supported", "Band_Calibration_List")
     return found[0][0], found[0][1]
 
 
 def _angle(file: DimapFile, base: str, name: str) -> Array:
-    """Return the coefficients ``name_0``, ``name_1`` ... that there are, of which the first has to be."""
+    """Return the coefficients ``name_0``, ``name_1`` ...; the first one is required."""
     terms = [file.number(f"{base}/{name}_0")]
     while file.has(f"{base}/{name}_{len(terms)}") and len(terms) <= MOST_TERMS:
         terms.append(file.number(f"{base}/{name}_{len(terms)}"))
     listed = sum(element.tag.startswith(f"{name}_") for element in file.all(f"{base}/*"))
     if listed != len(terms):
-        raise file.error("the coefficients are not those of one polynomial", f"{base}/{name}_{len(terms)}")
+        raise file.error("the coefficients do not form one polynomial", f"{base}/{name}_{len(terms)}")
     return np.array(terms)
 
 
 def _possible_period(file: DimapFile, period: float, field: str) -> float:
     if not 0 < period < 1:
-        raise file.error(f"{period} s is not a time for a row", field)
+        raise file.error(f"{period} s is not a possible line period", field)
     return period
 
 
 def _refuse_part_of_a_line(file: DimapFile, field: str, columns: int) -> None:
-    """Refuse columns that are not those of the whole image: no numbers of a vendor tell how they count."""
+    """Raise an error unless the columns are those of the whole image; the convention for others is unknown."""
     if not file.has(field):
         return
     first = file.number(f"{field}/FIRST_COL")
     last = file.number(f"{field}/LAST_COL") if file.has(f"{field}/LAST_COL") else columns
     if first != 1:
-        raise file.error(
-            f"the image begins in column {first:g} of the line: from where its look angles count is not known", field
-        )
+        raise file.error(f"the image begins at column {first:g} of the line; such images are not supported", field)
     if field.endswith("Swath_Range") and last != columns:
-        raise file.error(f"the look angles are of {last:g} columns, the image has {columns}", field)
+        raise file.error(f"there are look angles for {last:g} columns, but the image has {columns}", field)
 
 
 def _refuse_other_duration(file: DimapFile, field: str, start: float, duration: float) -> None:
-    """Refuse a part of a pass: which of its rows the image has is not said."""
+    """Raise an error for a part of a pass, because it is not stated which rows the image has."""
     if not file.has(f"{field}/END"):
         return
     taken = file.time(f"{field}/END") - start
     if abs(taken - duration) > 0.01 * duration:
-        raise file.error(f"the rows take {duration:.6g} s, from START to END there are {taken:.6g} s", field)
+        raise file.error(f"the rows take {duration:.6g} s, but START and END are {taken:.6g} s apart", field)
 
 
 def _polynomial_attitude(file: DimapFile, scaled: str, parts: str) -> Callable[[float, float], tuple[Array, Array]]:
-    """Return polynomials, sampled as far as half an image beyond both ends."""
+    """Return the attitude polynomials, sampled to half an image beyond both ends."""
     offset, scale = file.number(f"{scaled}/OFFSET"), file.number(f"{scaled}/SCALE")
     if scale == 0:
-        raise file.error("a scale of zero", f"{scaled}/SCALE")
+        raise file.error("a scale is zero", f"{scaled}/SCALE")
     terms = [file.polynomial(f"{parts}/Q{k}") for k in range(4)]
 
     def sampled(first: float, duration: float) -> tuple[Array, Array]:
@@ -186,7 +184,7 @@ def _polynomial_attitude(file: DimapFile, scaled: str, parts: str) -> Callable[[
 def _listed_attitude(file: DimapFile, field: str) -> Callable[[float, float], tuple[Array, Array]]:
     rows = file.all(f"{field}/Quaternion")
     if not rows:
-        raise file.error("there is neither a polynomial nor a list of quaternions", field)
+        raise file.error("the attitude has neither a polynomial nor a list of quaternions", field)
     times = np.array([file.time("TIME", row) for row in rows])
     quaternions = np.array([[file.number(f"Q{k}", row) for k in range(4)] for row in rows])
     turns = _turns(file, quaternions, field)
@@ -197,7 +195,7 @@ def _turns(file: DimapFile, quaternions: Array, field: str) -> Array:
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     if not (np.abs(length - 1) <= _UNIT_LENGTH).all():
-        raise file.error("the quaternions of the attitude are not of length one", field)
+        raise file.error("the quaternions of the attitude do not have length one", field)
     return np.asarray(rotations_of_quaternions(quaternions) @ _VENDOR_FROM_CAMERA)
 
 

@@ -1,11 +1,11 @@
 r"""Sensor plugin for radar images that were geocoded on a plane (GEC), not on terrain: Capella, Umbra, ICEYE, others.
 
-A radar measures range: a point above the plane lies nearer to the antenna than the point of the plane below it, and is
-drawn *towards* the radar, by :math:`1 / \tan\theta` of its height at the incidence angle :math:`\theta`. In direction
-and sign a camera on the other side would see so at the elevation :math:`\theta`; the model is `MapPlane`.
+A radar measures range. A point above the plane is nearer to the antenna than the point of the plane below it, so it is
+displaced *towards* the radar, by :math:`1 / \tan\theta` of its height at the incidence angle :math:`\theta`. A camera
+on the other side at the elevation :math:`\theta` would show the same displacement; the model is `MapPlane`.
 
-No product was at hand to check the fields with that are read of Capella's ``_extended.json`` (places of satellite and
-scene centre, from which both angles follow); of others the angles are given as options. A notice says so.
+The reader of Capella's ``_extended.json`` (positions of satellite and scene centre, which give both angles) could not
+be checked with a real product; a notice says so. For other products the angles are options.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from ortho_pipeline.plugin import (
 
 MAX_SIZE = 20_000_000
 _REMEDY = "download the metadata again, or give incidence=DEG and azimuth=DEG"
-#: Ground (m) above and below the plane that the model is meant for.
+#: Height range (m) of the model above and below the plane.
 HALF_RANGE = 1000.0
 #: Incidence angles of radars (degrees).
 _STEEPEST, _FLATTEST = 10.0, 80.0
-_PLANE = "give a product in map geometry on a plane (GEC, GEO), not SLC or GRD"
+_PLANE = "use a product in map geometry on a plane (GEC, GEO), not SLC or GRD"
 
 
 @hookimpl
@@ -50,19 +50,19 @@ def ortho_sensors() -> Iterable[Sensor]:
     """Offer the sensor ``sar``."""
     yield Sensor(
         "sar",
-        "radar images geocoded on a plane (GEC): Capella with _extended.json, others with the options",
+        "radar images geocoded on a plane (GEC): Capella with _extended.json, others with the options below",
         recognises,
         open_scene,
         options={
-            "incidence": "incidence angle at the scene's centre, degrees from the vertical",
+            "incidence": "incidence angle at the scene centre, degrees from the vertical",
             "azimuth": "direction from the scene to the radar, degrees from north, clockwise",
-            "plane": "ellipsoidal height (m) of the plane; by itself that of the scene's centre in the metadata",
+            "plane": "ellipsoidal height (m) of the plane; default: the scene centre's height in the metadata",
         },
     )
 
 
 def metadata_of(name: str) -> Path | None:
-    """Return the extended metadata of an image of Capella; None without."""
+    """Return the extended metadata of a Capella image; None without them."""
     if not name:
         return None
     try:
@@ -74,7 +74,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether extended metadata of Capella lie beside an image, or it has complex values that nothing places."""
+    """Return whether an image has extended Capella metadata beside it, or complex values without a position."""
     path = metadata_of(dataset.GetDescription())
     if path is None and _is_slant(dataset) and not has_rpc(dataset):
         return True
@@ -87,17 +87,19 @@ def recognises(dataset: gdal.Dataset) -> bool:
 def open_scene(
     dataset: gdal.Dataset, *, incidence: str | None = None, azimuth: str | None = None, plane: str | None = None
 ) -> Scene:
-    """Open an image on a plane; refuse one in slant range."""
+    """Open an image on a plane; raise an error for slant range."""
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     if _is_slant(dataset):
         raise InputError(
-            "complex values, no map geometry: this is in slant range (SLC, SICD)", file=name, remedy=_PLANE
+            "this image is in slant range (SLC, SICD): it has complex values and no map geometry",
+            file=name,
+            remedy=_PLANE,
         )
     path = metadata_of(name)
     facts = {} if path is None else read_extended(path)
     product = facts.get("product", "GEC")
     if product not in ("GEC", "GEO"):
-        raise InputError(f"a product {product} is in slant or ground range", file=name, remedy=_PLANE)
+        raise InputError(f"a {product} product is in slant or ground range", file=name, remedy=_PLANE)
     crs, corner, pixel = _map_of(dataset)
     given = {"incidence_deg": incidence, "azimuth_deg": azimuth, "plane_m": plane}
     facts |= {fact: _number(text, fact) for fact, text in given.items() if text is not None}
@@ -105,13 +107,13 @@ def open_scene(
     if missing:
         options = ", ".join(fact.rpartition("_")[0] for fact in missing)
         raise InputError(
-            f"nothing says the {options} of this image", file=name, field=options, remedy=f"give {options}"
+            f"unknown for this image: {options}", file=name, field=options, remedy=f"give {options} as sensor options"
         )
     if not _STEEPEST <= facts["incidence_deg"] <= _FLATTEST:
         raise InputError(
-            f"{facts['incidence_deg']:g} degrees are not the incidence of a radar",
+            f"{facts['incidence_deg']:g} degrees is not a possible incidence angle of a radar",
             field="incidence",
-            remedy=f"it is from {_STEEPEST:g} to {_FLATTEST:g} degrees from the vertical",
+            remedy=f"give {_STEEPEST:g} to {_FLATTEST:g} degrees from the vertical",
         )
     height = facts["plane_m"]
     model = MapPlane.from_view(
@@ -129,7 +131,7 @@ def open_scene(
 
 
 def _is_slant(dataset: gdal.Dataset) -> bool:
-    """Tell whether an image has complex values, which only a radar in its own geometry gives, and no map geometry."""
+    """Return whether an image has complex values (a radar image in its own geometry) and no map geometry."""
     band = dataset.GetRasterBand(1) if dataset.RasterCount else None
     complex_ = band is not None and bool(gdal.DataTypeIsComplex(band.DataType))
     return complex_ and dataset.GetGeoTransform(can_return_null=True) is None
@@ -137,12 +139,12 @@ def _is_slant(dataset: gdal.Dataset) -> bool:
 
 @reads(_REMEDY)
 def read_extended(path: Path) -> dict[str, Any]:
-    """Read the angles and the plane of Capella's extended metadata: of the satellite over the scene's centre.
+    """Read angles and plane from Capella's extended metadata.
 
     Raises
     ------
     InputError
-        If it is no such JSON, or its places are not those of a satellite and a scene.
+        If it is not such JSON, or its positions are not those of a satellite and a scene.
     """
     document = read_json(path, MAX_SIZE, _REMEDY)
 
@@ -159,7 +161,7 @@ def read_extended(path: Path) -> dict[str, Any]:
             facts[fact] = text[:60]
     vectors = at("collect", "state", "state_vectors")
     if not isinstance(vectors, list) or not vectors:
-        raise InputError("there are no places of the satellite", file=path, field="collect.state.state_vectors")
+        raise InputError("the metadata have no satellite positions", file=path, field="collect.state.state_vectors")
     target = _place(at("collect", "image", "center_pixel", "target_position"), path, "center_pixel.target_position")
     places = np.array(
         [
@@ -167,12 +169,16 @@ def read_extended(path: Path) -> dict[str, Any]:
             for one in vectors
         ]
     )
-    # The middle of the aperture is where the radar is nearest, within what the vectors' distance leaves open.
+    # The radar is nearest at the middle of the aperture, within the time step of the vectors.
     line = places[int(np.argmin(np.linalg.norm(places - target, axis=1)))] - target
     ground = geodetic(target[None])
     east, north, up = enu_from_ecef(ground)[0] @ (line / np.linalg.norm(line))
     if not (up > 0.1 and abs(ground[0, 2]) < 10_000):
-        raise InputError("these are not a satellite and a scene below it", file=path, field="state_vectors, target")
+        raise InputError(
+            "these positions are not those of a satellite and a scene below it",
+            file=path,
+            field="state_vectors, target",
+        )
     facts["incidence_deg"] = round(math.degrees(math.acos(min(1.0, up))), 4)
     facts["azimuth_deg"] = round(math.degrees(math.atan2(east, north)) % 360.0, 4)
     return facts | {"plane_m": round(float(ground[0, 2]), 3)}
@@ -181,10 +187,10 @@ def read_extended(path: Path) -> dict[str, Any]:
 def _place(value: Any, path: Path, field: str) -> NDArray[np.float64]:
     good = isinstance(value, list) and len(value) == 3
     if not good or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
-        raise InputError("three numbers belong here", file=path, field=field, remedy=_REMEDY)
+        raise InputError("this must be a list of three numbers", file=path, field=field, remedy=_REMEDY)
     found = np.array(value, dtype=np.float64)
     if not 6.2e6 < np.linalg.norm(found) < 5e7:
-        raise InputError("this is not a place on Earth or around it", file=path, field=field, remedy=_REMEDY)
+        raise InputError("this position is not near the Earth", file=path, field=field, remedy=_REMEDY)
     return found
 
 
@@ -193,13 +199,13 @@ def _map_of(dataset: gdal.Dataset) -> tuple[str, tuple[float, float], tuple[floa
     name, steps = dataset.GetDescription(), dataset.GetGeoTransform(can_return_null=True)
     text = dataset.GetProjection()
     if steps is None or not text:
-        raise InputError("this image has no map geometry: it is in slant or ground range", file=name, remedy=_PLANE)
+        raise InputError("this image is in slant or ground range: it has no map geometry", file=name, remedy=_PLANE)
     crs = parse_crs(text)
     if not crs.is_projected or steps[2] or steps[4] or not (steps[1] > 0 > steps[5]):
         raise InputError(
-            f"an image in {crs.name} is not read, only in a map projection with north on top",
+            f"this image must be in a map projection with north up, not in {crs.name}",
             file=name,
-            remedy="project it to UTM (gdalwarp -t_srs EPSG:326zz), which leaves the plane a plane",
+            remedy="project it to UTM with gdalwarp -t_srs EPSG:326zz (zz: the zone), which keeps the plane",
         )
     return crs.to_string(), (steps[0], steps[3]), (steps[1], -steps[5])
 
@@ -216,11 +222,11 @@ def _number(text: str, fact: str) -> float:
 
 def _warnings(from_file: bool) -> tuple[Notice, ...]:
     text = (
-        "this is a radar image: what rises leans towards the radar, slopes steeper than the incidence lie over each"
-        " other and others in shadow, and no ground was seen there"
+        "this is a radar image: high objects lean towards the radar. Steep slopes are in layover or in shadow, where "
+        "the ground is not visible"
     )
     found = [Notice("radar-on-a-plane", text)]
     if from_file:
-        text = "no product of this kind was at hand to check how its metadata are read: compare with control points"
+        text = "this metadata reader was never tested with a real product of this kind. Compare with control points"
         found.append(Notice("unchecked-product", text))
     return tuple(found)

@@ -49,7 +49,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Tell whether metadata of a SPOT scene lie beside an image, or are it."""
+    """Return whether a file is the metadata of a SPOT scene, or an image with them beside it."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and b"<METADATA_PROFILE>SPOTSCENE" in read_bounded(path, 4000).replace(b" ", b"")
@@ -62,14 +62,14 @@ def open_scene(dataset: gdal.Dataset, *, attitude: str = "vendor") -> Scene:
     name = dataset.GetDescription()
     path = metadata_of(name)
     if path is None:
-        raise InputError("there is no METADATA.DIM beside this image", file=name, remedy="add it from the delivery")
+        raise InputError("no METADATA.DIM found beside this image", file=name, remedy="add it from the delivery")
     if attitude not in ("vendor", "speeds"):
-        raise InputError("there is no such choice", field="attitude", remedy="give vendor or speeds")
+        raise InputError("unknown attitude", field="attitude", remedy="give vendor or speeds")
     spot = read_spot(path, attitude=attitude)
     size, its = (dataset.RasterXSize, dataset.RasterYSize), spot.model.camera.size
     warnings = []
     if size != its:
-        text = "the metadata are for {} x {} pixels, this image has {} x {}: is it a crop?".format(*its, *size)
+        text = "the metadata are for {} x {} pixels, but this image has {} x {}. Is it a crop?".format(*its, *size)
         warnings.append(Notice("maybe-a-crop", text, metadata_size=list(its)))
     if spot.bands_differ > 0.5:
         text = f"the look angles of its bands differ by up to {spot.bands_differ:.1f} px; those of the first are used"

@@ -1,11 +1,11 @@
 r"""DIMAP 1 metadata of SPOT 1 to 5, level 1A: ephemeris, attitude and look angles of the detectors as a line scanner.
 
-What the vendor's numbers mean:
+Conventions of the vendor:
 
 - the *centre* of row l, counted from 1, is exposed at SCENE_CENTER_TIME + (l - SCENE_CENTER_LINE) LINE_PERIOD;
-- positions and velocities (ECEF, relative to the turning Earth) between those of the table follow from Lagrange's
-  polynomial through eight of them;
-- the orbital frame of a moment has Z along the position, X along velocity x Z (to the right of the flight), Y = Z x X;
+- positions and velocities (ECEF, relative to the rotating Earth) are interpolated by Lagrange's polynomial through
+  eight rows of the table;
+- the orbital frame has Z along the position, X along velocity x Z (to the right of the flight), Y = Z x X;
 - detector p looks along :math:`(-\tan\psi_Y, \tan\psi_X, -1)` on board; SPOT 1 to 4 give the angles of the first and
   the last detector, between which they are linear, SPOT 5 those of every detector; detector 1 is column 1;
 - on board is turned into the orbital frame by :math:`M_p M_r M_y` with
@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 
 #: A file of 24,000 detectors with their calibration has 10 MB.
 MAX_SIZE = 20_000_000
-#: Heights (m) of the ground for which the camera is meant: nothing is said of them.
+#: Height range (m) of the camera, because none is stated.
 HEIGHTS = (-500.0, 9000.0)
 _STRIP, _CONFIGURATION = "Data_Strip", "Data_Strip/Sensor_Configuration"
 _ATTITUDES = f"{_STRIP}/Satellite_Attitudes"
@@ -69,13 +69,13 @@ _SAID = (
 )
 #: Camera axes (along the line, forward, to the ground) in those of the vendor on board.
 _VENDOR_FROM_CAMERA = np.diag([-1.0, 1.0, -1.0])
-#: The frame and the attitude are followed by rows of a table so far apart (s); where the vendor has rows, by those.
+#: Time step (s) of tables of frame and attitude, unless the vendor's rows are used.
 _EVERY, _SPEEDS_EVERY = 0.25, 0.125
-#: So much more of a list of angles is taken on both sides (s), because a cubic goes through four of its rows.
+#: Angles are used this much (s) beyond both ends, because a cubic needs four rows.
 _BEYOND = 1.0
-#: Two angles for a whole line are linear between: so many columns follow the tangent of that.
+#: Columns that represent the tangent of angles that are linear along a line.
 _COLUMNS = 33
-#: Bands whose look angles differ by more than this (px) from those of the first are worth a word.
+#: Bands whose look angles differ by more than this (px) from those of the first give a warning.
 _SAME = 0.5
 
 
@@ -115,18 +115,18 @@ def read_spot(path: PathLike[str], *, attitude: str = "vendor", heights: tuple[f
     level = file.text("Data_Processing/PROCESSING_LEVEL")
     if level != "1A":
         raise file.error(
-            f"a product of level {level[:10]} has been resampled, and its metadata are not those of its pixels",
+            f"this product of level {level[:10]} is resampled, so its metadata do not describe its pixels",
             "Data_Processing/PROCESSING_LEVEL",
-            "take the scene of level 1A",
+            "use the scene at level 1A",
         )
     columns, rows = (file.integer(f"Raster_Dimensions/{name}") for name in ("NCOLS", "NROWS"))
     lines = file.all(f"{_CONFIGURATION}/Instrument_Look_Angles_List/Instrument_Look_Angles", 20)
     if not lines:
-        raise file.error("there are no look angles", "Instrument_Look_Angles_List")
+        raise file.error("the metadata have no look angles", "Instrument_Look_Angles_List")
     psi_x, psi_y = _look_angles(file, lines[0], columns)
     period = file.number(f"{_CONFIGURATION}/Time_Stamp/LINE_PERIOD")
     if not 0 < period < 1:
-        raise file.error(f"{period} s is not a time for a row", "LINE_PERIOD")
+        raise file.error(f"{period} s is not a possible line period", "LINE_PERIOD")
     centre = file.number(f"{_CONFIGURATION}/Time_Stamp/SCENE_CENTER_LINE")
     first = file.time(f"{_CONFIGURATION}/Time_Stamp/SCENE_CENTER_TIME") + (0.5 - centre) * period
     orbit = _orbit(file)
@@ -158,7 +158,7 @@ def read_spot(path: PathLike[str], *, attitude: str = "vendor", heights: tuple[f
 
 
 def _facts(file: XmlFields) -> dict[str, Any]:
-    """Return what is worth showing; what is missing there is no reason to refuse a scene."""
+    """Return facts of the metadata; missing ones are left out."""
     said = {name: file.said(f"{_SOURCE}/{name}") for name in _SAID}
 
     def joined(first: str, second: str, sign: str = "") -> str | None:
@@ -182,18 +182,18 @@ def _facts(file: XmlFields) -> dict[str, Any]:
 
 
 def _look_angles(file: XmlFields, line: Element, columns: int) -> tuple[Array, Array]:
-    """Return psi_X and psi_Y (rad) at evenly spaced columns, the centres of the first and the last among them."""
+    """Return psi_X and psi_Y (rad) at evenly spaced columns, including the centres of the first and the last."""
     entries = line.findall("Look_Angles_List/Look_Angles")
     field = "Look_Angles_List/Look_Angles"
     detectors = np.array([file.number("DETECTOR_ID", entry) for entry in entries])
     angles = np.array([[file.number(name, entry) for name in ("PSI_X", "PSI_Y")] for entry in entries]).reshape(-1, 2)
     if not (np.abs(angles) < 1.2).all():
-        raise file.error("a look angle is beyond any mirror", field)
+        raise file.error("a look angle is out of range", field)
     whole = len(detectors) >= 2 and detectors[0] == 1 and detectors[-1] == columns
     if not whole or len(detectors) not in (2, columns) or not (np.diff(detectors) > 0).all():
         raise file.error(
-            f"{len(detectors)} detectors do not belong to the {columns} columns of this image, of which the first has"
-            " to be detector 1",
+            f"{len(detectors)} detectors do not match the {columns} columns of this image; the first must be "
+            f"detector 1",
             field,
         )
     if len(detectors) == 2:
@@ -211,14 +211,16 @@ def _orbit(file: XmlFields) -> tuple[Array, Array, Array]:
         for part in ("Location", "Velocity")
     )
     if len(times) < 4 or not (np.diff(times) > 0).all():
-        raise file.error(f"{len(times)} positions, at times that may not grow, are not an orbit", "Ephemeris/Points")
+        raise file.error(
+            f"{len(times)} positions do not give an orbit (at least 4, at increasing times)", "Ephemeris/Points"
+        )
     return times, places, rates
 
 
 def _attitude(
     file: XmlFields, orbit: tuple[Array, Array, Array], span: tuple[float, float], kind: str
 ) -> tuple[Array, Array]:
-    """Return times and rotations of the camera to ECEF, half an image beyond both ends as far as the tables go."""
+    """Return times and rotations from camera to ECEF, to half an image beyond both ends if the tables cover it."""
     first, duration = span
     low, high = max(first - duration / 2, orbit[0][0]), min(first + 1.5 * duration, orbit[0][-1])
     if not high > low:
@@ -226,9 +228,9 @@ def _attitude(
     corrected = file.has(f"{_ATTITUDES}/Corrected_Attitudes")
     if corrected and kind == "speeds":
         raise file.error(
-            "this scene has a corrected attitude, which is better than angular speeds",
+            "this scene has a corrected attitude, which is more accurate than angular speeds",
             "Corrected_Attitudes",
-            "leave the attitude to the vendor",
+            "use attitude=vendor",
         )
     if corrected:
         times, angles = _rows(file, f"{_ATTITUDES}/Corrected_Attitudes/Corrected_Attitude//Angles")
@@ -237,7 +239,7 @@ def _attitude(
         angles = np.zeros((len(times), 3))
     else:
         its, turned = _integrated(file, span)
-        # They end with the image, which may reach a little beyond: there the angles stay.
+        # They end with the image, which may extend slightly beyond: there the angles stay constant.
         times = np.linspace(low, high, max(8, min(2000, int((high - low) / _SPEEDS_EVERY))))
         angles = np.column_stack([np.interp(times, its, part) for part in turned.T])
     near = (times >= max(low - _BEYOND, orbit[0][0])) & (times <= min(high + _BEYOND, orbit[0][-1]))
@@ -248,7 +250,7 @@ def _attitude(
         x = np.cross(rates, z)
         x /= np.linalg.norm(x, axis=1)[:, None]
     if not np.isfinite(x).all():
-        raise file.error("positions and velocities are not those of a flight", "Ephemeris/Points")
+        raise file.error("positions and velocities do not match a satellite orbit", "Ephemeris/Points")
     orbital = np.stack([x, np.cross(z, x), z], axis=2)
     return times, orbital @ _on_board(*angles.T) @ _VENDOR_FROM_CAMERA
 
@@ -267,14 +269,14 @@ def _on_board(yaw: Array, pitch: Array, roll: Array) -> Array:
 
 
 def _rows(file: XmlFields, field: str) -> tuple[Array, Array]:
-    """Return times and yaw, pitch, roll ``(N, 3)`` of a list, without what the file calls out of range."""
+    """Return times and yaw, pitch, roll ``(N, 3)`` of a list, without rows that are marked out of range."""
     entries = [one for one in file.all(field) if (one.findtext("OUT_OF_RANGE") or "N").strip() != "Y"]
     if len(entries) < 4:
-        raise file.error(f"{len(entries)} of these are not an attitude", field)
+        raise file.error(f"{len(entries)} of these do not give an attitude", field)
     times = np.array([file.time("TIME", entry) for entry in entries])
     angles = np.array([[file.number(name, entry) for name in ("YAW", "PITCH", "ROLL")] for entry in entries])
     if not (np.abs(angles) < 0.1).all():
-        raise file.error("an angle of the attitude is beyond 0.1 rad", field)
+        raise file.error("an attitude angle is larger than 0.1 rad", field)
     return times, angles
 
 

@@ -203,10 +203,10 @@ def test_heights_have_no_default(tiny, tmp_path):
 
 
 SWAPPED = {
-    "latitude before longitude": ([0, 1, 2, 4, 3, 5], (1, 1, 1, 1, 1), "x and y of the ground"),
+    "latitude before longitude": ([0, 1, 2, 4, 3, 5], (1, 1, 1, 1, 1), "ground x and y"),
     "row before column": ([0, 2, 1, 3, 4, 5], (1, 1, 1, 1, 1), "column and row"),
     "both": ([0, 2, 1, 4, 3, 5], (1, 1, 1, 1, 1), "x and y, and column and row"),
-    "rows negative": ([0, 1, 2, 3, 4, 5], (1, -1, 1, 1, 1), "sign of the rows"),
+    "rows negative": ([0, 1, 2, 3, 4, 5], (1, -1, 1, 1, 1), "rows are negative"),
     "southern latitudes positive": ([0, 1, 2, 3, 4, 5], (1, 1, 1, -1, 1), "sign of y"),
     "western longitudes": ([0, 1, 2, 3, 4, 5], (1, 1, -1, 1, 1), "sign of x"),
 }
@@ -230,7 +230,7 @@ def test_rows_from_the_bottom_are_named(tiny):
 
 def test_points_of_another_place_are_refused(tiny):
     rows = [(name, col, row, lon + 5, lat, h) for name, col, row, lon, lat, h in tiny.points(8)]
-    with pytest.raises(InputError, match="outside of the model's domain"):
+    with pytest.raises(InputError, match="outside the model's domain"):
         commands.fit(tiny.image, points_of(tiny, tiny.write(tiny.folder / "far.csv", rows)))
 
 

@@ -89,16 +89,16 @@ def test_an_orthority_project_is_named(tmp_path):
 def test_a_table_that_names_the_image_is_named(tmp_path):
     image = picture(tmp_path / "a_b.tif")
     (tmp_path / "positions.txt").write_text("x 1 2 3 4 5 6\na_b -5.5 -3.7e6 5258.3 -0.3 0.29 -179.0\n")
-    assert "positions.txt has six numbers for it" in info(image).output
+    assert "positions.txt seems to have an exterior orientation for this image" in info(image).output
     other = picture(tmp_path / "c.tif")
-    assert "no sensor recognises it" in info(other).output
+    assert "no sensor recognises this image" in info(other).output
 
 
 def test_a_photo_with_a_position_is_named(tmp_path):
     tags = {"EXIF_GPSLatitude": "(24) (41) (5.7)", "EXIF_Make": "DJI", "EXIF_Model": "FC6310R"}
     done = info(picture(tmp_path / "a.tif", tags), "--json")
     assert done.exit_code == 2
-    assert "a photo with its GPS position in EXIF (DJI FC6310R)" in json.loads(done.stdout)["error"]["message"]
+    assert "a photo with a GPS position in EXIF (DJI FC6310R)" in json.loads(done.stdout)["error"]["message"]
 
 
 @pytest.mark.realdata
@@ -106,7 +106,7 @@ def test_the_remedy_for_a_real_project_works(real):
     image = real / "orthority" / "odm" / "images" / "100_0005_0018.tif"
     done = info(image)
     assert done.exit_code == 2
-    options = done.output.split("name the reconstruction: ")[1].split(", or ")[0]
+    options = done.output.split("give ")[1].split(" (replace ")[0]
     assert info(image, *shlex.split(options)).exit_code == 0
     # A frame that was laid on the map roughly is no ortho, and the DEM beside it is a DEM.
     ngi = real / "orthority" / "ngi"

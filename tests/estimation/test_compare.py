@@ -284,8 +284,8 @@ def test_no_unstable_model_is_recommended_on_spot_6(real):
     assert rows[smallest].reservations == ("unstable",)
     assert rows[done.recommended].reservations == ()
     assert done.recommended in ("poly3d2", "poly3d3")
-    assert f"; {smallest} has" in done.recommendation.reason
-    assert done.recommendation.reason.endswith("and is unstable")
+    assert f". {smallest} has" in done.recommendation.reason
+    assert done.recommendation.reason.endswith("but is unstable")
     # With the RPC, which is right up to shift and drift.
     done = compare(points, ("rpc", "rpc+shift", "rpc+shift-drift", "rpc+affine", "poly3d2", "rfm2"), own=rpc, size=size)
     assert done.recommended in ("rpc+shift-drift", "rpc+affine")
@@ -312,7 +312,7 @@ def test_what_is_uncertain_over_the_scene_is_part_of_the_expected_error():
     assert done.recommended == "affine3d"
     alone = compare(points, ("affine14",), size=(1000, 1000))
     assert alone.recommended == "affine14"
-    assert alone.recommendation.reason.endswith("it is uncertain at a corner: measure points there")
+    assert alone.recommendation.reason.endswith("affine14 is uncertain at a corner: measure points there")
 
 
 def as_if(name: str, parameters: int, errors: np.ndarray) -> ComparedModel:
@@ -431,7 +431,7 @@ def test_twenty_parameters_on_fourteen_points_do_not_win_by_chance():
     assert true["poly3d2"] > 1.9 * min(true.values())
     assert done.recommended == "dlt"
     assert true["dlt"] < 1.05 * min(true.values())
-    assert f"poly3d2 has {left_out['poly3d2']:.3g} px with 20 parameters, and " in done.recommendation.reason
+    assert f"poly3d2 has RMSE {left_out['poly3d2']:.3g} px with 20 parameters, but " in done.recommendation.reason
 
 
 @pytest.mark.slow

@@ -40,10 +40,10 @@ def truth(model: RPC) -> tuple[np.ndarray, np.ndarray]:
 
 #: How each mistake is made: the inverse of what SWAPS undoes.
 MISTAKES = {
-    "x and y of the ground": lambda image, ground: (image, ground[:, [1, 0, 2]]),
+    "ground x and y": lambda image, ground: (image, ground[:, [1, 0, 2]]),
     "column and row are": lambda image, ground: (image[:, ::-1], ground),
     "x and y, and column": lambda image, ground: (image[:, ::-1], ground[:, [1, 0, 2]]),
-    "sign of the rows": lambda image, ground: (image * [1, -1], ground),
+    "rows are negative": lambda image, ground: (image * [1, -1], ground),
     "from the bottom": lambda image, ground: (image * [1, -1] + [0, ROWS], ground),
     "in feet": lambda image, ground: (image, ground / [1, 1, 0.3048]),
     "sign of x": lambda image, ground: (image, ground * [-1, 1, 1]),

@@ -217,7 +217,7 @@ def test_a_mean_of_check_points_is_said():
     found = analyse(scattered(20, random), np.array([2.0, 0.0]) + random.normal(size=(20, 2)))
     assert found.mean_p is not None
     assert found.mean_p[0] < 0.001
-    assert "On average they are off by +" in found.statement
+    assert "The mean residual is +" in found.statement
     assert found.verdict == "none found"
 
 

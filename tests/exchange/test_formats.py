@@ -90,17 +90,17 @@ def test_an_installed_format_is_listed_and_written(install, registered, tiny, tm
     [
         ([3], "yields int, not Format"),
         (None, "ortho_formats returned NoneType"),
-        ([offer(name="My Format")], "'My Format' is not a name of a format"),
-        ([offer(title=" ")], "its title is empty"),
-        ([offer(ending="mine")], "its ending 'mine' is not like '_name.json'"),
-        ([offer(ending="_../mine")], "its ending '_../mine' is not like '_name.json'"),
+        ([offer(name="My Format")], "'My Format' is not a valid format name"),
+        ([offer(title=" ")], "the title is empty"),
+        ([offer(ending="mine")], "the ending must be like '_name.json', not 'mine'"),
+        ([offer(ending="_../mine")], "the ending must be like '_name.json', not '_../mine'"),
         ([Format("mine", "mine", "_mine.txt", "write")], "write must be callable"),
         ([offer(), offer()], "the format 'mine' twice"),
-        ([offer(ending="_rpc.txt")], "the files of the format 'rpc-txt' end with '_rpc.txt' too"),
-        ([offer(), offer(name="other")], "the files of the format 'mine' end with '_mine.txt' too"),
-        ([offer(name="rpb")], "the format 'rpb', but that name belongs to ortho-pipeline"),
-        ([offer(name="warnings")], "the format 'warnings', but that name belongs to ortho-pipeline"),
-        ([offer(name="csm")], "the format 'csm', but that name belongs to ortho-pipeline"),
+        ([offer(ending="_rpc.txt")], "the format 'rpc-txt' has the same ending '_rpc.txt'"),
+        ([offer(), offer(name="other")], "the format 'mine' has the same ending '_mine.txt'"),
+        ([offer(name="rpb")], "the format 'rpb', but this name belongs to ortho-pipeline"),
+        ([offer(name="warnings")], "the format 'warnings', but this name belongs to ortho-pipeline"),
+        ([offer(name="csm")], "the format 'csm', but this name belongs to ortho-pipeline"),
     ],
 )
 def test_formats_that_are_none_name_their_plugin(offered, message):
@@ -121,7 +121,7 @@ def test_the_help_and_the_doctor_leave_a_broken_format_out(install, caplog):
     assert list(commands.formats()) == [*FORMATS, "csm"]
     (broken,) = commands.doctor()["broken"]
     assert broken["distribution"] == "third-party"
-    assert "'csm' end with '_csm.json' too" in broken["error"]
+    assert "'csm' has the same ending '_csm.json'" in broken["error"]
     assert "third-party 1.2" in caplog.text
 
 

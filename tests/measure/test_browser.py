@@ -53,7 +53,7 @@ class Served:
         leading = folder / "open.html"
         leading.write_text(leading_to(self.address))
         page.goto(leading.as_uri())
-        self.says("#what", "not tested")
+        self.says("#what", "no points yet")
 
     def says(self, where: str, text: str) -> None:
         playwright.expect(self.page.locator(where)).to_have_text(re.compile(text), timeout=_SLOW_MACHINE)
@@ -120,7 +120,7 @@ def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.
         served.click("scene", feature + np.array([2, -2]))
         served.accept(f"P{number + 1}")
         assert _panes(served.page) == panes
-    served.says("#what", "left out in turn, relative to the reference")
+    served.says("#what", r"\(leave-one-out\), relative to the reference")
     # Whoever waits reads for what.
     told = served.page.evaluate("() => window.told")
     assert [text for text in told if "…" in text] == ["Matching …", "Saving P1 …", "Matching …", "Saving P2 …"]
@@ -129,13 +129,13 @@ def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.
     assert served.page.locator("#table tbody tr").count() == 2
     # Loaded anew, the page shows the points that there are.
     served.page.reload()
-    served.says("#what", "left out in turn, relative to the reference")
+    served.says("#what", r"\(leave-one-out\), relative to the reference")
     playwright.expect(served.page.locator("#table tbody tr")).to_have_count(2)
     served.says("#said", "Click a feature")
     # A second window follows what the first one does.
     second = served.page.context.new_page()
     second.goto(served.address)
-    playwright.expect(second.locator("#banner-text")).to_have_text(re.compile("Read only"), timeout=_SLOW_MACHINE)
+    playwright.expect(second.locator("#banner-text")).to_have_text(re.compile("Read-only"), timeout=_SLOW_MACHINE)
     served.page.keyboard.press("z")
     playwright.expect(second.locator("#table tbody tr")).to_have_count(1, timeout=_SLOW_MACHINE)
     second.close()
@@ -272,7 +272,7 @@ def test_six_points_by_keyboard_alone(serve, whole_reference: Path, truth) -> No
     served.says("#said", "P1 \\(control")
     before = page.inner_text("#table tbody")
     page.keyboard.press("ArrowRight")
-    served.says("#said", "By hand")
+    served.says("#said", "Manual")
     page.keyboard.press("Escape")
     assert page.inner_text("#table tbody") == before
     points = served.end()
@@ -291,23 +291,23 @@ def test_six_points_of_a_pair_by_keyboard_alone(serve, whole_reference: Path, wh
     for _ in range(40):
         page.keyboard.press("n")
         page.keyboard.press("m")
-        served.says("#said", "Matched: second|No match|The reference")
+        served.says("#said", "Matched: second|No match|Reference")
         said = page.inner_text("#said")
         # A control point could do with one image; those of the other roles could not.
         # Places near an edge are offered again after each point.
-        if "Enter accepts" not in said or "No match" in said:
+        if "Enter to accept" not in said or "No match" in said:
             page.keyboard.press("Escape")
             continue
         # Tie, control, check, and again.
         page.keyboard.press("r")
-        served.says("#said", r"Role: \w+\. Enter accepts\.")
+        served.says("#said", r"Role: \w+\. Press Enter to accept\.")
         accepted += 1
         page.keyboard.press("Enter")
         served.says("#said", f"P{accepted} accepted")
         if accepted == 6:
             break
-    served.says("#what", "2 check points: too few to judge by")
-    assert "control point would make the worst place" in page.inner_text("#gain")
+    served.says("#what", "Only 2 check points")
+    assert "Best next control point" in page.inner_text("#gain")
     roles = [row.split("\t")[1] for row in page.inner_text("#table tbody").strip().split("\n")]
     assert sorted(roles) == ["check", "check", "control", "control", "tie", "tie"]
     page.keyboard.press("c")
@@ -322,7 +322,7 @@ def test_six_points_of_a_pair_by_keyboard_alone(serve, whole_reference: Path, wh
     served.says("#said", "P1 ")
     before = page.inner_text("#table tbody")
     page.keyboard.press("ArrowRight")
-    served.says("#said", "By hand")
+    served.says("#said", "Manual")
     page.keyboard.press("Escape")
     assert page.inner_text("#table tbody") == before
     points = served.end()
@@ -372,7 +372,7 @@ def test_a_killed_server_loses_nothing_and_the_page_says_so(serve, reference: Pa
     served.process.kill()
     served.process.wait()
     served.page.keyboard.press("z")
-    served.says("#said", "nothing that was accepted is lost")
+    served.says("#said", "All accepted points are saved")
     again = serve(reference)
     playwright.expect(again.page.locator("#table tbody tr")).to_have_count(1)
     assert len(again.end()) == 1
@@ -440,7 +440,7 @@ def test_the_wheel_zooms_and_a_dragged_point_stays(serve, reference: Path, featu
     assert zooms(page, "scene")
     # The whole scene again.
     page.reload()
-    served.says("#what", "not tested")
+    served.says("#what", "no points yet")
     served.click("scene", np.array([500.0, -60.0]))
     served.says("#said", "^You clicked outside the image.$")
     served.click("scene", features[2])

@@ -72,7 +72,7 @@ def test_a_second_process_reads_and_does_not_write(written: Path) -> None:
     second = Journal(written)
     assert (first.read_only, second.read_only) == (False, True)
     assert len(second.actions) == 20
-    with pytest.raises(InputError, match="another process"):
+    with pytest.raises(InputError, match="another ortho measure process"):
         second.append(put("X"))
     first.close()
     third = Journal(written)

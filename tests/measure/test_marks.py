@@ -87,7 +87,7 @@ def test_the_file_is_read_as_the_points_that_are_shown(tmp_path: Path) -> None:
 
 def test_two_points_of_one_place_are_refused_as_the_file_would_be() -> None:
     for twin in (whole("B", image=[11, 12]), whole("B", ground=[33.5, 37, 1])):
-        with pytest.raises(InputError, match="A has the same"):
+        with pytest.raises(InputError, match="A already has the same"):
             history({"do": "put", "mark": whole("A")}, {"do": "put", "mark": twin})
     # What is off is not in the file.
     history({"do": "put", "mark": whole("A", off=True)}, {"do": "put", "mark": whole("B")})
@@ -109,6 +109,6 @@ def test_points_of_a_file_stay_what_they_are() -> None:
 
 @pytest.mark.parametrize("document", [[], "P1", None, 7])
 def test_what_is_no_object_is_refused_by_name(document):
-    with pytest.raises(InputError, match="not a mark") as caught:
+    with pytest.raises(InputError, match="not a point") as caught:
         mark_of(document)
     assert caught.value.field == "mark"

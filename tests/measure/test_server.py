@@ -184,7 +184,7 @@ def test_no_file_is_looked_for_that_a_request_names(client: TestClient, tmp_path
         for path in (tmp_path / "real.gtx", tmp_path / "none.gtx")
     ]
     assert answers[0] == answers[1]
-    assert "not known by that name" in answers[0]
+    assert "unknown height datum" in answers[0]
 
 
 def test_a_tile_is_a_picture_and_nonsense_is_none(client: TestClient) -> None:

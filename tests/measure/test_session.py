@@ -143,7 +143,7 @@ def test_reopening_goes_on_where_it_ended(opens: Opens, tmp_path: Path) -> None:
     second = opens()
     assert second.journal.read_only
     assert second.marks == first.marks
-    with pytest.raises(InputError, match="another process"):
+    with pytest.raises(InputError, match="another ortho measure process"):
         second.act({"do": "undo"})
     # It follows what the one that writes does, and not the half of a line.
     again.act({"do": "remove", "id": again.state()["marks"][0]["id"]})
@@ -156,10 +156,10 @@ def test_reopening_goes_on_where_it_ended(opens: Opens, tmp_path: Path) -> None:
     assert second.marks == again.marks
     again.close()
     assert len(json.loads((tmp_path / "p.geojson").read_text())["features"]) == 17
-    with pytest.raises(InputError, match="began with others"):
+    with pytest.raises(InputError, match="started with other points"):
         opens(gcps=SAMPLE / "gcps.csv")
     (tmp_path / "old.geojson").write_text("{}")
-    with pytest.raises(InputError, match="no journal"):
+    with pytest.raises(InputError, match="was not made by ortho measure"):
         opens("old.geojson")
 
 

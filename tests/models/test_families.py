@@ -315,7 +315,7 @@ def test_coplanar_points(name, simpler, tilt):
     points = make_points(30, ground=on_plane(tilt=tilt))
     with pytest.raises(DegeneratePoints, match="do not determine") as caught:
         fit_family(name, points, size=SIZE)
-    assert caught.value.remedy.endswith(f"these points do determine {simpler}")
+    assert caught.value.remedy.endswith(f"these points are enough for {simpler}")
 
 
 def test_terrain_that_is_flat_but_for_noise():

@@ -240,7 +240,7 @@ def test_summary_fits_a_screen():
 
 def test_what_is_left_out_is_not_known_by_these_words(tmp_path):
     """A model that was left out was taken for a point that was, and not said; so was what a plugin says of nodata."""
-    said = "DIM_1.XML has a rigorous model that is left out: it is of 10 x 10 pixels"
+    said = "the rigorous model in DIM_1.XML is not used: it is for 10 x 10 pixels"
     point = Notice("left-out", "point G3 was left out: gross error")
     made = document(adjusted(points()), warnings=[Notice("rigorous-left-out", said), point])
     assert f"warning   {said}" in report.summary_text(made)

@@ -171,7 +171,7 @@ def test_the_ground_of_an_aeroplanes_frame_lies_below_it(tmp_path: Path) -> None
 
 def test_what_has_no_state(tmp_path: Path) -> None:
     lens = replace(frame(), interior=replace(frame().interior, k1=3.0))
-    with pytest.raises(InputError, match="px off the model"):
+    with pytest.raises(InputError, match="the error would be"):
         csm_text(lens)
     assert csm_text(lens, force=True)[1] > 0.1
     corrected = ImageCorrection.identity(frame(), "shift", (0.0, 0.0))
@@ -182,14 +182,14 @@ def test_what_has_no_state(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
-        ("m_majorAxis", 3396190.0, "another ellipsoid"),
-        ("m_distortionType", 1, "not radial"),
-        ("m_intTimes", [0.0], "not a time for a row"),
-        ("m_currentParameterValue", [1.0] * 16, "corrections beside"),
+        ("m_majorAxis", 3396190.0, "not the ellipsoid of the Earth"),
+        ("m_distortionType", 1, "only radial"),
+        ("m_intTimes", [0.0], "not a possible line period"),
+        ("m_currentParameterValue", [1.0] * 16, "corrections of the tables"),
         ("m_quaternions", [0.0] * 40, "length one"),
-        ("m_positions", None, "numbers belong here"),
+        ("m_positions", None, "must be a list of"),
         ("m_positions", [1e14] * 300, "where no satellite can be"),
-        ("m_nLines", 0, "not a size"),
+        ("m_nLines", 0, "not an image size"),
     ],
 )
 def test_what_is_refused(tmp_path: Path, field: str, value: object, said: str) -> None:

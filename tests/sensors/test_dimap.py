@@ -239,9 +239,9 @@ def test_info_says_which_rigorous_model_is_not_read_and_why(real: Path, pleiades
     reasons = document["facts"]["rigorous_models_not_read"]
     assert set(reasons) == {neo.name, PLEIADES}
     assert "XLOS_0" in reasons[neo.name]  # this file was shortened
-    assert "40000 x 15872 pixels, this image has 8000 x 15872" in reasons[PLEIADES]
+    assert "40000 x 15872 pixels, but this image has 8000 x 15872" in reasons[PLEIADES]
     for name in reasons:
-        assert f"{name} has a rigorous model that is left out: " in text
+        assert f"the rigorous model in {name} is not used: " in text
         assert any(name in warning for warning in document["warnings"])
 
 
@@ -323,7 +323,7 @@ def test_shortened_lists_and_bands_of_their_own_are_refused(tmp_path: Path) -> N
     path.write_text(text.replace(band[0], band[0] + band[0]))
     read_dimap_pushbroom(path)
     path.write_text(text.replace(band[0], band[0] + band[0].replace("8e-05", "9e-05")))
-    with pytest.raises(InputError, match="look angles of their own"):
+    with pytest.raises(InputError, match="each band has its own look angles"):
         read_dimap_pushbroom(path)
 
 

@@ -111,7 +111,7 @@ def test_info_says_what_is_missing(tmp_path):
     path = image(tmp_path)
     with pytest.raises(InputError) as error:
         commands.info(path)
-    assert "`scene.sensor=NAME`, which says what it needs (for images in general: frame" in str(error.value)
+    assert "`scene.sensor=NAME` (general ones: frame" in str(error.value)
     with pytest.raises(InputError) as error:
         commands.info(path, SceneOptions(sensor="frame"))
     for option in ("camera", "exterior", "vertical"):

@@ -482,14 +482,14 @@ def test_what_contradicts_is_said(tmp_path):
     (folder / "po_39001_metadata.txt").write_text(metadata_text().replace("Product Line: Geo", "Product Line: Pro"))
     assert any("corrected twice" in text for text in open_order(image).warnings)
     (folder / "po_39001_metadata.txt").write_text(metadata_text().replace("Zone Number: 39", "Zone Number: 38"))
-    assert any("the image says it is in" in text for text in open_order(image).warnings)
+    assert any("in the image, but" in text for text in open_order(image).warnings)
 
 
 @pytest.mark.parametrize("key", ["Nominal Collection Azimuth", "Nominal Collection Elevation", "Reference Height"])
 def test_what_the_plane_lacks_is_named(tmp_path, key):
     text = "".join(line for line in metadata_text().splitlines(keepends=True) if not line.startswith(key))
     image = write_order(tmp_path / "order", text=text)
-    with pytest.raises(InputError, match=f"without {key}"):
+    with pytest.raises(InputError, match=f"needs {key}"):
         open_order(image)
     scene = open_order(write_order(tmp_path / "order", text=text, rpc=True))
     assert list(scene.models) == ["rpc"]
@@ -508,7 +508,7 @@ def test_wrong_options_and_crops_are_refused(tmp_path):
             open_order(image, **options)
     image.unlink()  # GDAL would delete the metadata with an image that it overwrites
     write_image(image, ramps()[:, :200])
-    with pytest.raises(InputError, match="400 x 200 pixels, the metadata are of 400 x 300"):
+    with pytest.raises(InputError, match="400 x 200 pixels, but the metadata are for 400 x 300"):
         open_order(image)
     assert open_order(write_order(tmp_path / "order"), heights="1000,2500").model.height_range == (1000.0, 2500.0)
 
@@ -600,7 +600,7 @@ def test_bands_are_stacked_and_each_is_as_by_itself(tmp_path):
         )
     some = open_order(bands["red"], bands="red,grn")
     assert [path.name[9:12] for path in some.rasters] == ["red", "grn"]
-    with pytest.raises(InputError, match="there is no band 'ms'"):
+    with pytest.raises(InputError, match="no file found for band 'ms'"):
         open_order(bands["red"], bands="red,ms")
 
 
@@ -727,7 +727,7 @@ def test_a_neighbour_that_is_broken_is_no_obstacle(tmp_path):
     (tmp_path / "order" / "po_39001_pan_0000000.tif").write_bytes(b"cut off")
     scene = open_order(bands["red"])
     assert {piece.path.name[9:12] for piece in scene.pieces} == {"blu", "grn", "nir"}
-    assert "points in po_39001_pan_0000000.tif are not taken over" in scene.warnings[0]
+    assert "points in po_39001_pan_0000000.tif are not used" in scene.warnings[0]
 
 
 # -- what GDAL makes of it -------------------------------------------------------------------------------------------

@@ -379,10 +379,10 @@ def test_points_of_the_panchromatic_image_adjust_the_colours(bundle: list[Path])
     ("old", "new", "said"),
     [
         ("<POLYORDER>-1", "<POLYORDER>2", "optical distortion"),
-        ("<QCS4>1.0", "<QCS4>0.9", "turned in its platform"),
-        ("<DETROTANGLE>0.0", "<DETROTANGLE>0.1", "turned detectors"),
-        ("<CX>0.0", "<CX>0.5", "away from the middle"),
-        ("<TLCLIST>50.0", "<TLCLIST>25.0 2.4e-3</TLCLIST><TLCLIST>50.0", "any one rate"),
+        ("<QCS4>1.0", "<QCS4>0.9", "rotated in its platform"),
+        ("<DETROTANGLE>0.0", "<DETROTANGLE>0.1", "rotated detectors"),
+        ("<CX>0.0", "<CX>0.5", "off the centre"),
+        ("<TLCLIST>50.0", "<TLCLIST>25.0 2.4e-3</TLCLIST><TLCLIST>50.0", "rate is not constant"),
     ],
 )
 def test_a_camera_of_unknown_conventions_is_left_for_the_rpc(

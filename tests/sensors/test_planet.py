@@ -40,7 +40,7 @@ def test_every_command(image: Path) -> None:
 
 def test_an_orthorectified_asset_is_refused(image: Path) -> None:
     (image.parent / f"{image.stem}_RPC.TXT").unlink()
-    with pytest.raises(InputError, match="orthorectified assets have none"):
+    with pytest.raises(InputError, match="Orthorectified assets have none"):
         open_scene(image)
 
 

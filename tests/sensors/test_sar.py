@@ -96,7 +96,7 @@ def test_angles_as_options_without_metadata(image: Path) -> None:
     assert relief[0] == pytest.approx(math.sin(math.radians(80)) / math.tan(math.radians(35)), rel=0.02)
     assert [notice.code for notice in scene.notices] == ["radar-on-a-plane"]
     del options["azimuth"]
-    with pytest.raises(InputError, match="nothing says the azimuth"):
+    with pytest.raises(InputError, match="unknown for this image: azimuth"):
         open_scene(image, "sar", options)
 
 
@@ -115,6 +115,6 @@ def test_slant_range_is_refused(image: Path) -> None:
 def test_complex_values_are_slant_range(tmp_path: Path) -> None:
     """SLC and SICD of any vendor, which nothing else knows."""
     gdal.GetDriverByName("GTiff").Create(str(tmp_path / "slc.tif"), *SIZE, 1, gdal.GDT_CFloat32).FlushCache()
-    with pytest.raises(InputError, match="this is in slant range") as caught:
+    with pytest.raises(InputError, match="this image is in slant range") as caught:
         open_scene(tmp_path / "slc.tif")
     assert "GEC" in caught.value.remedy

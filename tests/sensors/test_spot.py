@@ -192,7 +192,7 @@ def test_a_crop_has_its_place(scene: Path) -> None:
         ("<PROCESSING_LEVEL>1A", "<PROCESSING_LEVEL>1B", "level 1A"),
         ("<DETECTOR_ID>1<", "<DETECTOR_ID>2<", "detector 1"),
         ("<NCOLS>60", "<NCOLS>61", "61 columns"),
-        ("+1.5040000000e-03", "0", "not a time for a row"),
+        ("+1.5040000000e-03", "0", "not a possible line period"),
         ("Location", "Elsewhere", "missing"),
     ],
 )

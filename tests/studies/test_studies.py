@@ -45,7 +45,7 @@ def test_studies_of_packages_are_commands_beside_the_four_papers(offered):
         ("yield 3", "yields int, not Study"),
         ("yield Study('mine', ''); yield Study('mine', '')", "the study 'mine' twice"),
         ("return None", "ortho_studies returned NoneType"),
-        ("yield Study('ikonos', '')", "the study 'ikonos', but that name belongs to ortho-pipeline"),
+        ("yield Study('ikonos', '')", "the study 'ikonos', but this name belongs to ortho-pipeline"),
     ],
 )
 def test_studies_that_are_none_name_their_plugin(offered, offer, message):
@@ -57,9 +57,9 @@ def test_studies_that_are_none_name_their_plugin(offered, offer, message):
 @pytest.mark.parametrize(
     ("word", "other", "message"),
     [
-        ("ortho_studies():", "ortho_study():", r"no hook 'ortho_study'(.|\n)*did you mean ortho_studies\?"),
+        ("ortho_studies():", "ortho_study():", r"unknown hook 'ortho_study'(.|\n)*did you mean ortho_studies\?"),
         ("from ortho_studies.hookspecs import Study, hookimpl", "from ortho_pipeline.hookspecs import hookimpl",
-         r"ortho_studies is not marked with @hookimpl\n.*@hookimpl of ortho_studies\.hookspecs"),
+         r"ortho_studies has no decorator @hookimpl\n.*@hookimpl .from ortho_studies\.hookspecs"),
     ],
 )  # fmt: skip
 def test_a_hook_that_nobody_calls_is_an_error(offered, word, other, message):

@@ -1,9 +1,9 @@
-"""Many models on the same points, one row each, and which of them to take.
+"""Compare models on the same points: one row for each, and a recommendation.
 
-A model that cannot be fitted is a row with its reason. Gross errors are found once and left out for all, because a
-model that may throw out what it cannot follow would win.
+A model that cannot be fitted has a row with the reason. Gross errors are found once and left out for all models:
+otherwise a model that rejects the points that it cannot fit would win.
 
-`choice.recommendation` says which one to take.
+`choice.recommendation` chooses the model.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 
-#: What is adjusted over a scene's own model.
+#: Corrections of a scene's own model.
 CORRECTIONS = tuple(FREE)
-#: Models whose median error is within this factor of the smallest one have a vote on gross errors.
+#: Only models whose median error is within this factor of the smallest vote on gross errors.
 _CLEAR_SIGHTED = 2.0
 
 
@@ -45,7 +45,7 @@ class PointCounts(Record):
 
 
 class Recommendation(Record):
-    """The model to take, null where nothing can be said, and what speaks for it."""
+    """The recommended model and the reason; the model is null if none can be recommended."""
 
     model: str | None
     criterion: Literal["check", "leave-one-out", "none"]
@@ -53,7 +53,7 @@ class Recommendation(Record):
 
 
 class ComparisonRecord(Record):
-    """Models that ortho compare fitted to the same points, and its recommendation."""
+    """Models fitted to the same points by ortho compare, and its recommendation."""
 
     schema_version: Count
     image: str
@@ -78,7 +78,7 @@ class ComparisonRecord(Record):
         return next((row for row in self.rows if row.model == self.recommended), None)
 
     def noted(self, notices: Sequence[Notice]) -> Self:
-        """Return it with more notices."""
+        """Return the record with further notices."""
         more = to_document(notices)
         return self.replaced(warnings=(*self.warnings, *more["warnings"]), notices=(*self.notices, *more["notices"]))
 
@@ -89,7 +89,7 @@ def available_models(own: SensorModel | None = None) -> dict[str, tuple[int, int
     Parameters
     ----------
     own : SensorModel, optional
-        The scene's own model: it comes first, as delivered, with each correction, and with parameters of its own.
+        The scene's own model. It comes first: as delivered, with each correction, and with its own parameters.
     """
     found: dict[str, tuple[int, int, int]] = {}
     if own is not None:
@@ -104,7 +104,7 @@ def available_models(own: SensorModel | None = None) -> dict[str, tuple[int, int
 
 
 def own_name(own: SensorModel, correction: str) -> str:
-    """Return what a scene's own model is called, with what is adjusted on it."""
+    """Return the name of a scene's own model with a correction."""
     return own.kind if correction == "none" else f"{own.kind}+{correction}"
 
 
@@ -123,9 +123,9 @@ def choose_models(text: str, own: SensorModel | None = None) -> tuple[str, ...]:
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         raise InputError(
-            f"no model is called {', '.join(unknown)}" if unknown else "no model is named",
+            f"unknown model {', '.join(unknown)}" if unknown else "no model given",
             field="models",
-            remedy=f"all, or some of {', '.join(known)}",
+            remedy=f"use all, or some of {', '.join(known)}",
         )
     return names
 
@@ -145,9 +145,9 @@ def compare(
     significance: float = SIGNIFICANCE,
     robust: bool = True,
 ) -> ComparisonRecord:
-    """Fit every model to the same control points and hold them against the same check points.
+    """Fit several models to the same control points and test them at the same check points.
 
-    Image and sensor are empty: they are not known here.
+    `image` and `sensor` of the record stay empty.
 
     Parameters
     ----------
@@ -156,21 +156,21 @@ def compare(
     own : SensorModel, optional
         The scene's own model, for names such as ``rpc+shift``.
     priors : mapping of parameter name to Prior, optional
-        How well its own parameters are known.
+        Accuracy of its own parameters as delivered.
     size : (int, int), optional
         Columns and rows of the image.
     crs : str, optional
-        Ground CRS of the classical models: geocentric, geographic, utm or EPSG:n; that of the points by default.
+        Ground CRS of the classical models: geocentric, geographic, utm or EPSG:n; default: that of the points.
     heights : (lo, hi), optional
-        Heights (m) for which the models are meant.
+        Height range (m) of the models.
     unsuited : mapping of str to str, optional
-        Families that do not suit the scene, with a warning for each.
+        Unsuitable families, each with its warning.
     ridge : float, 'gcv', 'lcurve', 'auto' or None
-        Regularisation of rational functions, as for `ortho_pipeline.estimation.family_fit.fit_family`.
+        Regularisation of rational functions, as for `fit_family`.
     significance : float
         Of the tests of parameters.
     robust : bool
-        Look for gross errors and leave them out.
+        Find gross errors and leave them out.
     """
     known = available_models(own)
     job = _Job(own, dict(priors or {}), size, crs, heights, ridge)
@@ -236,9 +236,9 @@ class _Job:
 
 
 def _blunders(fits: Sequence[Fit]) -> dict[str, str]:
-    """Return the points that more than half of the models reject, each with the first reason given.
+    """Return the points that more than half of the models reject, each with the first reason.
 
-    Models that do not follow the scene at all see no gross error: only those with about the smallest errors vote.
+    Poor models cannot see gross errors, so only models with about the smallest errors vote.
     """
     able = [found for found in fits if found.redundancy >= 4 and found.model.params.size]
     sizes = [_median_error(found) for found in able]
@@ -254,7 +254,7 @@ def _blunders(fits: Sequence[Fit]) -> dict[str, str]:
 
 
 def _median_error(found: Fit) -> float:
-    """Return the median over all control points, rejected ones too, of how far they are from their prediction (px)."""
+    """Return the median prediction error (px) of all control points, including rejected ones."""
     errors = np.where(found.used[:, None], found.loo_residuals, found.residuals)[found.points.control]
     sizes = np.hypot(*np.where(np.isfinite(errors), errors, np.inf).T)
     return float(np.median(sizes))

@@ -1,23 +1,23 @@
-r"""How large an error a model is expected to have over a whole scene, and whether its control points contradict it.
+r"""The expected error of a model over a whole scene, and whether the control points contradict the model.
 
-Leave-one-out residuals say what a model errs where control is. Over the scene its parameters are less certain, and
-control at one height does not show what a model of the plane does at others. With the mean square :math:`m` (px²) of
-the residuals of points that took no part, the stated noise :math:`q` of a point, the variances :math:`v_t` and
-:math:`v_s` that come from the parameters at these points and over the scene (both for the stated noise), the expected
-mean square over the scene, noise of measuring included, is
+Leave-one-out residuals measure the error near control points. Elsewhere in the scene the parameters are less certain,
+and control points at one height cannot show the error of a 2D model at other heights. Let :math:`m` be the mean square
+(px²) of residuals of points that did not take part, :math:`q` the stated noise of a point, and :math:`v_t` and
+:math:`v_s` the variances from the parameters at these points and over the scene (both for the stated noise). Then the
+expected mean square over the scene, including measurement noise, is
 
 .. math:: e = u (q + v_s) + h, \qquad u = \max(m / (q + v_t), u_0)
 
-:math:`u_0` is the noise itself: a smaller error is chance. It is 1 (the stated noise), or less where the model that the
-points support most has less. :math:`h` is the parallax of heights that control does not cover, zero for 3D models.
+:math:`u_0` is the noise itself, because a smaller error is chance. It is 1 (the stated noise), or less if the best
+supported model has less. :math:`h` is the parallax of heights without control points, zero for 3D models.
 
-Whether the points support a model is Akaike's criterion, corrected for few observations: with the whitened sum of
-squares :math:`S`, :math:`N` observations and :math:`K` parameters (one of them the noise), and the stated noise as
-:math:`\nu` observations more,
+Akaike's criterion, corrected for few observations, decides whether the points support a model. With the whitened sum of
+squares :math:`S`, :math:`N` observations, :math:`K` parameters (one of them the noise), and the stated noise as
+:math:`\nu` further observations, it is
 
 .. math:: (N + \nu) \ln\frac{S + \nu}{N + \nu} + 2 K + \frac{2 K (K + 1)}{N + \nu - K - 1}
 
-A model that is larger by more than 10 has essentially no support (Burnham and Anderson 2002, section 2.6).
+A model whose criterion is larger by more than 10 has essentially no support (Burnham and Anderson 2002, section 2.6).
 
 Source: Hurvich and Tsai 1989 (the correction); Allen 1974 (prediction by leaving out).
 """
@@ -39,17 +39,17 @@ from ortho_pipeline.models.base import Array
 
 #: Criteria that are larger than the smallest one by this contradict the model.
 _CONTRADICTED = 10.0
-#: The stated noise counts as so many observations: the sigma of a point is rarely known better than by half of itself.
+#: The stated noise counts as this many observations: a stated sigma is rarely accurate to better than 50 %.
 _STATED = 8
-#: Places at which the scene is looked at, to each side and in height.
+#: Grid positions in the scene, in each direction and in height.
 _PLACES, _LEVELS = 9, 3
-#: Mean square tangent of the angle off nadir of images whose view nobody states: 17.5 degrees.
+#: Mean square tangent of an unknown incidence angle: 17.5 degrees.
 _VIEW = 0.1
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """What the points say of one model.
+    """Statistics of one model from the points.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class Expectation:
         Mean variances (px²): of measuring a point as stated, and of the parameters at the points that test the model
         and over the scene.
     unseen : float
-        Mean square parallax (px²) of heights that control does not cover.
+        Mean square parallax (px²) of heights without control points.
     """
 
     criterion: float
@@ -72,12 +72,12 @@ class Expectation:
     unseen: float
 
     def square(self, mean_square: float, least: float) -> float:
-        """Return the expected mean square (px²) over the scene for that at the tests; `least` is the noise."""
+        """Return the expected mean square (px²) over the scene from that at the test points; `least` is the noise."""
         return max(mean_square / (self.stated + self.tested), least) * (self.stated + self.scene) + self.unseen
 
 
 def expectation(found: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | None) -> Expectation:
-    """Return what is expected of a fit that the points in the mask `tests` ``(N,)`` test, in an image of this size."""
+    """Return the statistics of a fit that the points of the mask `tests` ``(N,)`` test, in an image of this size."""
     points, model = found.points, found.model
     measured = points.select(found.used | tests)
     stated = float(np.trace(ImageErrors.of(model, measured).covariance, axis1=1, axis2=2).mean())
@@ -93,10 +93,10 @@ def expectation(found: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | No
 
 
 def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[str], float]:
-    """Return the models that the points do not contradict, and the noise as a multiple of the stated one (squared).
+    """Return the models that the points support, and the noise as a multiple of the stated one (squared).
 
-    A model whose noise is within the factor `worth` of that of the most supported one is not contradicted: many points
-    prove differences that matter to nobody.
+    A model whose noise is within the factor `worth` of the best supported one also counts: many points prove
+    differences that do not matter.
     """
     best = min(expected, key=lambda name: expected[name].criterion)
     lowest = expected[best].criterion
@@ -139,7 +139,7 @@ def _variance(found: Fit, ground: Array) -> float:
 
 
 def _places(found: Fit, size: tuple[int, int] | None) -> Array:
-    """Return places ``(n, 3)`` spread evenly over the ground for which a model is meant, as far as its image shows."""
+    """Return positions ``(n, 3)`` spread evenly over the domain of a model, within its image."""
     centre, half = found.model.domain
     side = (np.arange(_PLACES) + 0.5) / _PLACES * 2 - 1
     level = (np.arange(_LEVELS) + 0.5) / _LEVELS * 2 - 1
@@ -152,7 +152,7 @@ def _places(found: Fit, size: tuple[int, int] | None) -> Array:
 
 
 def _unseen(found: Fit, places: Array) -> float:
-    """Return the mean square (px²) of what heights move that control does not cover, for a model that ignores them."""
+    """Return the mean square displacement (px²) by heights without control points, for a model that ignores heights."""
     heights = found.points.ground[found.used, 2]
     if found.model.uses_height or not len(places):
         return 0.0

@@ -1,15 +1,15 @@
-"""Which of the models that were compared to take.
+"""Recommend one of the compared models.
 
-The recommendation is the model with the smallest error that is expected over the whole scene (`expected_error`), from
-the errors at all points that took no part: check points, and control points each left out in turn.
+The recommended model has the smallest expected error over the whole scene (`expected_error`). This is computed from
+errors at check points, and at control points left out one at a time.
 
-1. A model that is unstable or unsuited, or that the points contradict, is never recommended.
-2. Where the scene has a model of its own, one of its corrections is taken, unless another model is significantly better
-   at the points that took no part: at 5 % in paired differences of the squared errors at the same points.
-3. Of the models within 2 % of the smallest expected error, the one with the fewest parameters.
+1. A model that is unstable, unsuitable or contradicted by the points is never recommended.
+2. If the scene has its own model, one of its corrections is recommended, unless another model is significantly better
+   (5 % level, paired differences of squared errors at the same points).
+3. Among models within 2 % of the smallest expected error, the one with the fewest parameters is recommended.
 
-The smallest error at the points would be that of a model that is best by chance: there are some twenty candidates, and
-those with nearly as many parameters as observations vary most. docs/engineering/accuracy.md has what the choice costs.
+The smallest error at the points would often belong to a model that is best by chance: there are some twenty candidates,
+and those with many parameters vary most. docs/engineering/accuracy.md states the cost of this choice.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 
-#: Chance of calling the corrections of the scene's own model worse than another one that is as good, one-sided.
+#: Chance that the scene's own model is rejected although the other one is only equally good (one-sided).
 _SIGNIFICANTLY_WORSE = 0.05
-#: Smaller differences of the RMSE, as a factor, are not worth a parameter, nor another model than the scene's own.
+#: A smaller improvement of the RMSE (a factor) does not justify one more parameter or another model.
 _WORTH = 1.02
 
 _Squares = dict[str, Array]
@@ -41,7 +41,7 @@ def recommend(
     unsuited: Sequence[str] = (),
     size: tuple[int, int] | None = None,
 ) -> tuple[str | None, str, str]:
-    """Return the recommended model, the reason in words, and what decided.
+    """Return the recommended model, the reason in words, and the criterion.
 
     Parameters
     ----------
@@ -55,31 +55,32 @@ def recommend(
     Returns
     -------
     tuple
-        The third is ``check`` (check points, and control points left out in turn), ``leave-one-out`` or ``none``.
+        The criterion is ``check`` (check points, and control points left out one at a time), ``leave-one-out`` or
+        ``none``.
     """
     by_name = {row.model: row for row in rows if row.fit is not None}
     squares, tests, checks = _tests(list(by_name.values()))
     if not squares:
-        return None, "no model leaves redundancy: nothing can be tested on these points", "none"
+        return None, "no model has redundancy on these points, so none can be tested", "none"
     count = int(tests.sum())
     if count < 3:
-        return None, "fewer than three points test every model: too few to choose by", "none"
+        return None, "fewer than three points test all models, too few for a recommendation", "none"
     doubts = {name: _doubts(by_name[name], unsuited) for name in squares}
     sound = {name: values for name, values in squares.items() if not doubts[name]}
     smallest = min(squares, key=lambda name: (squares[name].mean(), by_name[name].parameters))
     if not sound:
-        return None, f"every model that can be tested is doubtful; {smallest} is {doubts[smallest]}", "none"
+        return None, f"no model that can be tested is reliable; {smallest} is {doubts[smallest]}", "none"
     expected = {name: expectation(by_name[name].fit, tests, size) for name in sound}  # type: ignore[arg-type]
     errors = expected_errors(sound, expected)
     chosen = _choose(sound, errors, by_name, [name for name in preferred if name in errors])
-    reason = f"{chosen}: {errors[chosen]:.3g} px expected over the scene, {_shown(squares[chosen])} at "
-    reason += f"{_what(checks, count - checks)}, with {counted(by_name[chosen].parameters, 'parameter')}"
+    reason = f"{chosen}: expected error {errors[chosen]:.3g} px over the scene; RMSE {_shown(squares[chosen])} at "
+    reason += f"{_what(checks, count - checks)}; {counted(by_name[chosen].parameters, 'parameter')}"
     reason += _but(chosen, smallest, squares, errors, doubts, by_name)
     return chosen, reason, "check" if checks else "leave-one-out"
 
 
 def expected_errors(squares: Mapping[str, Array], expected: Mapping[str, Expectation]) -> dict[str, float]:
-    """Return the root mean square (px) that is expected over the scene of each model that the points support."""
+    """Return the expected error (root mean square, px) over the scene of each model that the points support."""
     names, noise = supported(expected, _WORTH)
     return {name: math.sqrt(expected[name].square(float(squares[name].mean()), noise)) for name in names}
 
@@ -92,19 +93,20 @@ def _but(
     doubts: Mapping[str, str],
     rows: Mapping[str, ComparedModel],
 ) -> str:
-    """Return in words why the model with the smallest error at the points is not taken, and what to mind."""
+    """Return in words why the model with the smallest error at the points is not recommended, and reservations."""
     text = ""
     if smallest != chosen:
-        text = f"; {smallest} has {_shown(squares[smallest])} with {counted(rows[smallest].parameters, 'parameter')}, "
+        text = f". {smallest} has RMSE {_shown(squares[smallest])} with "
+        text += f"{counted(rows[smallest].parameters, 'parameter')}, "
         if doubts[smallest]:
-            text += f"and is {doubts[smallest]}"
+            text += f"but is {doubts[smallest]}"
         elif smallest not in errors:
-            text += "and these points do not support it"
+            text += "but these points do not support it"
         else:
-            text += f"and {errors[smallest]:.3g} px are expected over the scene"
+            text += f"but its expected error over the scene is {errors[smallest]:.3g} px"
     found = rows[chosen].fit
     weak = ", ".join(found.reservations) if found else ""
-    return text + (f"; it is {weak}: measure points there" if weak else "")
+    return text + (f". {chosen} is {weak}: measure points there" if weak else "")
 
 
 def _shown(squares: Array) -> str:
@@ -112,10 +114,10 @@ def _shown(squares: Array) -> str:
 
 
 def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:
-    """Return squared errors (px²) of each model at the points that test all of them, their mask, how many are checks.
+    """Return squared errors (px²) of each model at the points that test all models, their mask, and the check count.
 
-    Without redundancy no control point can be left out; such models are tested where check points alone test all.
-    Check points that contradict the model with the smallest median test none.
+    A model without redundancy has no leave-one-out errors; only check points can test it. Check points that contradict
+    the model with the smallest median are not used.
     """
     fits = {row.model: row.fit for row in rows if row.fit is not None}
     errors = {name: _squares(found) for name, found in fits.items() if found.redundancy > 0}
@@ -136,7 +138,7 @@ def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:
 
 
 def _squares(found: Fit) -> Array:
-    """Return squared errors (px²) per point ``(N,)`` of check points and of control points left out; NaN for others."""
+    """Return squared errors (px²) per point ``(N,)``: check points, control points left out; NaN for others."""
     # A model without parameters is tested by every control point.
     control = found.loo_residuals if found.model.params.size else np.where(found.used[:, None], found.residuals, np.nan)
     values = np.where(found.points.check[:, None], found.residuals, control)
@@ -145,9 +147,9 @@ def _squares(found: Fit) -> Array:
 
 
 def _doubts(row: ComparedModel, unsuited: Sequence[str]) -> str:
-    """Return why a model is not recommended whatever its errors; empty if there is no reason.
+    """Return why a model is not recommended, whatever its errors; empty if there is no reason.
 
-    That it is uncertain at a corner is part of the error that is expected of it.
+    Uncertainty at a corner is no reason, because it is part of the expected error.
     """
     found = [one for one in row.fit.reservations if one == "unstable"] if row.fit else []
     return " and ".join([*found, *(["unsuited to the scene"] if row.model in unsuited else [])])
@@ -156,7 +158,7 @@ def _doubts(row: ComparedModel, unsuited: Sequence[str]) -> str:
 def _choose(
     squares: _Squares, errors: Mapping[str, float], rows: Mapping[str, ComparedModel], preferred: Sequence[str]
 ) -> str:
-    """Return the model to take."""
+    """Return the name of the recommended model."""
     candidates: Sequence[str] = list(errors)
     if preferred:
         own, best = (min(names, key=errors.__getitem__) for names in (preferred, candidates))
@@ -168,7 +170,7 @@ def _choose(
 
 
 def _significantly_worse(squares: Array, best: Array) -> bool:
-    """Say whether errors are larger by more than is worth it, and by more than chance at the same points explains."""
+    """Return whether errors are larger than those of the best model, by more than `_WORTH` and more than by chance."""
     if squares.mean() <= _WORTH**2 * best.mean():
         return False
     difference = squares - best
@@ -178,8 +180,8 @@ def _significantly_worse(squares: Array, best: Array) -> bool:
 
 
 def _what(checks: int, control: int) -> str:
-    """Return in words what points tested the models."""
-    left_out = f"{counted(control, 'control point')}, each left out in turn"
+    """Return in words which points tested the models."""
+    left_out = f"{counted(control, 'control point')} (leave-one-out)"
     if not checks:
         return left_out
     return counted(checks, "check point") + (f" and {left_out}" if control else "")

@@ -1,6 +1,6 @@
-"""Observations of an adjustment, of one image and of a block: the types that both have.
+"""Observations of an adjustment: the types that the fit of one image and a block have in common.
 
-An image point has `ImageErrors`. In the fit of one image they contain the errors of the known ground. A block keeps the
-ground as an unknown, and observes it by `OnPoints`. A parameter that is known beforehand has a `Prior`. An error that
-many points have in common is a `CommonUnknown`. A tie is image points of one place without ground.
+An image point has `ImageErrors`. In the fit of one image they include the errors of the known ground. A block has the
+ground as an unknown, and observes it by `OnPoints`. Prior knowledge of a parameter is a `Prior`. An error common to
+many points is a `CommonUnknown`. A tie consists of image points of one place without known ground.
 """

@@ -1,12 +1,11 @@
-r"""An error that many observations have in common, as an unknown of an adjustment: of one image, and of a block.
+r"""An error common to many observations, as an unknown of an adjustment of one image or a block.
 
-It is one vector :math:`c \sim N(0, I)`, of known ground in plan, in units of its standard deviation. What the
-adjustment tells of it is information :math:`T` (``told``), and the slope :math:`g` of half the sum of squares: a step
-of it is
+It is one vector :math:`c \sim N(0, I)`, of known ground in plan, in units of its standard deviation. The adjustment
+gives the information :math:`T` (``told``) and the slope :math:`g` of half the sum of squares. A step is
 
 .. math:: (I + T)\, dc = g - c
 
-Where nothing tells of it, :math:`T = 0`, it stays 0 with its whole standard deviation.
+Without information, :math:`T = 0`, it stays 0 with its full standard deviation.
 
 Source: Koch 1999, section 3.2 (elimination of unknowns) and 3.6 (mixed model).
 """
@@ -22,27 +21,26 @@ import numpy as np
 from ortho_pipeline.models.base import Array
 
 _S = TypeVar("_S")
-#: Its estimate is renewed so many times at most.
+#: Largest number of iterations.
 _ROUNDS = 5
-#: Other points that put the reference farther off than so many of its sigmas contradict it: they do not correct it.
+#: If other points show an error of more than this many sigmas, they contradict the reference and do not correct it.
 _BELIEVED = 4.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CommonUnknown:
-    """What observations have in common, and what the others tell of it.
+    """An error common to some observations, and the information on it from the others.
 
     Parameters
     ----------
     sigma : float
-        Its standard deviation per axis, m: the largest, where points state several.
+        Standard deviation per axis, m; the largest if points state several.
     points : int
-        Control points that share it.
+        Number of control points that share the error.
     value : (k,)
-        Its estimate, in standard deviations: of ground how far true east and north of the truth that of these points
-        lies; 0 where nothing tells of it.
+        Estimate in standard deviations: of known ground stated minus true ground, east and north; 0 without information.
     told : (k, k)
-        Information of other points and of priors on it; that of its own standard deviation is I.
+        Information from other points and from priors; that of its own standard deviation is I.
     """
 
     sigma: float
@@ -52,13 +50,13 @@ class CommonUnknown:
 
     @property
     def left(self) -> Array:
-        """Covariance ``(k, k)`` of its estimate, in standard deviations."""
+        """Covariance ``(k, k)`` of the estimate, in standard deviations."""
         return np.asarray(np.linalg.inv(np.eye(len(self.value)) + self.told))
 
     def started(self, each: Array) -> Self:
-        """Return it as others see it one by one ``(n, 2)``, by their median: a start that gross errors do not spoil.
+        """Return the error started from single estimates ``(n, 2)``, by their median, which resists gross errors.
 
-        If they put it beyond what its sigma allows, it stays 0.
+        If the median is too large for the sigma, the value stays 0.
         """
         each = each[np.isfinite(each).all(axis=1)]
         value = np.median(each, axis=0) if len(each) else np.zeros(2)
@@ -75,23 +73,23 @@ class CommonUnknown:
         again: Callable[[Self, _S], _S],
         stands: float,
     ) -> tuple[_S, Self]:
-        """Return a solution with it as an unknown, and it.
+        """Return a solution with the error as an unknown, and the error.
 
         Parameters
         ----------
         seen : callable (self, solution) -> (self, (2,))
-            It with what a solution tells of it, and the slope.
+            The error with the information of a solution, and the slope.
         again : callable (self, solution) -> solution
-            With its new value.
+            The solution with its new value.
         stands : float
-            The estimate stands when it moves by less than this (standard deviations); models are nearly linear in it.
+            The iteration stops when the value changes by less than this (standard deviations).
         """
-        found = self
+        error = self
         for _ in range(_ROUNDS):
-            found, slope = seen(found, solution)
-            step = found.step(slope)
+            error, slope = seen(error, solution)
+            step = error.step(slope)
             if np.abs(step).max() < stands:
                 break
-            found = replace(found, value=found.value + step)
-            solution = again(found, solution)
-        return solution, found
+            error = replace(error, value=error.value + step)
+            solution = again(error, solution)
+        return solution, error

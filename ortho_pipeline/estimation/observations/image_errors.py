@@ -1,4 +1,4 @@
-"""Errors of image points, with those of their ground."""
+"""Errors of image points, including errors of their ground."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import says_more
 
-#: An error across a direction that is smaller than this part of that along it is rounding.
+#: A perpendicular error below this part of the error along a direction is rounding.
 _ROUNDING = 1e-14
 
 
@@ -20,7 +20,7 @@ _ROUNDING = 1e-14
 class ImageErrors:
     """A-priori errors of image measurements: Cholesky factors ``(n, 2, 2)`` px of their covariances, lower triangles.
 
-    Whitening is a division by the standard deviations where column and row err independently.
+    If column and row are independent, whitening divides by their standard deviations.
     """
 
     factor: Array
@@ -30,18 +30,18 @@ class ImageErrors:
 
     @classmethod
     def of(cls, model: SensorModel, points: Points) -> ImageErrors:
-        """Return the errors of points, which are in the CRS of the model, with what those of their ground move.
+        """Return the errors of points in the CRS of the model, with the projected errors of their ground.
 
         Raises
         ------
         InputError
-            If a point states no error at all in some direction of the image.
+            If a point has a standard deviation of zero in some direction.
         """
         factor = _factors(points.sigma_image, points.covariance_image)
         known = (points.sigma_ground > 0).any(axis=1)
         if known.any():
             ground = points.ground[known]
-            # On the ellipsoid: at heights of people a metre of it is a thousandth longer at most.
+            # On the ellipsoid: at heights on land, a metre differs by a thousandth at most.
             per_metre = map_from_enu(points.crs, ground * (1.0, 1.0, 0.0))
             moved = model.ground_partials(ground) @ (per_metre * points.sigma_ground[known][:, None, :])
             factor[known] = _summed(np.concatenate([factor[known], moved], axis=2))
@@ -49,7 +49,7 @@ class ImageErrors:
         if exact.any():
             name = points.ids[int(np.flatnonzero(exact)[0])]
             raise InputError(
-                f"the point {name} has no error in some direction of the image",
+                f"the point {name} has a standard deviation of zero in one direction of the image",
                 file=points.source or None,
                 field="sigma_image",
                 remedy="give each measurement a positive standard deviation",
@@ -67,7 +67,7 @@ class ImageErrors:
         return self.factor @ self.factor.transpose(0, 2, 1)
 
     def whitened(self, values: Array) -> Array:
-        """Return values ``(n, 2)`` or ``(n, 2, P)`` of px as multiples of independent standard deviations."""
+        """Return values ``(n, 2)`` or ``(n, 2, P)`` in px as multiples of independent standard deviations."""
         factor = self.factor.reshape(-1, 2, 2, *(1,) * (values.ndim - 2))
         white = np.empty(values.shape)
         white[:, 0] = values[:, 0] / factor[:, 0, 0]
@@ -84,7 +84,7 @@ class ImageErrors:
 
 
 def _factors(sigma: Array, covariance: Array) -> Array:
-    """Return the Cholesky factors ``(n, 2, 2)`` of covariances; of those without directions `sigma` ``(n,)`` counts."""
+    """Return the Cholesky factors ``(n, 2, 2)`` of covariances; `sigma` ``(n,)`` counts if they are isotropic."""
     factor = np.zeros((len(sigma), 2, 2))
     factor[:, 0, 0] = factor[:, 1, 1] = sigma
     full = says_more(covariance)
@@ -95,8 +95,8 @@ def _factors(sigma: Array, covariance: Array) -> Array:
 def _summed(parts: Array) -> Array:
     """Return the Cholesky factors ``(n, 2, 2)`` of A A^T for each A ``(n, 2, k)``.
 
-    By orthogonalising the rows of A, not from A A^T: where one direction errs far more than the other, as with heights
-    that are hardly known, the difference of squares would be lost to rounding.
+    Computed by orthogonalising the rows of A, not from A A^T: if one direction has a far larger error than the other
+    (poorly known heights), the difference of squares would be lost to rounding.
     """
     column, row = parts[:, 0], parts[:, 1]
     first = np.linalg.norm(column, axis=1)

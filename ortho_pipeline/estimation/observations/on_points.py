@@ -1,12 +1,12 @@
-"""Observations of the places of points by themselves, beside their rays: known ground, and what else is known of them.
+"""Direct observations of the positions of points, in addition to their rays, such as known ground.
 
-There is one form of all of them, which is all that the solver, the sigmas and the search for gross errors see: along
-three axes of each point, how far what was observed is from where the point is, and with what sigma.
+All types have the same form for the solver, the sigmas and the search for gross errors: observed minus present position
+along three axes of each point, and its sigma.
 
-- Known ground has the axes east, north and up. Of ground without a known height nothing is observed along the third.
+- Known ground has the axes east, north and up. Without a known height, nothing is observed along the third axis.
 - A height of a surface is observed along the normal of its plane at the point (`Planes`).
 
-A further type gives its apart, axes and sigmas for its points in `block.equations.problem.BlockProblem.on_points`. The
+A further type gives apart, axes and sigmas of its points in `block.equations.problem.BlockProblem.on_points`. The
 sigmas of a block (`block.variances`) give covariances of these points along the axes.
 """
 
@@ -22,16 +22,16 @@ from ortho_pipeline.models.base import Array
 
 @dataclass(frozen=True, eq=False)
 class OnPoints:
-    """Observations of the places of n points.
+    """Observations of the positions of n points.
 
     Parameters
     ----------
     apart : ndarray (n, 3)
-        Observed minus present place, metres along the axes; 0 where nothing is observed.
+        Observed minus present position, metres along the axes; 0 if nothing is observed.
     axes : ndarray (n, 3, 3)
         Rotations from the frame to the axes.
     sigmas : ndarray (n, 3)
-        Standard deviations in metres; infinite along axes of which nothing is observed.
+        Standard deviations in metres; infinite along axes without an observation.
     """
 
     apart: Array
@@ -40,7 +40,7 @@ class OnPoints:
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """Along which axes ``(n, 3)`` something is observed: each is one equation."""
+        """Mask ``(n, 3)`` of the axes with an observation; each is one equation."""
         return np.isfinite(self.sigmas)
 
     def with_heights(self, planes: Planes, local: Array, rows: NDArray[np.int64]) -> OnPoints:
@@ -57,7 +57,7 @@ class OnPoints:
         return self.apart / self.sigmas * np.sqrt(weights)[:, None]
 
     def partials(self, weights: Array) -> Array:
-        """Return the derivatives ``(n, 3, 3)`` of what is predicted by the place in the frame, over the sigmas."""
+        """Return the derivatives ``(n, 3, 3)`` of the prediction by the position in the frame, over the sigmas."""
         return self.axes * (np.sqrt(weights)[:, None] / self.sigmas)[:, :, None]
 
 

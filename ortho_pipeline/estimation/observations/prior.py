@@ -1,4 +1,4 @@
-"""A parameter that is known beforehand."""
+"""Prior knowledge of parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from ortho_pipeline.models.base import SensorModel
 
 @dataclass(frozen=True)
 class Prior:
-    """A parameter known beforehand: one more observation with this mean and sigma, in the parameter's unit."""
+    """Prior knowledge of a parameter: one more observation, with this mean and sigma in the unit of the parameter.
+
+    Examples
+    --------
+    >>> Prior(0.0, sigma=0.01)
+    Prior(mean=0.0, sigma=0.01)
+    """
 
     mean: float
     sigma: float
@@ -20,11 +26,18 @@ class Prior:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and self.sigma > 0):
             raise InputError(
-                f"a prior has a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
+                f"a prior needs a finite mean and a positive sigma, not {self.mean} and {self.sigma}", field="prior"
             )
 
 
 def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prior]:
-    """Return priors that hold parameters at their values in `model`, with these sigmas by name."""
+    """Return priors with the present values of `model` as means.
+
+    Parameters
+    ----------
+    model : SensorModel
+    sigmas : mapping of str to float
+        Standard deviations by parameter name; parameters without one get no prior.
+    """
     values = dict(zip(model.param_names, model.params.tolist(), strict=True))
     return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}

@@ -1,17 +1,17 @@
-r"""Covariance analysis of residuals: do neighbouring points err alike, and how accurate are they to each other?
+r"""Covariance analysis of residuals: do neighbouring points have similar errors, and what is their relative accuracy?
 
-Pairs of points are sorted into classes of distance. For each class and axis, with residuals :math:`r` of the variance
-:math:`s^2` about their mean :math:`m`,
+Pairs of points are sorted into classes of distance. For each class and axis, with residuals :math:`r` of variance
+:math:`s^2` and mean :math:`m`:
 
 - correlation :math:`\overline{(r_i - m)(r_j - m)} / s^2`,
-- relative standard deviation :math:`\sqrt{\sum (r_i - r_j)^2 / (2 n)}`: below the RMSE of single points where
-  neighbours err alike. Its square is the semivariance, so that the covariance function
-  :math:`C(d) = \sigma_s^2 e^{-d / c}` of errors that neighbours share, beside noise :math:`\sigma_n^2` that they do
-  not, is fitted to it: :math:`\gamma(d) = \sigma_n^2 + \sigma_s^2 (1 - e^{-d / c})`.
+- relative standard deviation :math:`\sqrt{\sum (r_i - r_j)^2 / (2 n)}`: below the RMSE of single points if neighbours
+  have similar errors. Its square is the semivariance. The covariance function :math:`C(d) = \sigma_s^2 e^{-d / c}` of
+  shared errors, with independent noise :math:`\sigma_n^2`, is fitted to it:
+  :math:`\gamma(d) = \sigma_n^2 + \sigma_s^2 (1 - e^{-d / c})`.
 
-Whether residuals are more alike than chance makes them is tested by Moran's I over each point's nearest neighbours,
-against permutations of the residuals. Residuals of an adjustment are not independent even without systematic errors
-(they sum to zero, at the least), so each permutation is adjusted again.
+Moran's I over the nearest neighbours of each point tests whether residuals are more similar than by chance, against
+permutations of the residuals. Residuals of an adjustment are never independent (at least, they sum to zero), so each
+permutation is adjusted again.
 
 Source: section 3.3 and figure 7 of Bueyueksalih et al. (OrbView-3; the program BLAN); Moran 1950, Notes on continuous
 stochastic phenomena (I); Cliff and Ord 1981, Spatial processes, chapter 8 (residuals of an adjustment); Cressie 1993,
@@ -38,17 +38,17 @@ from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 
-#: Chance of calling residuals systematic that are not.
+#: Chance that random residuals are called systematic.
 SIGNIFICANCE = 0.05
-#: Below this number of points (and of degrees of freedom beyond the parameters) nothing is tested.
+#: With fewer points or fewer degrees of freedom nothing is tested.
 FEWEST_POINTS = 8
 #: Neighbours of each point in Moran's I.
 NEIGHBOURS = 4
-#: With fewer points than this it is said that only strong systematic errors show.
+#: With fewer points the statement says that only strong systematic errors would show.
 _SHARP = 30
-#: More points than this add time and no insight: so many are drawn from them.
+#: More points cost time without benefit: a sample of this size is used.
 MOST_POINTS = 1000
-#: Classes of distance are made of at least so many pairs, and are at most so many.
+#: Least number of pairs in a class of distance, and largest number of classes.
 _PAIRS_PER_CLASS, _MOST_CLASSES = 30, 12
 
 
@@ -67,14 +67,14 @@ class DistanceClass(Record):
 
 
 class CovarianceFunction(Record):
-    """Standard deviations of noise and of what neighbours share, and the distance at which 1/e of that is left."""
+    """Standard deviations of noise and of shared errors, and the distance at which 1/e of their covariance is left."""
 
     noise: float
     systematic: float
     range_m: float
 
     def covariance(self, distance: ArrayLike) -> Array:
-        """Return the covariance of residuals at distances, noise not included."""
+        """Return the covariance of residuals at distances, without noise."""
         return np.asarray(self.systematic**2 * np.exp(-np.asarray(distance, dtype=np.float64) / self.range_m))
 
     def relative(self, distance: ArrayLike) -> Array:
@@ -85,10 +85,10 @@ class CovarianceFunction(Record):
 class Covariance(Record):
     """Covariance analysis of residuals on the ground, per axis (x, y); see docs/engineering/accuracy.md."""
 
-    # Pairs of numbers are per axis, in the unit of the residuals. Relative and correlation are those of pairs closer
-    # than near_m, None where there is none; functions are None for an axis without a covariance that falls with
-    # distance. Moran's I, its p per axis and that of the larger one are of each point with its nearest neighbours;
-    # critical is what chance exceeds one time in twenty. They are None for too few points.
+    # Pairs of numbers are per axis, in the unit of the residuals. `relative` and `correlation` are of pairs closer than
+    # `near_m`, None without such pairs. A function is None if the covariance of its axis does not decrease with
+    # distance. `moran`, `p` (per axis), `p_joint` (of the larger one) and `critical` (exceeded by chance in 1 of 20
+    # cases) are of each point with its nearest neighbours; they are None for too few points.
     unit: str
     n: Count
     near_m: float | None
@@ -109,19 +109,19 @@ class Covariance(Record):
 
     @property
     def is_tested(self) -> bool:
-        """Whether there were points enough for a test, and classes of distance."""
+        """Whether there were enough points for a test and for classes of distance."""
         return self.p_joint is not None and len(self.classes) > 1
 
 
 class Covariances(Record):
-    """Of control and of check points, never of both together."""
+    """Covariance analysis of control and of check points, never of both together."""
 
     control: Covariance | None = None
     check: Covariance | None = None
 
     @property
     def drawn(self) -> tuple[Literal["control", "check"], Covariance] | None:
-        """The points whose analysis is drawn, and it: check points where they could be tested, else control."""
+        """The role and the analysis to draw: check points if they could be tested, otherwise control points."""
         if self.check is not None and self.check.is_tested:
             return "check", self.check
         return None if self.control is None or not self.control.is_tested else ("control", self.control)
@@ -137,23 +137,23 @@ def analyse(
     draws: int = 999,
     unit: str = "m",
 ) -> Covariance:
-    """Analyse the residuals ``(N, 2)`` of points at ``xy (N, 2)`` metres; rows with NaN are left out.
+    """Analyse the residuals ``(N, 2)`` of points at ``xy (N, 2)`` metres; rows with NaN are ignored.
 
     Parameters
     ----------
     near : float, optional
-        Distance (m) below which points are neighbours; by default that at which there are as many pairs as points.
+        Distance (m) below which points are neighbours; default: a distance with as many pairs as points.
     classes : sequence of float, optional
-        Edges (m) of the classes of distance; by default 0, `near`, and on in classes of equally many pairs.
+        Edges (m) of the classes of distance; default: 0, `near`, and further classes with equal numbers of pairs.
     design : array (N, 2, P), optional
-        Partials of the residuals by the parameters that were adjusted to these points; a mean per axis without it.
+        Partials of the residuals by the adjusted parameters; default: a mean per axis.
     unit : str
-        Unit of the residuals, for the words.
+        Unit of the residuals, for the statement.
 
     Raises
     ------
     InputError
-        If the arrays do not belong together, or a distance is not positive.
+        If the shapes do not match, or a distance is not positive.
     """
     where, values, partials = _usable(xy, residuals, design)
     mean, absolute = np.zeros(2), np.zeros(2)
@@ -194,7 +194,13 @@ def analyse(
 
 
 def analyse_fit(fit: Fit, *, near: float | None = None) -> Covariances:
-    """Analyse the residuals of a fit on the ground (m, true east and north), control (used) and check points apart."""
+    """Analyse the residuals of a fit on the ground (m, true east and north), for control and check points separately.
+
+    Parameters
+    ----------
+    near : float, optional
+        As for `analyse`.
+    """
     points = fit.points
     if not len(points):
         return Covariances()
@@ -213,13 +219,13 @@ def _on_the_ground(fit: Fit) -> Array:
     known = np.isfinite(geographic).all(axis=1)
     where = np.full((len(ground), 2), np.nan)
     if known.any():
-        # The first point, for longitudes have no mean across the antimeridian.
+        # Origin at the first point, because longitudes have no mean across the antimeridian.
         where[known] = enu_from_geodetic(geographic[known], geographic[known][0])[0][:, :2]
     return where
 
 
 def _design(fit: Fit) -> Array:
-    """Return how the parameters move residuals on the ground (m), ``(N, 2, P)``."""
+    """Return the partials of residuals on the ground (m) by the parameters ``(N, 2, P)``."""
     plan, _ = metre_partials(fit.model, fit.points.ground)
     partials = fit.model.param_partials(with_reference_height(fit.model, fit.points.ground))
     solved = np.full(partials.shape, np.nan)
@@ -229,32 +235,31 @@ def _design(fit: Fit) -> Array:
 
 
 def _usable(xy: ArrayLike, residuals: ArrayLike, design: ArrayLike | None) -> tuple[Array, Array, Array]:
-    """Return positions, residuals and design of the points that have all, at most `MOST_POINTS`, and how many had."""
+    """Return positions, residuals and design of the points that have all three, at most `MOST_POINTS`."""
     where, values = np.asarray(xy, dtype=np.float64), np.asarray(residuals, dtype=np.float64)
     if where.ndim != 2 or where.shape[1:] != (2,) or where.shape != values.shape:
-        raise InputError(f"positions and residuals are both (N, 2), not {where.shape} and {values.shape}")
+        raise InputError(f"positions and residuals must both be (N, 2), not {where.shape} and {values.shape}")
     mean = np.broadcast_to(np.eye(2), (len(values), 2, 2))
     partials = mean if design is None else np.asarray(design, dtype=np.float64)
     if partials.ndim != 3 or partials.shape[:2] != values.shape:
-        raise InputError(f"a design of {counted(len(values), 'point')} is (N, 2, P), not {partials.shape}")
-    whole = np.isfinite(where).all(axis=1) & np.isfinite(values).all(axis=1) & np.isfinite(partials).all(axis=(1, 2))
-    rows = np.flatnonzero(whole)
-    given = len(rows)
-    if given > MOST_POINTS:
+        raise InputError(f"the design of {counted(len(values), 'point')} must be (N, 2, P), not {partials.shape}")
+    finite = np.isfinite(where).all(axis=1) & np.isfinite(values).all(axis=1) & np.isfinite(partials).all(axis=(1, 2))
+    rows = np.flatnonzero(finite)
+    if len(rows) > MOST_POINTS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MOST_POINTS, replace=False))
     return where[rows], values[rows], partials[rows]
 
 
 def _positive(near: float) -> float:
     if not (math.isfinite(near) and near > 0):
-        raise InputError(f"neighbours are closer than a positive distance, not {near!r}", field="near")
+        raise InputError(f"near must be a positive distance, not {near!r}", field="near")
     return float(near)
 
 
 def _checked_edges(classes: Sequence[float]) -> Array:
     edges = np.asarray(classes, dtype=np.float64)
     if edges.ndim != 1 or len(edges) < 2 or not np.isfinite(edges).all() or (np.diff(edges) <= 0).any() or edges[0] < 0:
-        raise InputError("the edges of classes are ascending distances from 0 on", field="classes")
+        raise InputError("the edges of classes must be ascending distances, not negative", field="classes")
     return edges
 
 
@@ -262,13 +267,13 @@ def _checked_edges(classes: Sequence[float]) -> Array:
 
 
 def _pair_values(values: Array, i: NDArray[Any], j: NDArray[Any]) -> tuple[Array, Array]:
-    """Return of each pair the product about the mean and half the squared difference, both ``(pairs, 2)``."""
+    """Return the product about the mean and half the squared difference of each pair, both ``(pairs, 2)``."""
     about = values - values.mean(axis=0) if len(values) else values
     return about[i] * about[j], (values[i] - values[j]) ** 2 / 2
 
 
 def _default_near(distance: Array, count: int) -> float | None:
-    """Return the distance, rounded up to two digits, below which there are as many pairs as points (at least ten)."""
+    """Return the distance (rounded up to two digits) below which there are as many pairs as points, at least ten."""
     wanted = max(count, 10)
     if len(distance) < wanted:
         return None
@@ -276,7 +281,7 @@ def _default_near(distance: Array, count: int) -> float | None:
     if reach <= 0:
         return None
     step = 10.0 ** (math.floor(math.log10(reach)) - 1)
-    # Rounded, for steps below one would leave 0.30000000000000004.
+    # Rounded to avoid values such as 0.30000000000000004.
     return float(f"{math.ceil(reach / step - 1e-9) * step:.6g}")
 
 
@@ -294,7 +299,7 @@ def _classes(
 ) -> tuple[DistanceClass, ...]:
     found: list[DistanceClass] = []
     for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        # The first class has its lower edge: two points may lie at one place.
+        # The first class includes its lower edge, because two points may have the same position.
         within = (distance <= high) & ((distance > low) if found or low > 0 else (distance >= low))
         if within.any():
             found.append(
@@ -320,7 +325,7 @@ def _pair(values: Array) -> Pair:
 
 
 def _mean_p(values: Array) -> Pair | None:
-    """Return the chance per axis of so large a mean, were the errors independent and zero on average (t test)."""
+    """Return the chance per axis of such a mean for independent errors with mean zero (t test)."""
     count = len(values)
     if count < FEWEST_POINTS:
         return None
@@ -332,10 +337,10 @@ def _mean_p(values: Array) -> Pair | None:
 
 
 def _function(distance: Array, halves: Array) -> CovarianceFunction | None:
-    """Fit noise, shared part and range to the semivariances of pairs, in classes up to three quarters of the longest.
+    """Fit noise, shared part and range to the semivariances of classes of pairs, up to 3/4 of the longest distance.
 
     Weights are the number of pairs over the squared semivariance (Cressie). For a given range the model is linear in
-    both variances, so that only the range is searched for. Returns None where nothing falls with distance.
+    both variances, so only the range is searched. Returns None if the covariance does not decrease with distance.
     """
     if len(distance) < 3 * _PAIRS_PER_CLASS or not halves.any():
         return None
@@ -358,7 +363,7 @@ def _function(distance: Array, halves: Array) -> CovarianceFunction | None:
 
 
 def _best_range(at: Array, seen: Array, weight: Array, reach: float) -> tuple[float, float, float]:
-    """Search the range on ever finer grids of its logarithm; return both variances and it."""
+    """Search the range on successively finer grids of its logarithm; return both variances and the range."""
     low, high = math.log(max(0.2 * at[0], 1e-4 * reach)), math.log(reach)
     for _ in range(5):
         grid = np.linspace(low, high, 25)
@@ -407,7 +412,7 @@ def _test(where: Array, values: Array, design: Array, draws: int) -> tuple[Pair,
 
 
 def _basis(design: Array) -> Array:
-    """Return orthonormal columns ``(2 N, rank)`` that span what the adjustment takes out of residuals."""
+    """Return orthonormal columns ``(2 N, rank)`` that span what the adjustment removes from residuals."""
     if not design.size:
         return np.zeros((2 * len(design), 0))
     rows = design.reshape(-1, design.shape[2])
@@ -416,7 +421,7 @@ def _basis(design: Array) -> Array:
 
 
 def _projected(values: Array, basis: Array) -> Array:
-    """Return residuals ``(K, N, 2)`` as the adjustment would leave them."""
+    """Return residuals ``(K, N, 2)`` after an adjustment."""
     rows = values.reshape(len(values), -1)
     return np.asarray((rows - (rows @ basis) @ basis.T).reshape(values.shape))
 
@@ -424,10 +429,10 @@ def _projected(values: Array, basis: Array) -> Array:
 def _nearest(where: Array) -> tuple[NDArray[Any], NDArray[Any]]:
     from scipy.spatial import cKDTree
 
-    # With several points at one place, the nearest is not always the point itself.
-    _, found = cKDTree(where).query(where, k=NEIGHBOURS + 1)
+    # If several points have the same position, the nearest is not always the point itself.
+    _, nearest = cKDTree(where).query(where, k=NEIGHBOURS + 1)
     first = np.repeat(np.arange(len(where)), NEIGHBOURS + 1)
-    second = np.asarray(found).ravel()
+    second = np.asarray(nearest).ravel()
     other = first != second
     return first[other], second[other]
 
@@ -438,28 +443,30 @@ def _moran(values: Array, first: NDArray[Any], second: NDArray[Any]) -> Array:
     return _ratio((about[:, first] * about[:, second]).mean(axis=1), (about**2).mean(axis=1))
 
 
-# -- words -----------------------------------------------------------------------------------------------------------
+# -- the statement ---------------------------------------------------------------------------------------------------
 
 
 def _sentences(found: Covariance) -> list[str]:
     if found.moran is None or found.critical is None:
         return [
-            f"{counted(found.n, 'point')}: too few to tell a systematic error from chance (it takes "
-            f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters)."
+            f"{counted(found.n, 'point')}: too few to distinguish systematic errors from chance. The test needs "
+            f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*found.moran)
-    chance = f"chance alone gives more than {found.critical:+.2f} one time in {round(1 / SIGNIFICANCE)}"
-    begin = "Systematic errors remain" if found.verdict == "systematic" else "No systematic error was found"
-    said = [f"{begin}: residuals are correlated with those of the {NEIGHBOURS} nearest points by {alike}; {chance}."]
+    chance = f"chance alone exceeds {found.critical:+.2f} in 1 of {round(1 / SIGNIFICANCE)} cases"
+    result = "Systematic errors remain" if found.verdict == "systematic" else "No systematic error was found"
+    sentences = [
+        f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) are correlated by {alike}; {chance}."
+    ]
     if found.verdict != "systematic" and found.n < _SHARP:
-        said.append(f"With {found.n} points only a strong one would show.")
+        sentences.append(f"With {found.n} points, only a strong systematic error would show.")
     if found.relative is not None:
         numbers = "{:.2f} and {:.2f}".format(*found.relative), "{:.2f} and {:.2f}".format(*found.absolute)
-        said.append(
-            f"Points closer than {found.near_m:g} m are accurate to each other to {numbers[0]} {found.unit} "
-            f"({counted(found.pairs_near, 'pair')}), all to {numbers[1]} {found.unit}."
+        sentences.append(
+            f"Relative to each other, points closer than {found.near_m:g} m are accurate to {numbers[0]} {found.unit} "
+            f"({counted(found.pairs_near, 'pair')}). All points are accurate to {numbers[1]} {found.unit}."
         )
     if found.mean_p and min(found.mean_p) < SIGNIFICANCE / 2:
         off = "{:+.2f} and {:+.2f}".format(*found.mean)
-        said.append(f"On average they are off by {off} {found.unit}, more than chance explains.")
-    return [text.replace(" -", " −") for text in said]
+        sentences.append(f"The mean residual is {off} {found.unit}, more than chance explains.")
+    return [text.replace(" -", " −") for text in sentences]

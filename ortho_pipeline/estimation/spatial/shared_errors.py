@@ -1,24 +1,24 @@
-r"""What neighbouring points err together, and what it does to the parameters of a fit.
+r"""Errors that neighbouring points share, and their effect on the parameters of a fit.
 
-Matched points share the errors of the DEM and of the reference with their neighbours: of whitened errors :math:`u` of
-points with a group, along each of two axes, :math:`\mathrm{cov}(u_i, u_j) = \sigma_n^2 \delta_{ij} + \sigma_s^2
+Matched points share errors of the DEM and the reference with their neighbours. For whitened errors :math:`u` of points
+with a group, along each of two axes, :math:`\mathrm{cov}(u_i, u_j) = \sigma_n^2 \delta_{ij} + \sigma_s^2
 k(d_{ij} / c)`. With whitened design :math:`A` and cofactors :math:`Q`, the covariance of the parameters of a weighted
-fit is then :math:`L^T \Sigma L` with the influences :math:`L = A Q` (sandwich), not :math:`\sigma_0^2 Q`.
+fit is :math:`L^T \Sigma L` with the influences :math:`L = A Q` (sandwich), not :math:`\sigma_0^2 Q`.
 
-Residuals hide the part that the model absorbs. So the function is estimated by restricted likelihood, which looks only
-at what no value of the parameters can explain, in the means over cells of a twelfth of the extent: the parameters feel
-what is shared over long distances, and the many pairs of close neighbours, whose errors are rougher or smoother than
-any family (chips that overlap, a DEM between its samples), would outvote it. How smooth errors are decides how much of
-them is long, and few residuals tell it: correlations :math:`k` from rough to smooth are tried (exponential, Matern of
-order 3/2, Gaussian), each with ranges from the distance of neighbours to the extent of the points, and with
-:math:`\sigma_s^2` from :math:`\sigma_n^2 / n`, which adds no more to a mean than noise, to :math:`10^4 \sigma_n^2`.
-Beforehand families count alike, and ranges and ratios by their logarithms, because not even their order of magnitude is
-known; but residuals show a part of the variance :math:`\sigma_n^2 + \sigma_s^2`, and each part from none to all is as
-likely as any other: else smooth functions of enormous variance, of which a fit leaves hardly anything, dominate.
-No single function is taken: :math:`\Sigma` is the mean over all of them, weighted by their likelihood. So the variance
-is right in the mean over scenes of all these kinds; it is not right for each kind alone
-(docs/engineering/accuracy.md). A constant part cannot be told from the shift: residuals do not show it at all. What
-matching itself adds of that kind is known (`MATCHED_ALIKE`), and the covariance has it.
+The model absorbs part of these errors, so residuals do not show it. Restricted likelihood therefore uses only what no
+value of the parameters can explain, in means over cells of a twelfth of the extent. Errors with long ranges matter for
+the parameters; the many pairs of close neighbours (overlapping chips, a DEM between its samples) would outvote them.
+
+The smoothness of the errors is unknown. So several correlations :math:`k` are tried: exponential, Matern of order 3/2,
+Gaussian; each with ranges from the distance of neighbours to the extent of the points, and with :math:`\sigma_s^2` from
+:math:`\sigma_n^2 / n` (no more than noise in a mean) to :math:`10^4 \sigma_n^2`. A priori, families have equal weight,
+and ranges and ratios are uniform in their logarithm. Residuals show a part of the variance
+:math:`\sigma_n^2 + \sigma_s^2`, and each part from none to all is equally likely; otherwise smooth functions of huge
+variance would dominate. :math:`\Sigma` is the mean over all functions, weighted by likelihood. So the variance is right
+on average over scenes of all these kinds, but not for each kind alone (docs/engineering/accuracy.md).
+
+Residuals cannot show a constant part at all. The constant error of matching itself is known (`MATCHED_ALIKE`), and the
+covariance includes it.
 
 Source: Patterson and Thompson 1971 (restricted likelihood); Liang and Zeger 1986 (sandwich); Cressie 1993, section 2.6;
 Stein 1999, section 2.10 (Matern); Handcock and Stein 1993 (mean over what is likely).
@@ -38,11 +38,11 @@ from ortho_pipeline.estimation.statistics import basis_of
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
 
-#: Fewer points with groups, or degrees of freedom, say nothing of a function: each group then counts as one point.
+#: With fewer points with groups, or fewer degrees of freedom, no function is estimated: each group counts as one point.
 FEWEST_POINTS = 30
-#: More points add time and no insight: so many are drawn from them.
+#: More points cost time without benefit: a sample of this size is used.
 MOST_POINTS = 400
-#: The shortest range, in parts of the extent.
+#: The shortest range, as a part of the extent.
 _HEAP = 0.005
 #: (1 + x) e^-x is 1/e there.
 _MATERN = 2.1461932206
@@ -52,27 +52,27 @@ _FAMILIES: tuple[Callable[[Array], Array], ...] = (
     lambda x: (1.0 + _MATERN * x) * np.exp(-_MATERN * x),
     lambda x: np.exp(-(x**2)),
 )
-#: Ranges and ratios of variances, shared over noise, that are tried; with the largest, noise is 1 % of what is shared.
+#: Numbers of ranges and of variance ratios (shared over noise), and the largest ratio (sigma of noise 1 % of shared).
 _RANGES, _RATIOS, _LARGEST = 16, 20, 1e4
-#: Combinations of parameters whose effect is less than this part of the largest are none.
+#: Combinations of parameters with an effect below this part of the largest are ignored.
 _NO_EFFECT = 1e-9
-#: Cells whose means are looked at.
+#: Number of cells whose means are used.
 _CELLS = 144
-#: What all matches of an image err alike (px per axis), however many they are. Pixels of scene and reference meet at
-#: one phase all over an image, and neither interpolation nor sampling is exact: 0.001 to 0.003 px with real images.
+#: Constant error of all matches of an image (px per axis), whatever their number. Pixels of scene and reference have
+#: the same phase all over an image, and interpolation is not exact: 0.001 to 0.003 px with real images.
 MATCHED_ALIKE = 0.002
 
 
-#: Of what neighbours share, where they are too few to tell.
+#: Values for shared errors if there are too few points.
 NOT_KNOWN: dict[str, Any] = {"noise": None, "shared": None, "range_px": None}
 
 
 class SharedErrors(Record):
     """Errors that neighbouring points share, in units of stated sigmas; see docs/engineering/accuracy.md."""
 
-    # Of two axes, the first with the larger shared part: means over what is likely, None where the points are too few.
-    # The range is the distance at which 1/e of the covariance is left. As many independent points as are effective
-    # would determine a shift as well as all of the fit.
+    # `noise`, `shared` and `range_px` are of two axes, the first with the larger shared part: weighted means over the
+    # functions, None with too few points. The range is the distance at which 1/e of the covariance is left.
+    # `effective_points` independent points would determine a shift as well as all points of the fit.
     points: Count
     groups: Count
     effective_points: float
@@ -84,18 +84,18 @@ class SharedErrors(Record):
 def shared_errors(
     solution: Solution, image: Array, common: ImageCommonError | None = None, sigma_alike: Array | None = None
 ) -> tuple[SharedErrors, Array] | None:
-    """Return what neighbours share and the covariance ``(P, P)`` of the parameters; None where no point has a group.
+    """Return the shared errors and the covariance ``(P, P)`` of the parameters; None if no point has a group.
 
     Parameters
     ----------
     solution : Solution
         With redundancy.
     image : (n, 2)
-        Its points, px.
+        Image positions of its points, px.
     common : ImageCommonError, optional
-        What the points have in common; its own part of the covariance is not in what is returned.
+        Error common to the points; the returned covariance is without its own part.
     sigma_alike : (n,), optional
-        What the matches among them err alike, px per axis, where it is known to be more than `MATCHED_ALIKE`.
+        Constant error of the matches, px per axis, if it is known to be larger than `MATCHED_ALIKE`.
     """
     rows = np.flatnonzero(solution.groups >= 0)
     if not len(rows) or solution.sigma0 is None or not len(solution.cofactors):
@@ -128,18 +128,20 @@ def shared_by(
     own_shift: Array,
     variance: float,
 ) -> tuple[SharedErrors, Array | None]:
-    """Return what points with groups share, and the excess of A' Sigma A over independent errors of `variance`.
+    """Return the errors that points with groups share, and the excess of A' Sigma A over independent errors.
 
-    The excess is None where they are too few: all that is known then is who shares, and a group is one point.
+    The excess is None with too few points; then each group counts as one point.
 
     Parameters
     ----------
     image, residuals, groups : (n, 2), (n, 2), (n,)
-        Of these points, px, and whitened.
+        Positions in px, whitened residuals and group numbers of these points.
     design : (n, 2, K)
-        The whole whitened design A, by which residuals are explained.
+        The complete whitened design A, which explains residuals.
     shift, own_shift : (N, 2, 2), (n, 2, 2)
-        A shift of the image in whitened observations, of all points and of these: those on their own count as they are.
+        A shift of the image in whitened observations, of all points and of these points.
+    variance : float
+        Variance of independent errors.
     """
     count, number = len(image), len(np.unique(groups))
     scene = Neighbours.of(image, residuals, np.concatenate([design, own_shift], axis=2))
@@ -156,7 +158,7 @@ def shared_by(
 
 
 def positive_part(excess: Array, design: Array) -> Array:
-    """Return the part of a symmetric matrix that is positive in units of F' F, in the span of a design F ``(n, m)``."""
+    """Return the positive part of a symmetric matrix in units of F' F, in the span of a design F ``(n, m)``."""
     _, singular, turn = np.linalg.svd(design, full_matrices=False)
     real = singular > _NO_EFFECT * singular[0]
     back, forth = turn[real].T / singular[real], singular[real][:, None] * turn[real]
@@ -173,24 +175,24 @@ def _root(matrix: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Points that share errors, as the restricted likelihood takes them."""
+    """Points that share errors, prepared for the restricted likelihood."""
 
     distance: Array  # (n, n) px
     ranges: Array  # px
     span: Array  # (n, p): an orthonormal basis of the design
-    means: Array  # (m, n): means over cells, times the root of their points, so that noise stays what it is
+    means: Array  # (m, n): means over cells, times the root of their number of points, so that noise is unchanged
     explained: Array  # (m, q): an orthonormal basis of the design in these means
-    left: Array  # (m, 2) residuals along two axes in these means, without what the design explains
-    design: Array  # (p, 2, K): the whole design along the axes, in the basis
-    weight: float  # points over those that were drawn
+    left: Array  # (m, 2): means of residuals along two axes, without the part that the design explains
+    design: Array  # (p, 2, K): the complete design along the axes, in the basis
+    weight: float  # number of points over sample size
 
     @classmethod
     def of(cls, image: Array, residuals: Array, design: Array) -> Neighbours | None:
-        """Return the scene of points ``(n, 2)``, their whitened residuals, and design ``(n, 2, K)``."""
-        given = len(image)
+        """Prepare points ``(n, 2)`` with whitened residuals and design ``(n, 2, K)``; None with too few points."""
+        total = len(image)
         order = np.lexsort(image.T)
-        if given > MOST_POINTS:
-            order = np.sort(np.random.default_rng(0).permutation(given)[:MOST_POINTS])
+        if total > MOST_POINTS:
+            order = np.sort(np.random.default_rng(0).permutation(total)[:MOST_POINTS])
             order = np.lexsort(image.T)[order]
         image, residuals, design = image[order], residuals[order], design[order]
         extent = float(np.ptp(image, axis=0).max())
@@ -200,7 +202,7 @@ class Neighbours:
         if n < FEWEST_POINTS or n - p < FEWEST_POINTS / 2 or not extent > 0:
             return None
         distance = np.hypot(image[:, None, 0] - image[:, 0], image[:, None, 1] - image[:, 1])
-        # Points that lie in heaps, or upon each other, tell of no range within a heap.
+        # Clustered or coincident points do not determine ranges within a cluster.
         least = np.clip(np.median(np.partition(distance, 1, axis=1)[:, 1]), _HEAP * extent, extent / 2)
         ranges = np.geomspace(least, extent, _RANGES)
         means = _cell_means(image)
@@ -209,14 +211,14 @@ class Neighbours:
             means, explained = np.eye(n), span
         left = means @ residuals
         left = left - explained @ (explained.T @ left)
-        # The axes differ most in what is shared over the middle one of the ranges.
+        # The axes with the largest difference of errors shared over the middle range.
         near = means @ _FAMILIES[1](distance / ranges[_RANGES // 2]) @ means.T
         axes = np.linalg.eigh(left.T @ near @ left)[1].T[::-1]
         inside = np.einsum("np,nik->pik", span, np.einsum("ij,njk->nik", axes, design))
-        return cls(distance, ranges, span, means, explained, left @ axes.T, inside, given / n)
+        return cls(distance, ranges, span, means, explained, left @ axes.T, inside, total / n)
 
     def middle(self, variance: float) -> tuple[Array, Any]:
-        """Return the excess of A^T Sigma A ``(K, K)`` over independent errors of `variance`, and what is likely."""
+        """Return the excess of A^T Sigma A ``(K, K)`` over independent errors of `variance`, and mean parameters."""
         freedom = self.explained.shape[0] - self.explained.shape[1]
         ratios = np.geomspace(1.0 / len(self.span), _LARGEST, _RATIOS)
         logs, scales, inner = [], [], []
@@ -226,7 +228,7 @@ class Neighbours:
                 inner.append(self.span.T @ kernel @ self.span)
                 seen = self.means @ kernel @ self.means.T
                 half = seen @ self.explained
-                # With the design taken out on both sides: values of its directions are zero, and say nothing below.
+                # The design is removed on both sides: its directions have eigenvalue zero and no effect below.
                 cross = (half - self.explained @ (self.explained.T @ half / 2)) @ self.explained.T
                 values, vectors = np.linalg.eigh(seen - cross - cross.T)
                 each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
@@ -234,7 +236,7 @@ class Neighbours:
                 logs.append(-0.5 * (np.log(each).sum(axis=1) + freedom * np.log(squares)))
                 scales.append(squares / (freedom - 2))
         log, scale = np.array(logs), np.array(scales)  # (kernels, axes, ratios)
-        # A uniform part that residuals show of the whole has a logarithm whose density is that part.
+        # A uniform prior of the part that residuals show, expressed for its logarithm.
         log = log - np.log(np.maximum(scale * (1.0 + ratios) / variance, 1.0))
         chance = np.exp(log - log.max(axis=(0, 2), keepdims=True))
         chance /= chance.sum(axis=(0, 2), keepdims=True)
@@ -253,7 +255,7 @@ class Neighbours:
 
 
 def _cell_means(image: Array) -> Array:
-    """Return the matrix ``(m, n)``, with orthonormal rows, of means over square cells of points ``(n, 2)``."""
+    """Return the matrix ``(m, n)`` with orthonormal rows that averages points ``(n, 2)`` over square cells."""
     extent = np.ptp(image, axis=0)
     side = max(float(np.sqrt(extent.prod() / _CELLS)), float(extent.max()) / _CELLS)
     counts = np.maximum(1, np.round(extent / side))

@@ -98,8 +98,8 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
     of_rays = {one.name: one.rays for one in tried}
     for errors, what, unit in (
-        (of_ground, "points whose ground coordinates took no part", "m"),
-        (of_rays, "rays left out", "px"),
+        (of_ground, "points (their ground coordinates left out)", "m"),
+        (of_rays, "rays (leave-one-out)", "px"),
     ):
         tested = {name: values for name, values in errors.items() if np.isfinite(values).any()}
         if not tested:
@@ -112,15 +112,13 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
         able = [one for one in tried if one.name in sizes and sizes[one.name] <= _WORTH * smallest]
         chosen = min(able, key=lambda one: (one.parameters, sizes[one.name]))
         text = (
-            f"{sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}, with {counted(chosen.parameters, 'parameter')}"
+            f"RMSE {sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
         )
         least = min(sizes, key=lambda name: sizes[name])
         if least != chosen.name:
-            text += (
-                f"; {least} has {smallest:.3g} {unit}, less by 5 % at most, so that with fewer parameters is preferred"
-            )
+            text += f". {least} has RMSE {smallest:.3g} {unit}, at most 5 % less, but more parameters"
         return chosen.name, text
-    return None, "fewer than three points test every correction: too few to choose by"
+    return None, "fewer than three points test all corrections, too few for a recommendation"
 
 
 def _rms(values: Array) -> float | None:

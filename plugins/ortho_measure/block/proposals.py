@@ -72,10 +72,10 @@ class ProposalPair:
         there = self.carried(image[None])[0]
         inside = bool(np.isfinite(there).all() and ((there >= 0) & (there <= self.second.view.size)).all())
         if not inside and click is None:
-            return {"seen": False, "reason": "the other image does not show this place", "image": None}
+            return {"seen": False, "reason": "the other image does not cover this place", "image": None}
         jacobian = self.derivatives(image)
         if not (np.isfinite(jacobian).all() and np.isfinite(there).all()):
-            return {"seen": inside, "reason": "the heights do not reach here", "image": None}
+            return {"seen": inside, "reason": "the DEM does not cover this place", "image": None}
         local = replace(self.first, references=(OtherScene(self.second.view.intensity, self.second.model),))
         if click is not None:
             local = local.moved(np.linalg.solve(jacobian, there - click))
@@ -91,7 +91,7 @@ class ProposalPair:
         told: dict[str, Any] = json_value(
             {
                 "seen": True,
-                "reason": "" if np.isfinite(place).all() else "the heights do not reach here",
+                "reason": "" if np.isfinite(place).all() else "the DEM does not cover this place",
                 "image": json_position(place),
                 "covariance": _three(jacobian @ own @ jacobian.T),
                 "own": _three(own),
@@ -170,9 +170,9 @@ class TieSearch:
         for known, label, reach in zip(self.places, self.labels, self.reaches, strict=True):
             there = known.image_of(place)[0]
             if not (np.isfinite(there).all() and ((there >= 0) & (there <= known.view.size)).all()):
-                rays[label] = {"seen": False, "reason": "this image does not show this place", "image": None}
+                rays[label] = {"seen": False, "reason": "this image does not cover this place", "image": None}
             elif not self.referenced:
-                rays[label] = {"seen": True, "reason": "there is no reference to match with", "image": None}
+                rays[label] = {"seen": True, "reason": "there is no reference image", "image": None}
             else:
                 found = proposal_of(known, None, place, reach)
                 rays[label] = {**found, "image": None if found["reason"] else found["image"], "seen": True}

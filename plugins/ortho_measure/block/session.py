@@ -159,7 +159,7 @@ class BlockSession(Project):
     def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
         for mark in marks:
             if mark.image is not None or not set(mark.rays) <= set(self.images.labels):
-                raise InputError("there is no such image", field="rays", remedy="load the page anew")
+                raise InputError("unknown image", field="rays", remedy="reload the page")
         self.starts(correction)
 
     def _solve(self) -> None:
@@ -216,7 +216,7 @@ class BlockSession(Project):
     def at(self, version: int, number: int = 0) -> SceneGeometry:
         """Return the geometry that references were rendered with for an image."""
         if not 0 <= version < len(self.rendered):
-            raise InputError("there is no such rendering", field="version")
+            raise InputError("unknown rendering", field="version", remedy="reload the page")
         return self.images.places[number].by(self.rendered[version][number])
 
     def _geometries(self, version: int) -> dict[str, Geometry]:

@@ -19,7 +19,6 @@ from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.report.block import KEPT_OUT
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 
@@ -53,7 +52,7 @@ def solve(
         return BlockSolution(models)
     without = [label for k, label in enumerate(points.images) if not (points.image == k).any()]
     if without:
-        return BlockSolution(models, None, f"no point was measured in {without[0]} yet")
+        return BlockSolution(models, None, f"no points yet in {without[0]}")
     try:
         priors = {label: start.priors for label, start in starts.items()}
         fit = adjust(models, points, priors=priors, robust=robust, hold=hold)
@@ -90,9 +89,9 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         point["loo"][label] = json_position(without.rays[ray])
     for one in fit.rejected:
         where = f" in {one.image}" if one.image else ""
-        points[one.point] |= {"suspicious": True, "reason": f"left out{where}: {one.reason}"}
+        points[one.point] |= {"suspicious": True, "reason": f"rejected{where}: {one.reason}"}
     for doubt in fit.outlying:
-        text = f"the block contradicts its {doubt.what} by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
+        text = f"its {doubt.what} differs from the block by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
         points[doubt.point] |= {"suspicious": True, "reason": text}
     return {
         "error": "",
@@ -119,7 +118,7 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
     fit = solution.fit
     if fit is None or solution.left_out is None:
-        return {"px": None, "m": None, "what": "not tested: no points yet"}
+        return {"px": None, "m": None, "what": "no points yet"}
     to = ", relative to the reference" if relative else ""
     found = fit.object_rms()
     if found is None or found.n < LEAST_CHECK_POINTS:
@@ -129,8 +128,8 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     rays = [one for one in (fit.image_rms(image, "check") for image in fit.points.images) if one is not None]
     count = sum(one.n for one in rays)
     total = float(np.sqrt(sum(one.n * one.total**2 for one in rays) / count)) if count else None
-    few = f"; fewer than {ENOUGH_CHECK_POINTS} check points, no claim" if found.n < ENOUGH_CHECK_POINTS else ""
-    text = f"RMSE in plan, {found.h:.3f} m in height, at {counted(found.n, 'check point')}, {KEPT_OUT}{to}{few}"
+    few = f". Indicative: fewer than {ENOUGH_CHECK_POINTS} check points" if found.n < ENOUGH_CHECK_POINTS else ""
+    text = f"RMSE in plan; {found.h:.3f} m in height, at {counted(found.n, 'check point')}{to}{few}"
     told: dict[str, Any] = json_value({"px": total, "m": found.plan, "n": found.n, "what": text})
     return told
 
@@ -140,12 +139,9 @@ def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks:
     apart = without.ground[fit.used_ground]
     apart = apart[np.isfinite(apart).all(axis=1)]
     if not len(apart) or not fit.redundancy:
-        return {"px": None, "m": None, "what": f"not tested: no check points; {fit.gauge}"}
-    few = f"{counted(checks, 'check point')}: too few to judge by" if checks else "no check points were kept apart"
+        return {"px": None, "m": None, "what": f"no check points; {fit.gauge}"}
+    few = f"Only {counted(checks, 'check point')}" if checks else "No check points"
     east, north, up = np.sqrt((apart**2).mean(axis=0)).tolist()
-    text = (
-        f"RMSE in plan, {up:.3f} m in height, at {counted(len(apart), 'control point')}, the ground of each left out "
-        f"in turn{to}; {few}"
-    )
+    text = f"RMSE in plan; {up:.3f} m in height, at {counted(len(apart), 'control point')} (leave-one-out){to}. {few}"
     told: dict[str, Any] = json_value({"px": None, "m": math.hypot(east, north), "n": len(apart), "what": text})
     return told

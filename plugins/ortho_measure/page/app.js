@@ -19,7 +19,7 @@ const compared = { flicker: false, difference: false, swipe: 0 };
 /** @template {keyof Answers} W @param {W} what @param {object} [given] @returns {Promise<Answers[W]>} */
 async function ask(what, given = {}) {
   const response = await fetch(`api/${what}`, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ window: windowName, ...given }) });
-  const answer = await response.json().catch(() => ({ error: { message: `the server answers ${response.status}` } }));
+  const answer = await response.json().catch(() => ({ error: { message: `server error ${response.status}` } }));
   if (response.ok) return answer;
   const { message, remedy } = answer.error;
   throw new Error(`${message}${remedy ? ` (${remedy})` : ''}`);
@@ -33,7 +33,7 @@ function say(text, bad = false) {
 /** Run what may fail, and say so where it does. @template {any[]} G, T @param {(...given: G) => Promise<T>} work @returns {(...given: G) => Promise<T|undefined>} */
 const safely = (work) => async (...given) => {
   try { return await work(...given); } catch (error) {
-    say(error instanceof TypeError ? 'The server does not answer: nothing that was accepted is lost. Start ortho measure again.' : String(error instanceof Error ? error.message : error), true);
+    say(error instanceof TypeError ? 'No answer from ortho measure. All accepted points are saved. Start ortho measure again.' : String(error instanceof Error ? error.message : error), true);
     return undefined;
   }
 };
@@ -82,8 +82,8 @@ function complete(mark) {
 
 /** What a point of a role needs. */
 function needs(role) {
-  if (!facts.labels) return 'A point has a place in the scene and one on the ground.';
-  return { tie: 'A tie is measured in two images.', control: 'A control point has its ground, and is measured in an image.', check: 'A check point has its ground, and is measured in two images.' }[role];
+  if (!facts.labels) return 'Click the point in both the scene and the reference.';
+  return { tie: 'Measure a tie point in at least two images.', control: 'A control point needs ground coordinates and one image.', check: 'A check point needs ground coordinates and two images.' }[role];
 }
 
 function draw() {
@@ -97,8 +97,8 @@ function show(next) {
   state = next;
   const { headline } = state;
   const figures = [headline.px === null ? '' : `${headline.px.toFixed(3)} px`, headline.m === null ? '' : `${headline.m.toFixed(3)} m`];
-  $('figure').textContent = figures.filter(Boolean).join(', ') || 'Accuracy unknown';
-  $('what').textContent = state.error ? `${headline.what}: ${state.error}` : headline.what;
+  $('figure').textContent = figures.filter(Boolean).join(', ') || 'Accuracy unknown:';
+  $('what').textContent = state.error || headline.what;
   $('headline').title = $('what').textContent;
   $('undo').disabled = !state.undo || !facts.writes;
   $('redo').disabled = !state.redo || !facts.writes;
@@ -116,14 +116,21 @@ function show(next) {
   if (rendered) views.relink();
 }
 
+/** Which part of an image a position is in, in words. */
+function partOf([column, row], [width, height]) {
+  const vertical = row < height / 3 ? 'upper' : row > (2 * height) / 3 ? 'lower' : '';
+  const horizontal = column < width / 3 ? 'left' : column > (2 * width) / 3 ? 'right' : '';
+  return [vertical, horizontal].filter(Boolean).join(' ') || 'middle';
+}
+
 function tellNext() {
   const place = nextPlace();
   if (!place) { $('gain').textContent = ''; return; }
   const [column, row] = place.image.map((value) => value.toFixed(0));
-  const what = facts.labels ? `a ${place.role === 'tie' ? 'tie' : 'control point'}` : 'a point';
-  const known = facts.labels && place.role === 'tie' ? 'rays are predicted to miss each other by' : 'predicted to';
-  const gain = place.sigma === null ? '' : `: ${known} ±${place.sigma.toFixed(3)} px there; ${what} would make the worst place ±${place.then.toFixed(3)} px (now ±${place.largest.toFixed(3)})`;
-  $('gain').textContent = `Measure next at column ${column}, row ${row}${facts.labels ? ` of ${facts.labels[place.number]}` : ''}${gain}.`;
+  const what = { tie: 'tie', control: 'control point' }[facts.labels ? place.role : ''] ?? 'point';
+  const where = `${partOf(place.image, facts.images[place.number].size)} (column ${column}, row ${row})${facts.labels ? ` of ${facts.labels[place.number]}` : ''}`;
+  const gain = place.sigma === null ? '' : ` It reduces the largest uncertainty from ${place.largest.toFixed(3)} to ${place.then.toFixed(3)} px.`;
+  $('gain').textContent = `Best next ${what}: ${where}.${gain}`;
 }
 
 function fill() {
@@ -158,7 +165,7 @@ function cancel() {
   turn += 1;
   pending = null;
   selected = null;
-  say('Click a feature, or go to the next place (n) and press m.');
+  say('Click a feature. Or press n for the best next place, then m to measure it.');
   fill();
   draw();
 }
@@ -168,14 +175,14 @@ function take(found, wanted) {
   if (found.reason) {
     pending.score = null;
     pending.covariance = null;
-    const other = pending.image && pending.ground ? 'Accept it as measured by hand, or nudge it.' : `Click the same feature in the ${wanted}.`;
+    const other = pending.image && pending.ground ? 'Press Enter to accept your click, or move it with the arrow keys.' : `Click the same feature in the ${wanted}.`;
     say(`No match: ${found.reason}. ${other}`, true);
     return;
   }
   Object.assign(pending, { image: found.image, ground: found.ground, score: found.score, covariance: found.covariance, how: 'matched', sigma_image: null });
   pending.ground_from ??= 'reference';
   const sigma = Math.sqrt((found.covariance[0] + found.covariance[1]) / 2);
-  say(`Matched: score ${found.score.toFixed(3)}, ±${sigma.toFixed(3)} px${found.scattered ? ` by the scatter of ${found.scattered} neighbours` : ' (no neighbours to tell)'}. Enter accepts.`);
+  say(`Matched: score ${found.score.toFixed(3)}, ±${sigma.toFixed(3)} px${found.scattered ? ` (from ${found.scattered} neighbours)` : ' (assumed)'}. Press Enter to accept.`);
 }
 
 /** Take what the images show of a point under way, and tell what they do not. */
@@ -191,8 +198,8 @@ function takeRays({ rays, ground }, clicked) {
   const missing = Object.entries(rays).filter(([, ray]) => ray.reason && ray.seen);
   if (ground && !ground.reason && !pending.by_hand) Object.assign(pending, { ground: ground.ground, ground_from: 'reference' });
   const none = missing.map(([label, { reason }]) => ` No match in ${label}: ${reason}. Click it there.`).join('');
-  const unknown = ground?.reason && !pending.ground ? ` The reference: ${ground.reason}.` : '';
-  say(`${told.length ? `Matched: ${told.join(', ')}.` : ''}${none}${unknown}${complete(pending) ? ' Enter accepts.' : ''}`.trim(), !complete(pending));
+  const unknown = ground?.reason && !pending.ground ? ` Reference: ${ground.reason}.` : '';
+  say(`${told.length ? `Matched: ${told.join(', ')}.` : ''}${none}${unknown}${complete(pending) ? ' Press Enter to accept.' : ''}`.trim(), !complete(pending));
 }
 
 /** Measure a place in one of several images, or of the ground in the reference. */
@@ -209,10 +216,10 @@ async function tie(name, place, mine) {
   } else {
     const there = await ask('predict', { at: name, place, version: state.version });
     if (mine !== turn) return;
-    if (!there.ground) { say('The reference shows no ground here.', true); return; }
+    if (!there.ground) { say('The reference has no data here.', true); return; }
     Object.assign(pending, { ground: there.ground, ground_from: 'reference', by_hand: true });
     if ($('role').value === 'tie') { pending.role = 'control'; $('role').value = 'control'; }
-    if (Object.keys(pending.rays).length) say('Ground taken. Enter accepts.');
+    if (Object.keys(pending.rays).length) say('Ground coordinates set. Press Enter to accept.');
     else {
       const found = await ask('tie', { ground: there.ground });
       if (mine !== turn) return;
@@ -246,7 +253,7 @@ const measure = safely(async (pane, place) => {
   } else {
     const there = await ask('predict', { at: name, place, version: state.version });
     if (mine !== turn) return;
-    if (!there.ground) { say('The reference shows no ground here.', true); return; }
+    if (!there.ground) { say('The reference has no data here.', true); return; }
     Object.assign(pending, { ground: there.ground, ground_from: 'reference', by_hand: true });
     const found = await ask('propose', { image: pending.clicked ? pending.image : null, ground: there.ground });
     if (mine !== turn) return;
@@ -279,7 +286,7 @@ const nudge = safely(async (pane, column, row) => {
   const mine = (turn += 1);
   Object.assign(moved, { image: [moved.image[0] + column, moved.image[1] + row], how: 'manual', covariance: null, score: null });
   pending.clicked = true;
-  say(`By hand: column ${moved.image[0].toFixed(2)}, row ${moved.image[1].toFixed(2)}. Enter accepts.`);
+  say(`Manual: column ${moved.image[0].toFixed(2)}, row ${moved.image[1].toFixed(2)}. Press Enter to accept.`);
   fill();
   draw();
   if (!pending.places) await locate(mine);
@@ -289,7 +296,7 @@ const decimal = (id) => {
   const text = $(id).value.trim().replace(',', '.');
   if (!text) return null;
   const value = Number(text);
-  if (!Number.isFinite(value)) throw new Error(`${$(id).parentElement.firstChild.textContent.trim()}: not a number`);
+  if (!Number.isFinite(value)) throw new Error(`${$(id).parentElement.firstChild.textContent.trim()}: this is not a number`);
   return value;
 };
 
@@ -361,7 +368,7 @@ function goNext() {
   if (facts.labels && !shownWithin(there, imageOf(views.shows.scene))) showIn('scene', `scene-${there.number}`);
   views.goTo(there.places, 1);
   tellNext();
-  say('The next place: press m at the feature in the middle, or click one. Press n again for another place.');
+  say('Best next place: press m to measure the feature in the middle, or click one. Press n for another place.');
 }
 
 const dragged = safely(async (pane, id, place) => {
@@ -403,7 +410,7 @@ const models = safely(async () => {
   say('Comparing models …');
   const { rows, recommendation } = await ask('compare');
   const total = (rmse, which) => number(rmse?.[which]?.total, 3);
-  const figures = facts.labels ? ['Check, m', 'Control left out, m', 'Rays left out, px'] : ['Control, px', 'Check, px', 'Left out, px'];
+  const figures = facts.labels ? ['Check, m', 'Control leave-one-out, m', 'Rays leave-one-out, px'] : ['Control, px', 'Check, px', 'Leave-one-out, px'];
   const values = facts.labels ? (one) => [one.check_m, one.loo_m, one.rays].map((value) => number(value, 3))
     : ({ rmse }) => ['control', 'check', 'loo'].map((which) => total(rmse, which));
   const head = document.createElement('tr');
@@ -436,12 +443,12 @@ const makeOrtho = safely(async () => {
     const of = facts.labels ? `${facts.images[told.number].name}: ` : '';
     while (told.state === 'running') {
       $('ortho-share').value = told.share;
-      $('ortho-said').textContent = of + (told.stage ? `${told.stage}: ${Math.round(100 * told.share)} %. You can close this and go on measuring.` : 'Reading, fitting …');
+      $('ortho-said').textContent = of + (told.stage ? `${told.stage}: ${Math.round(100 * told.share)} %. You can close this window and continue measuring.` : 'Reading and fitting …');
       await wait(300);
       told = await ask('made');
     }
     $('ortho-share').hidden = true;
-    if (told.state !== 'done') { $('ortho-said').textContent = `No ortho: ${told.error}`; return; }
+    if (told.state !== 'done') { $('ortho-said').textContent = `The ortho failed: ${told.error}`; return; }
     $('ortho-said').textContent = `${of}${told.figure}: ${told.what}.`;
     const again = Date.now();
     $('ortho-own').src = `made/ortho?${again}`;
@@ -467,7 +474,7 @@ const typed = safely(async () => {
   if (mine !== turn) return;
   pending.places = there.places;
   views.goTo(there.places, 1);
-  say('Ground taken. Now click it in the scene: where it is expected is in the middle.');
+  say('Coordinates set. Now click the point in the scene; its expected position is in the middle.');
   fill();
   draw();
 });
@@ -477,7 +484,7 @@ function changeRole() {
   const { value } = $('role');
   if (pending) pending.role = value;
   const missing = pending && !complete(pending);
-  say(`Role: ${value}.${missing ? ` ${needs(value)}` : pending ? ' Enter accepts.' : ''}`, missing);
+  say(`Role: ${value}.${missing ? ` ${needs(value)}` : pending ? ' Press Enter to accept.' : ''}`, missing);
   if (pending) fill();
 }
 
@@ -512,7 +519,7 @@ function pressed(event) {
 function choices(pane) {
   const scenes = facts.images.map((image, number) => [`scene-${number}`, facts.labels ? image.name : 'Scene']);
   if (pane === 'scene') return scenes;
-  const rendered = facts.images.map((image, number) => [`reference-${number}`, facts.labels ? `Reference, as ${image.name} sees it` : 'Reference, as the scene would see it']);
+  const rendered = facts.images.map((image, number) => [`reference-${number}`, facts.labels ? `Reference in the geometry of ${image.name}` : 'Reference in the geometry of the scene']);
   return [...(facts.labels ? [...scenes.slice(1), scenes[0]] : []), ...rendered.filter(([name]) => facts.bands[name]),
     ...facts.maps.map((one, number) => [`map-${number}`, `Reference as a map${facts.maps.length > 1 ? `: ${one.name}` : ''}`])];
 }
@@ -547,9 +554,9 @@ function bandChoices(pane) {
 }
 
 function banner() {
-  const text = facts.locked ? 'Read only: another process measures these points. This one shows what that one does.'
-    : facts.stopped ? `Warning: ${facts.stopped}. The points are those before it; the rest was kept in a file beside the journal.`
-    : facts.writes ? (facts.healed ? 'The last action had not been written as a whole, and was left out.' : '') : 'Read only: another window measures these points.';
+  const text = facts.locked ? 'Read-only: these points are open in another ortho measure process. This window shows its changes.'
+    : facts.stopped ? `Warning: ${facts.stopped}. Only the points before it are loaded. The other actions are in a .rest file beside the journal.`
+    : facts.writes ? (facts.healed ? 'Note: the last action was not saved completely and is lost.' : '') : 'Read-only: these points are open in another window.';
   $('banner-text').textContent = text;
   $('banner').hidden = !text;
   $('take').hidden = facts.locked || facts.writes;

@@ -8,17 +8,17 @@ const length = (pair) => (pair ? Math.hypot(...pair) : null);
 const ONE = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
-  ['Column', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
-  ['Row', (mark) => mark.residual?.[1] ?? null, (mark) => number(mark.residual?.[1])],
-  ['m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
-  ['Left out', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
+  ['Column, px', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
+  ['Row, px', (mark) => mark.residual?.[1] ?? null, (mark) => number(mark.residual?.[1])],
+  ['Ground, m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
+  ['Leave-one-out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
-  ['By', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
+  ['Method', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
 ];
 
-const hands = { matched: 'match', manual: 'hand' };
+const hands = { matched: 'match', manual: 'manual' };
 const rays = (mark) => Object.values(mark.rays ?? {});
-/** How many rays there are by each hand: 2 match, 1 hand. */
+/** How many rays there are by each method: 2 match, 1 manual. */
 function counted(mark) {
   const found = {};
   for (const { how } of rays(mark)) found[hands[how] ?? how] = (found[hands[how] ?? how] ?? 0) + 1;
@@ -31,11 +31,11 @@ const SEVERAL = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
   ['Rays', (mark) => rays(mark).length, counted],
-  ['px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
-  ['Left out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
+  ['Residual, px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
+  ['Leave-one-out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
   ['Plan, m', (mark) => plan(mark.loo_m), (mark) => number(plan(mark.loo_m), 2)],
-  ['h, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
-  ['± h, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
+  ['Height, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
+  ['± Height, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
 ];
 

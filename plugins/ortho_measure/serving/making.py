@@ -36,7 +36,7 @@ class Making:
             If there is no such image.
         """
         if number >= len(self._session.views):
-            raise InputError("there is no such image", field="number")
+            raise InputError("unknown image", field="number")
         with self._lock:
             if self._told["state"] != "running":
                 self._told = {"state": "running", "share": 0.0, "number": number}
@@ -105,5 +105,5 @@ class Making:
     def _file(self, name: str) -> Path:
         with self._lock:
             if name not in self._files:
-                raise InputError("there is no ortho yet", field="ortho", remedy="make it first")
+                raise InputError("no ortho was made yet", field="ortho", remedy="press Make ortho first")
             return self._files[name]

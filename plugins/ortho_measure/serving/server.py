@@ -45,7 +45,7 @@ PAGE = {
     "ol.css": "text/css; charset=utf-8",
     "ol-LICENSE.md": "text/plain; charset=utf-8",
 }
-_REMEDY = "load the page anew"
+_REMEDY = "reload the page"
 
 
 class Windows:
@@ -86,7 +86,7 @@ class _Answers:
             If there are several.
         """
         if not isinstance(self._session, Session):
-            raise InputError("this is asked of one scene", field="request", remedy=_REMEDY)
+            raise InputError("this request is for a single scene", field="request", remedy=_REMEDY)
         return self._session
 
     def begin(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -118,7 +118,7 @@ class _Answers:
         self._require_writer(given)
         action = given.get("action")
         if not isinstance(action, dict):
-            raise InputError("there is no action", field="action")
+            raise InputError("the request has no action", field="action")
         return self._session.act(action)
 
     def state(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -141,7 +141,7 @@ class _Answers:
         """Match a click."""
         image, ground = given.get("image"), given.get("ground")
         if image is None and ground is None:
-            raise InputError("there is no place to match", field="image", remedy=_REMEDY)
+            raise InputError("no position to match", field="image", remedy=_REMEDY)
         return self.scene.proposal(
             None if image is None else _numbers(image, 2), None if ground is None else _numbers(ground, 3)
         )
@@ -150,12 +150,12 @@ class _Answers:
         """Match a click in one of several images, or a ground, in all of them."""
         session, known = self._session, given.get("known") or {}
         if not isinstance(session, BlockSession) or not isinstance(known, dict):
-            raise InputError("there is one image", field="request", remedy=_REMEDY)
+            raise InputError("this request is for several images", field="request", remedy=_REMEDY)
         if given.get("ground") is not None:
             return session.of_ground(_numbers(given["ground"], 3))
         number, labels = _whole(given.get("number")), session.images.labels
         if number >= len(labels) or not set(known) <= set(labels):
-            raise InputError("there is no such image", field="number", remedy=_REMEDY)
+            raise InputError("unknown image", field="number", remedy=_REMEDY)
         places = {str(label): _numbers(place, 2) for label, place in known.items()}
         return session.proposal(number, _numbers(given.get("image"), 2), places)
 
@@ -163,7 +163,7 @@ class _Answers:
         """Understand typed coordinates."""
         values = given.get("values")
         if not isinstance(values, list) or len(values) != 3:
-            raise InputError("ground has x, y and a height or none", field="values")
+            raise InputError("enter x and y; the height is optional", field="values")
         numbers = [None if value is None else _numbers([value], 1)[0] for value in values]
         vertical = given.get("vertical")
         return {
@@ -174,7 +174,7 @@ class _Answers:
         """Return what is black and white, for each band."""
         pane, box = str(given.get("pane")), given.get("box")
         if pane not in self._tiles.bands:
-            raise InputError("there is no such view", field="pane")
+            raise InputError("unknown view", field="pane")
         where = None if box is None else _numbers(box, 4)
         bands, version = _bands(given.get("bands")), _whole(given.get("version", 0))
         return {"limits": [self._tiles.limits(pane, version, where, self._band(pane, band)) for band in bands]}
@@ -200,12 +200,12 @@ class _Answers:
     def _require_writer(self, given: dict[str, Any]) -> None:
         if not self._windows.claim(_window(given)):
             raise InputError(
-                "another window measures these points: this one only shows them", field="window", remedy="take over"
+                "these points are open in another window; this one is read-only", field="window", remedy="take over"
             )
 
     def _band(self, pane: str, band: int) -> int:
         if not 0 <= band <= self._tiles.bands[pane]:
-            raise InputError("there is no such band", field="bands")
+            raise InputError("unknown band", field="bands")
         return band
 
 
@@ -365,12 +365,12 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
 def _asked(body: bytes) -> dict[str, Any]:
     given = parse_json(body or b"{}", "request", _REMEDY)
     if not isinstance(given, dict):
-        raise InputError("a request is a JSON object", remedy=_REMEDY)
+        raise InputError("a request must be a JSON object", remedy=_REMEDY)
     try:
         json.dumps(given, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
         # JSON can name halves of a character. They are in no file and in no answer.
-        raise InputError("a text of this request is not Unicode", field="request", remedy=_REMEDY) from error
+        raise InputError("this request has text that is not Unicode", field="request", remedy=_REMEDY) from error
     return given
 
 
@@ -379,39 +379,39 @@ def _tile(request: Request) -> tuple[Any, ...]:
     query = request.query_params
     numbered = [text.isascii() and text.isdigit() and len(text) < 10 for text in query.get("b", "0").split(",")]
     if not all(numbered):
-        raise InputError("there is no such band", field="bands")
+        raise InputError("unknown band", field="bands")
     bands = _bands([int(text) for text in query.get("b", "0").split(",")])
     values = query.get("l", "").split(",")
     if len(values) != 2 * len(bands):
-        raise InputError("there is no such tile", field="tile")
+        raise InputError("unknown tile", field="tile")
     try:
         limits = _numbers([float(text) for text in values], len(values))
     except ValueError:
-        raise InputError("there is no such tile", field="tile") from None
+        raise InputError("unknown tile", field="tile") from None
     pairs = list(zip(limits[::2], limits[1::2], strict=True))
     factor, column, row = given["factor"], given["column"], given["row"]
     if factor > MOST or max(column, row) > 1 << 20:
-        raise InputError("there is no such tile", field="tile")
+        raise InputError("unknown tile", field="tile")
     return given["pane"], given["version"], factor, column, row, bands, pairs
 
 
 def _bands(values: Any) -> list[int]:
     found = [_whole(value) for value in values] if isinstance(values, list) else []
     if len(found) not in (1, 3):
-        raise InputError("one band is shown in grey, or three in colours", field="bands")
+        raise InputError("choose one band (grey) or three (colour)", field="bands")
     return found
 
 
 def _whole(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
-        raise InputError("this is no whole number", field="request", remedy=_REMEDY)
+        raise InputError("this must be a whole number", field="request", remedy=_REMEDY)
     return value
 
 
 def _numbers(values: Any, count: int) -> list[float]:
     """Return so many finite numbers of a request."""
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
-        raise InputError(f"{count} numbers are wanted", field="request", remedy=_REMEDY)
+        raise InputError(f"this must be a list of {count} numbers", field="request", remedy=_REMEDY)
     for value in values:
         if (
             isinstance(value, bool)
@@ -419,7 +419,7 @@ def _numbers(values: Any, count: int) -> list[float]:
             or not math.isfinite(value)
             or abs(value) > 1e12
         ):
-            raise InputError("this is no number", field="request", remedy=_REMEDY)
+            raise InputError("this must be a number", field="request", remedy=_REMEDY)
     return [float(value) for value in values]
 
 
@@ -430,7 +430,7 @@ def _facts(path: str, size: tuple[int, int]) -> dict[str, Any]:
 def _window(given: dict[str, Any]) -> str:
     name = given.get("window")
     if not isinstance(name, str) or not 8 <= len(name) <= 64:
-        raise InputError("a window has a name", field="request", remedy=_REMEDY)
+        raise InputError("the window has no name", field="request", remedy=_REMEDY)
     return name
 
 

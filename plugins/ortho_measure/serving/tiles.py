@@ -107,7 +107,7 @@ class TileServer:
             or not 0 <= band <= self.bands[name]
             or not (1 <= factor <= MOST and factor & (factor - 1) == 0)
         ):
-            raise InputError("there is no such tile", field="tile")
+            raise InputError("unknown tile", field="tile")
         places = self._project.rendering(name, version)
         key = (name, 0 if places is None else version, factor, left, top, band)
         with self._lock:
