@@ -35,6 +35,7 @@ from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands.mosaic.assembly import assemble
+from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.locations import Location
@@ -88,11 +89,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
         if record is not None:
             RunRecord(name=job.name, key="", status="started", outputs=before).write(job.record)
-        asked = job.request
-        result = commands.rectify(
-            asked.image, job.folder, scene=asked.scene, points=asked.points, surface=asked.surface, match=asked.match,
-            output=asked.output, name=job.name, digest=DIGESTS,
-        )  # fmt: skip
+        result = _rectified(job)
         made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
         _remove(job.folder, {one.path for one in before} - {one.path for one in made})
         before = made
@@ -101,9 +98,16 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         report = result.document["report"]
         read = (*as_read(job, report), *far)
         done = RunRecord(
-            name=job.name, key=key_of(read, job.configuration, job.versions), status="done", inputs=read, outputs=made,
-            siblings=listing, seconds=time.monotonic() - begin, facts=_facts(report), run=job.run,
-        )  # fmt: skip
+            name=job.name,
+            key=key_of(read, job.configuration, job.versions),
+            status="done",
+            inputs=read,
+            outputs=made,
+            siblings=listing,
+            seconds=time.monotonic() - begin,
+            facts=_facts(report),
+            run=job.run,
+        )
         done.write(job.record)
         return Outcome(job.name, "done", done.seconds, paths_of(done, job), done.facts)
     except Exception as error:
@@ -118,6 +122,21 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         return Outcome(job.name, "failed", failed.seconds, kept, error=told)
 
 
+def _rectified(job: Job) -> Result:
+    request = job.request
+    return commands.rectify(
+        request.image,
+        job.folder,
+        scene=request.scene,
+        points=request.points,
+        surface=request.surface,
+        match=request.match,
+        output=request.output,
+        name=job.name,
+        digest=DIGESTS,
+    )
+
+
 def _check_versions(job: Job) -> None:
     here = versions()
     other = [
@@ -126,8 +145,11 @@ def _check_versions(job: Job) -> None:
         if here[name] != job.versions.get(name)
     ]
     if other:
-        raise InputError(f"this worker has other software than the run: {'; '.join(other)}", field="scheduler",
-                         remedy="install the same versions everywhere")  # fmt: skip
+        raise InputError(
+            f"this worker has other software than the run: {'; '.join(other)}",
+            field="scheduler",
+            remedy="install the same versions everywhere",
+        )
 
 
 def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: bool) -> RunRecord | None:
@@ -157,7 +179,9 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a summary says of a scene."""
     scene, adjustment = report["scene"], report["adjustment"]
     return {
-        "sensor": scene["sensor"], "model": adjustment["model"], "headline": report["headline"],
+        "sensor": scene["sensor"],
+        "model": adjustment["model"],
+        "headline": report["headline"],
         "lean_m_per_m": scene["lean_m_per_m"],
         "rmse_px": {which: rmse and rmse["total"] for which, rmse in adjustment["rmse"].items()},
         "rmse_m": {which: rmse and rmse["total"] for which, rmse in report["rmse_m"].items()},
@@ -165,7 +189,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "ortho": {name: report["ortho"][name] for name in ("crs", "resolution", "size", "valid_share")},
         "warnings": list(report["warnings"]),
         "notices": list(report["notices"]),
-    }  # fmt: skip
+    }
 
 
 # -- all scenes ------------------------------------------------------------------------------------------------------
@@ -216,9 +240,11 @@ def run(
     planned = config if isinstance(config, Plan) else plan(config, allow_network=allow_network)
     if store is None and Location(planned.path).is_far:
         raise InputError(
-            "what a pipeline file of another machine asks for goes to a store", file=planned.path, field="output",
+            "what a pipeline file of another machine asks for goes to a store",
+            file=planned.path,
+            field="output",
             remedy="give a folder of objects for the outputs, such as s3://bucket/prefix, or copy the file",
-        )  # fmt: skip
+        )
     jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
     if store is not None:
         _refuse_unshared(planned)
@@ -240,9 +266,11 @@ def run(
 def _refuse_unshared(planned: Plan) -> None:
     if planned.mosaic is not None:
         raise InputError(
-            "workers that share a store make no mosaic", file=planned.path, field="mosaic",
+            "workers that share a store make no mosaic",
+            file=planned.path,
+            field="mosaic",
             remedy="take it out of the file, and make it of the orthos with `ortho mosaic` afterwards",
-        )  # fmt: skip
+        )
 
 
 def _run_id() -> str:
@@ -266,9 +294,7 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
 class _Run:
     """One call of `run`: the log, the count, the end."""
 
-    def __init__(
-        self, planned: Plan, part: bool, checksums: bool, progress: Progress | None
-    ) -> None:  # fmt: skip
+    def __init__(self, planned: Plan, part: bool, checksums: bool, progress: Progress | None) -> None:
         self.planned, self.part, self.checksums, self.progress = planned, part, checksums, progress
         self.begin = time.monotonic()
         self.log_path = planned.output / RUN_FILES["log"]
@@ -329,8 +355,11 @@ class _Run:
         if not self.part:
             files |= {kind: self.planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
         if made is not None and "file" in made:
-            files |= {"mosaic": self.planned.output / made["file"], "seams": self.planned.output / RUN_FILES["seams"],
-                      "mosaic page": self.planned.output / RUN_FILES["page"]}  # fmt: skip
+            files |= {
+                "mosaic": self.planned.output / made["file"],
+                "seams": self.planned.output / RUN_FILES["seams"],
+                "mosaic page": self.planned.output / RUN_FILES["page"],
+            }
         result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
         if not self.part:
             write_json(files["summary"], result.to_json())
@@ -359,11 +388,13 @@ class _Mosaic:
         self.record = planned.output / STATE / "mosaic" / "record.json"
         self.orthos = [
             Ortho(
-                job.name, Path(outcomes[job.name].files["ortho"]), outcomes[job.name].facts["lean_m_per_m"],
+                job.name,
+                Path(outcomes[job.name].files["ortho"]),
+                outcomes[job.name].facts["lean_m_per_m"],
                 _path_of(outcomes[job.name].files.get("accuracy")),
             )
             for job in jobs
-        ]  # fmt: skip
+        ]
         # What the records know of the orthos need not be taken again.
         known = [RunRecord.at(job.record) for job in jobs]
         self.inputs = tuple(

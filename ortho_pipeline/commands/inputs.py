@@ -16,7 +16,7 @@ from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import allowed
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options import PathLike, SceneOptions
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster import source as raster
 
@@ -44,28 +44,41 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         if dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
             raise InputError(
                 "this scene is open already", file=image, field="scene", remedy="give its path, or open it so"
-            )  # fmt: skip
+            )
         return image
     if options.model is None:
         given: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
             if "rpc" in given:
-                raise InputError("the RPC is chosen twice", field="scene.rpc",
-                                 remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")))  # fmt: skip
+                raise InputError(
+                    "the RPC is chosen twice",
+                    field="scene.rpc",
+                    remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")),
+                )
             given["rpc"] = options.rpc
         given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
         return host.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
+    return _with_model_file(image, options, options.model)
+
+
+def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model: PathLike) -> Scene:
+    """Open an image with the model of a model file, which takes the place of its own."""
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
-            "a model file takes the place of the image's model", field="scene.model",
+            "a model file takes the place of the image's model",
+            field="scene.model",
             remedy=Text(
-                "leave out ", Setting("scene.rpc"), ", ", Setting("scene.sensor"), " and ",
-                Setting("scene.sensor_options")
+                "leave out ",
+                Setting("scene.rpc"),
+                ", ",
+                Setting("scene.sensor"),
+                " and ",
+                Setting("scene.sensor_options"),
             ),
-        )  # fmt: skip
+        )
     dataset = raster.open_dataset(image, **options.access)
     host.Host.discover()  # model families of plugins, which the file may name
-    saved = read_model_file(located(options.model, allow_network=options.allow_network))
+    saved = read_model_file(located(model, allow_network=options.allow_network))
     size = dataset.RasterXSize, dataset.RasterYSize
     offset = options.crop_offset
     if offset is None and saved.size != size:
@@ -74,7 +87,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         raise InputError(
             f"this model is of an image of {saved.size[0]} x {saved.size[1]} pixels, {Path(image).name} has "
             f"{size[0]} x {size[1]}",
-            file=options.model,
+            file=model,
             field="size",
             remedy=Text(
                 "give the model file of this image, or ",
@@ -83,11 +96,15 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
             ),
         )
     scene = Scene(
-        sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
-        models={saved.model.kind: saved.model}, model_source=str(options.model),
+        sensor=saved.sensor or "model file",
+        path=image,
+        width=size[0],
+        height=size[1],
+        models={saved.model.kind: saved.model},
+        model_source=str(model),
         facts={"delivered_model_source": saved.model_source} if saved.model_source else {},
         adjusted=saved.adjusted,
-    )  # fmt: skip
+    )
     return scene if offset is None else crop.placed(scene, dataset, offset)
 
 
@@ -151,17 +168,20 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
     attaching = any(str(path).endswith(SIDE_CARS) for path in files.values())
     if attaching and folder.resolve() == Path(request.image).resolve().parent:
         raise InputError(
-            "the RPC files written here would attach to the source image and change its model", file=folder,
-            field="folder", remedy="choose an output folder of its own",
-        )  # fmt: skip
+            "the RPC files written here would attach to the source image and change its model",
+            file=folder,
+            field="folder",
+            remedy="choose an output folder of its own",
+        )
     if "ortho" in files and not overwrite:
         # Statistics, overviews and masks go with an ortho that is replaced; a model is nothing that an ortho has.
         for stale in old_side_cars(files["ortho"]):
             if stale.name.endswith(SIDE_CARS) or not files["ortho"].exists():
                 raise InputError(
-                    "an old side-car lies here that GDAL would attach to the ortho", file=stale,
+                    "an old side-car lies here that GDAL would attach to the ortho",
+                    file=stale,
                     remedy=Text("remove it (", Setting("overwrite"), " does), or choose another output folder"),
-                )  # fmt: skip
+                )
 
 
 def old_side_cars(ortho: Path) -> list[Path]:

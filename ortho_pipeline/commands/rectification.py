@@ -124,13 +124,7 @@ def rectify(
     _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
 
     def described() -> SceneReport:
-        made = report.build_report(
-            scene=opened, fit=adjusted.fit, exported=exported, surface=placed.surface,
-            coverage=placed.footprint.coverage, grid=placed.grid, warp=warped, near=request.points.near,
-            provenance=record | read_since(before), matching=adjusted.matching,
-            warnings=[*adjusted.warnings(placed.surface), *placed.footprint.notes(),
-                      *placed.sparse(warped.valid_pixels), *complaints, *notes, *warped.notes(output.memory)],
-        )  # fmt: skip
+        made = _report_of(placed, exported, warped, record | read_since(before), [*complaints, *notes])
         made = report.with_layers(made, accuracy=accuracy, angles=angles)
         write_report(made, adjusted.fit, files, adjusted.matched, source)
         if acquired is not None:
@@ -229,9 +223,14 @@ def export(
         if heights is not None:
             heights = footprint.facing(adjusted.model, heights, *size)
         job = Export(
-            dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
+            dataset,
+            adjusted.model,
+            size,
+            heights,
+            adjustment.points.select(adjustment.used),
+            adjustment.rejected,
             force=force,
-        )  # fmt: skip
+        )
         for one in chosen:
             job.write(one, files[one.name])
     document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
@@ -265,8 +264,11 @@ def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
 
         return acquisition_time(facts, output.acquired)
     if output.acquired is not None:
-        raise InputError("only a STAC item says when", field="output.acquired",
-                         remedy=Text("give ", Setting("output.stac"), " too, or leave it out"))  # fmt: skip
+        raise InputError(
+            "only a STAC item says when",
+            field="output.acquired",
+            remedy=Text("give ", Setting("output.stac"), " too, or leave it out"),
+        )
     return None
 
 
@@ -292,11 +294,50 @@ def _warp(
 
     output = placed.request.output
     job = WarpJob(
-        placed.model, source, placed.surface, placed.grid, output.resampling, output.dem_interpolation,
-        output.tolerance, Resources(output.memory, output.threads, progress), output.format,
-        dict(output.creation_options), Profile.of(source, output.dtype, output.nodata), exported,
-    )  # fmt: skip
+        placed.model,
+        source,
+        placed.surface,
+        placed.grid,
+        output.resampling,
+        output.dem_interpolation,
+        output.tolerance,
+        Resources(output.memory, output.threads, progress),
+        output.format,
+        dict(output.creation_options),
+        Profile.of(source, output.dtype, output.nodata),
+        exported,
+    )
     return engine_of(output.engine).rectify(job, path)
+
+
+def _report_of(
+    placed: Placement,
+    exported: rpc.RpcExport | None,
+    warped: WarpRecord,
+    record: Mapping[str, Any],
+    notices: Sequence[Notice],
+) -> SceneReport:
+    """Return the report of an ortho, without its layers."""
+    adjusted, request = placed.adjusted, placed.request
+    return report.build_report(
+        scene=placed.scene,
+        fit=adjusted.fit,
+        exported=exported,
+        surface=placed.surface,
+        coverage=placed.footprint.coverage,
+        grid=placed.grid,
+        warp=warped,
+        near=request.points.near,
+        provenance=record,
+        matching=adjusted.matching,
+        warnings=[
+            *adjusted.warnings(placed.surface),
+            *placed.footprint.notes(),
+            *placed.sparse(warped.valid_pixels),
+            *notices,
+            *warped.notes(request.output.memory),
+        ],
+    )
 
 
 def _write_models(

@@ -6,15 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Protocol
 
-from ortho_pipeline.options.option import (
-    CORRECTIONS,
-    PIXEL_ORIGINS,
-    PIXEL_TYPES,
-    RESAMPLING,
-    Option,
-    PathLike,
-    documented,
-)
+from ortho_pipeline.options.option import CORRECTIONS, PIXEL_ORIGINS, Option, PathLike, documented
+from ortho_pipeline.options.output import OutputOptions
 from ortho_pipeline.options.texts import Setting, Text
 
 
@@ -24,8 +17,9 @@ class SceneOptions:
     """How the image is opened."""
 
     sensor: Annotated[
-        str | None, Option("--sensor", "Sensor of the image (see 'ortho sensors').", "NAME"),
-    ] = None  # fmt: skip
+        str | None,
+        Option("--sensor", "Sensor of the image (see 'ortho sensors').", "NAME"),
+    ] = None
     rpc: Annotated[
         str | None,
         Option("--rpc", "Which RPC, where there are several, or an RPC file.", "tag|sidecar|FILE"),
@@ -36,10 +30,12 @@ class SceneOptions:
     crop_offset: Annotated[
         Sequence[float] | None,
         Option(
-            "--crop-offset", "First pixel of this image in the one that its model belongs to, where it is a crop.",
-            "COL,ROW", kind="pair",
+            "--crop-offset",
+            "First pixel of this image in the one that its model belongs to, where it is a crop.",
+            "COL,ROW",
+            kind="pair",
         ),
-    ] = None  # fmt: skip
+    ] = None
     sensor_options: Annotated[
         Mapping[str, str],
         Option("--sensor-option", "Option of the sensor (see 'ortho sensors').", "K=V", kind="keys"),
@@ -50,10 +46,13 @@ class SceneOptions:
     roots: Annotated[
         Sequence[PathLike],
         Option(
-            "--root", "A folder that files may lead to (a VRT), besides their own.", "DIR", kind="folders",
+            "--root",
+            "A folder that files may lead to (a VRT), besides their own.",
+            "DIR",
+            kind="folders",
             in_file=False,
         ),
-    ] = ()  # fmt: skip
+    ] = ()
 
     @property
     def access(self) -> dict[str, Any]:
@@ -121,10 +120,11 @@ class PointOptions:
     select: Annotated[
         str | None,
         Option(
-            "--select", "Points that control: N well spread, N of one region, these, or N at random; all others check.",
+            "--select",
+            "Points that control: N well spread, N of one region, these, or N at random; all others check.",
             "even:N|cluster:N|ids:A,B|random:N:SEED",
         ),
-    ] = None  # fmt: skip
+    ] = None
     correction: Annotated[
         str | None,
         Option(
@@ -143,9 +143,7 @@ class PointOptions:
             "NAME",
         ),
     ] = None
-    model_crs: Annotated[
-        str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="that of the points")
-    ] = None  # fmt: skip
+    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="that of the points")] = None
     prune: Annotated[bool, Option("--prune", "Remove parameters that the points do not justify.")] = False
     params: Annotated[str | None, Option("--params", "Adjust these parameters only.", "A,B,C", unset="all")] = None
     significance: Annotated[
@@ -153,7 +151,7 @@ class PointOptions:
         Option(
             "--significance", "Above this chance (p) a parameter is not justified.", kind="number", above=0, below=1
         ),
-    ] = 0.05  # fmt: skip
+    ] = 0.05
     ridge: Annotated[
         str,
         Option("--ridge", "Regularisation of fitted models: found, or of this weight.", "auto|none|gcv|lcurve|W"),
@@ -161,10 +159,13 @@ class PointOptions:
     near: Annotated[
         float | None,
         Option(
-            "--near", "Points closer than this are neighbours in the analysis of residuals.", "M",
-            kind="number", above=0,
+            "--near",
+            "Points closer than this are neighbours in the analysis of residuals.",
+            "M",
+            kind="number",
+            above=0,
         ),
-    ] = None  # fmt: skip
+    ] = None
 
 
 @documented
@@ -185,10 +186,12 @@ class BlockOptions:
     ] = None
     ties: Annotated[
         str | None,
-        Option("--ties", Text(
-            "Find tie points between the images by matching, besides those of ", Setting("points.points"), "."
-        ), choices=("auto",)),
-    ] = None  # fmt: skip
+        Option(
+            "--ties",
+            Text("Find tie points between the images by matching, besides those of ", Setting("points.points"), "."),
+            choices=("auto",),
+        ),
+    ] = None
     gcps: Annotated[
         PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
     ] = None
@@ -219,18 +222,24 @@ class BlockOptions:
     ground_sigma: Annotated[
         str | None,
         Option(
-            "--ground-sigma", "Sigmas (m) in plan and height of ground that states none in the points file.", "XY[,H]",
+            "--ground-sigma",
+            "Sigmas (m) in plan and height of ground that states none in the points file.",
+            "XY[,H]",
             unset="estimated",
         ),
-    ] = None  # fmt: skip
+    ] = None
     model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS")] = None
     hold: Annotated[
         float | None,
         Option(
-            "--hold", "Hold the orientation at its start values with this sigma.", "PX", kind="number", above=0,
+            "--hold",
+            "Hold the orientation at its start values with this sigma.",
+            "PX",
+            kind="number",
+            above=0,
             unset="10 where nothing else gives a datum",
         ),
-    ] = None  # fmt: skip
+    ] = None
 
 
 @documented
@@ -241,10 +250,12 @@ class SurfaceOptions:
     dem: Annotated[
         PathLike | None,
         Option(
-            "--dem", "Digital elevation model: a file, a pattern of the files that make one, a STAC item or "
-            "collection, or 'auto' for the cells of the Copernicus DEM under the scene.", "FILE|URL|auto",
+            "--dem",
+            "Digital elevation model: a file, a pattern of the files that make one, a STAC item or "
+            "collection, or 'auto' for the cells of the Copernicus DEM under the scene.",
+            "FILE|URL|auto",
         ),
-    ] = None  # fmt: skip
+    ] = None
     vertical: Annotated[
         str | None, Option("--dem-vertical", f"Height datum of the DEM: {_VERTICAL_FORMS}.", "DATUM")
     ] = None
@@ -264,168 +275,30 @@ class SurfaceOptions:
             kind="number or word",
         ),
     ] = "error"
-    height: Annotated[
-        float | None, Option("--height", "One ellipsoidal height, no DEM.", "M", kind="number")
-    ] = None  # fmt: skip
+    height: Annotated[float | None, Option("--height", "One ellipsoidal height, no DEM.", "M", kind="number")] = None
     sigma: Annotated[
         float | PathLike | None,
         Option(
-            "--dem-sigma", "Standard deviation of the heights, metres: a number or a raster, such as Copernicus' HEM.",
-            "M|FILE", kind="number or word", unset="unknown",
+            "--dem-sigma",
+            "Standard deviation of the heights, metres: a number or a raster, such as Copernicus' HEM.",
+            "M|FILE",
+            kind="number or word",
+            unset="unknown",
         ),
-    ] = None  # fmt: skip
+    ] = None
     source: Annotated[
         PathLike | None,
         Option(
-            "--dem-source", Text(
-                "Where ", Setting("surface.dem", "auto"),
-                " finds cells: a folder of them, or an address (https, s3, gs, az)."
-            ), "DIR|URL", unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
-        ),
-    ] = None  # fmt: skip
-
-
-@documented
-@dataclass(frozen=True)
-class OutputOptions:
-    """Form of the ortho, and how it is computed.
-
-    `memory` is in bytes.
-    """
-
-    crs: Annotated[str | None, Option("--output-crs -t_srs", metavar="CRS", unset="the UTM zone of the scene")] = None
-    resolution: Annotated[
-        float | Sequence[float] | None,
-        Option(
-            "--resolution -tr", "Pixel size in units of the output CRS.", "X [Y]", unset="the ground sample distance",
-            kind="one or two", above=0,
-        ),
-    ] = None  # fmt: skip
-    extent: Annotated[
-        Sequence[float] | None,
-        Option(
-            "--extent -te", "Bounds of the ortho, taken as they are.", "XMIN YMIN XMAX YMAX", kind="box",
-            unset="the scene's footprint",
-        ),
-    ] = None  # fmt: skip
-    like: Annotated[
-        PathLike | None,
-        Option(
-            "--like", "Take CRS, resolution and extent from this raster, so that pixels fall on pixels.", "RASTER",
-            kind="file",
-        ),
-    ] = None  # fmt: skip
-    align: Annotated[
-        bool, Option("--align -tap", Text("Widen ", Setting("output.extent"), " to whole multiples of the resolution."))
-    ] = False  # fmt: skip
-    resampling: Annotated[str, Option("--resampling -r", choices=RESAMPLING)] = "bilinear"
-    bands: Annotated[
-        Sequence[int] | None,
-        Option(
-            "--band -b", "Only these bands of the image, from 1, in this order.", "N[,...]", unset="all",
-            kind="integers", above=0,
-        ),
-    ] = None  # fmt: skip
-    dtype: Annotated[
-        str | None,
-        Option(
-            "--output-type -ot", "Type of the pixels; values beyond its range are clamped.", "|".join(PIXEL_TYPES),
-            unset="that of the image", choices=PIXEL_TYPES,
-        ),
-    ] = None  # fmt: skip
-    nodata: Annotated[
-        float | str | None,
-        Option(
-            "--nodata -dstnodata", "Value of pixels without an image.", "VALUE", kind="number or nan",
-            unset="that of the image, or a mask",
-        ),
-    ] = None  # fmt: skip
-    dem_interpolation: Annotated[
-        str, Option("--dem-interpolation", "Between the samples of the DEM.", choices=("bilinear", "cubic"))
-    ] = "bilinear"
-    format: Annotated[str, Option("--format -of", choices=("COG", "GTiff"))] = "COG"
-    creation_options: Annotated[
-        Mapping[str, str], Option("--creation-option -co", "Option of GDAL's driver.", "K=V", kind="keys")
-    ] = field(default_factory=dict)
-    engine: Annotated[
-        str,
-        Option(
-            "--engine", "Our warper, or GDAL's with its own transformers, exactly (slow; for comparison).",
-            choices=("ortho", "gdal"),
-        ),
-    ] = "ortho"  # fmt: skip
-    memory: Annotated[
-        int,
-        Option(
-            "--memory -wm", "Bound on windows and caches; or with a unit, such as 2GB.", "MB", kind="bytes",
-            in_file=False,
-        ),
-    ] = 512_000_000  # fmt: skip
-    threads: Annotated[
-        int | None, Option("--threads", unset="all processors", kind="integer", above=0, in_file=False)
-    ] = None
-    tolerance: Annotated[
-        float,
-        Option(
-            "--tolerance", "Bound on the warper's geometric error, in source pixels.", "PX", kind="number", above=0
-        ),
-    ] = 0.01  # fmt: skip
-    accuracy_raster: Annotated[
-        bool,
-        Option(
-            "--accuracy-raster", Text(
-                "Write a raster of how accurate the ortho is at each place; ", Setting("surface.sigma"),
-                " says how good the heights are."
+            "--dem-source",
+            Text(
+                "Where ",
+                Setting("surface.dem", "auto"),
+                " finds cells: a folder of them, or an address (https, s3, gs, az).",
             ),
+            "DIR|URL",
+            unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
         ),
-    ] = False  # fmt: skip
-    visibility: Annotated[
-        str | None,
-        Option(
-            "--visibility", "Look for ground that other terrain hides: write a mask of it, or leave its pixels empty "
-            "(with a surface model a true ortho).", choices=("mask", "nodata"),
-        ),
-    ] = None  # fmt: skip
-    fill_from: Annotated[
-        PathLike | None,
-        Option(
-            "--fill-from", Text(
-                "Fill what ", Setting("output.visibility"), " leaves empty from this ortho, on any grid."
-            ),
-            "ORTHO", kind="file",
-        ),
-    ] = None  # fmt: skip
-    angles: Annotated[
-        bool,
-        Option(
-            "--angles", "Write angles of view at each place and, where the sun is known, of the sun, and which pixels "
-            "lie in shadow.",
-        ),
-    ] = False  # fmt: skip
-    sun: Annotated[
-        Sequence[float] | None,
-        Option(
-            "--sun", Text("Azimuth and elevation of the sun, degrees, for ", Setting("output.angles"), "."), "AZ,EL",
-            kind="pair", unset="that of the metadata",
-        ),
-    ] = None  # fmt: skip
-    layer_step: Annotated[
-        int,
-        Option(
-            "--layer-step", "Pixels of the ortho to one of the layers of accuracy and angles.", "N", kind="integer",
-            above=0,
-        ),
-    ] = 16  # fmt: skip
-    stac: Annotated[bool, Option("--stac", "Write a STAC item of the ortho too.")] = False
-    acquired: Annotated[
-        str | None, Option("--acquired", "Time of acquisition (RFC 3339), where the metadata have none.", "TIME")
     ] = None
-
-    @property
-    def files(self) -> dict[str, str | os.PathLike[str]]:
-        """Rasters besides the image that an ortho is made with, by what they are."""
-        given = {"other ortho": self.fill_from, "grid": self.like}
-        return {role: path for role, path in given.items() if path is not None}
 
 
 @documented
@@ -436,32 +309,46 @@ class MatchOptions:
     reference: Annotated[
         Sequence[PathLike],
         Option(
-            "--reference", "Orthoimages to take control points from by matching; where several show a place, the "
-            "first.", "ORTHO[,...]", kind="files",
+            "--reference",
+            "Orthoimages to take control points from by matching; where several show a place, the first.",
+            "ORTHO[,...]",
+            kind="files",
         ),
-    ] = ()  # fmt: skip
+    ] = ()
     reference_bands: Annotated[
         Sequence[int] | None,
         Option(
-            "--reference-bands", "Bands of the reference to compare, from 1.", "N[,...]", kind="integers", above=0,
+            "--reference-bands",
+            "Bands of the reference to compare, from 1.",
+            "N[,...]",
+            kind="integers",
+            above=0,
             unset="the four with the most content",
         ),
-    ] = None  # fmt: skip
+    ] = None
     search: Annotated[
         float | None,
         Option(
-            "--search", "How far the image's model may be off on the ground.", "M", kind="number", above=0,
+            "--search",
+            "How far the image's model may be off on the ground.",
+            "M",
+            kind="number",
+            above=0,
             unset="three times the accuracy that the scene states, else 100",
         ),
-    ] = None  # fmt: skip
+    ] = None
     search_rotation: Annotated[
         float | None,
         Option(
-            "--search-rotation", "How far the image's model may be turned (degrees; 180 for any angle).", "DEG",
-            kind="number", above=0, below=180.001, unset="5 where the model comes from metadata on orbit or attitude, "
-            "else none",
+            "--search-rotation",
+            "How far the image's model may be turned (degrees; 180 for any angle).",
+            "DEG",
+            kind="number",
+            above=0,
+            below=180.001,
+            unset="5 where the model comes from metadata on orbit or attitude, else none",
         ),
-    ] = None  # fmt: skip
+    ] = None
     points: Annotated[
         int,
         Option(
@@ -476,23 +363,28 @@ class MatchOptions:
     reference_sigma: Annotated[
         float | None,
         Option(
-            "--reference-sigma", "Standard deviation of where the reference lies as a whole, in each axis.", "M",
-            kind="number", above=0,
+            "--reference-sigma",
+            "Standard deviation of where the reference lies as a whole, in each axis.",
+            "M",
+            kind="number",
+            above=0,
         ),
-    ] = None  # fmt: skip
+    ] = None
     gcps_as: Annotated[
         str,
         Option(
-            "--gcps-as", Text(
-                "What ", Setting("points.gcps"), " are beside matches: a test that takes no part, or control too."
-            ),
+            "--gcps-as",
+            Text("What ", Setting("points.gcps"), " are beside matches: a test that takes no part, or control too."),
             choices=("check", "control"),
         ),
-    ] = "check"  # fmt: skip
+    ] = "check"
 
 
 #: The groups, by the name that they have in messages, in the pipeline file and as arguments of the commands.
 GROUPS: Mapping[str, type] = {
-    "scene": SceneOptions, "points": PointOptions, "surface": SurfaceOptions, "match": MatchOptions,
+    "scene": SceneOptions,
+    "points": PointOptions,
+    "surface": SurfaceOptions,
+    "match": MatchOptions,
     "output": OutputOptions,
-}  # fmt: skip
+}

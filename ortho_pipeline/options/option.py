@@ -116,9 +116,8 @@ def documented(group: type[_T]) -> type[_T]:
         )
         lines.append(f"{one.name} : {kind}\n    {said}")
     group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
-    signature = inspect.signature(group)
-    plain = [one.replace(annotation=get_args(one.annotation)[0]) for one in signature.parameters.values()]
-    group.__signature__ = signature.replace(parameters=plain)  # type: ignore[attr-defined]
+    types = {field.name: get_args(field.type)[0] for field in fields(group)}  # type: ignore[arg-type]
+    group.__init__.__annotations__ = {**types, "return": None}
     group.__repr__ = _as_called  # type: ignore[method-assign]
     return group
 

@@ -34,6 +34,11 @@ from ortho_pipeline.plugin import (
 HEIGHTS = (-500.0, 9000.0)
 #: Axes of the state's camera (x right, y down, z to the scene) in those of ours (x right, y up, z backwards).
 _OURS_FROM_THEIRS = np.diag([1.0, -1.0, -1.0])
+#: Fields that a state has to have, and that a camera does not know.
+_IDENTIFIERS = (
+    *(f"m_{name}Identifier" for name in ("image", "collection", "platform", "sensor", "trajectory")),
+    "m_dateTime",
+)
 
 
 def read_frame(state: StateFields) -> FrameCamera:
@@ -54,10 +59,15 @@ def read_frame(state: StateFields) -> FrameCamera:
     sums = [state.number(f"m_detector{name}Summing", 1.0) for name in ("Sample", "Line")]
     if not all(one > 0 for one in sums):
         raise state.error("summing is positive", "m_detectorSampleSumming")
-    column = (sample[0] + sample[1] * state.number("m_samplePp", 0.0) + centre[1]
-              - state.number("m_startingDetectorSample", 0.0)) / sums[0]  # fmt: skip
-    row = (line[0] + line[2] * state.number("m_linePp", 0.0) + centre[0]
-           - state.number("m_startingDetectorLine", 0.0)) / sums[1]  # fmt: skip
+    column = (
+        sample[0]
+        + sample[1] * state.number("m_samplePp", 0.0)
+        + centre[1]
+        - state.number("m_startingDetectorSample", 0.0)
+    ) / sums[0]
+    row = (
+        line[0] + line[2] * state.number("m_linePp", 0.0) + centre[0] - state.number("m_startingDetectorLine", 0.0)
+    ) / sums[1]
     pitch_x, pitch_y = sums[0] / sample[1], sums[1] / line[2]
     interior = Interior(
         width, height, focal, pitch_x, pitch_y, x0=(column - width / 2) * pitch_x, y0=(height / 2 - row) * pitch_y
@@ -65,7 +75,7 @@ def read_frame(state: StateFields) -> FrameCamera:
     turn = rotations_of_quaternions(values[None, 3:], scalar="last")[0]
     return FrameCamera.from_geocentric(
         interior, values[:3], _OURS_FROM_THEIRS @ turn.T, heights=heights_below(values[:3], state.heights(HEIGHTS))
-    )  # fmt: skip
+    )
 
 
 def frame_fields(model: FrameCamera) -> dict[str, Any]:
@@ -78,26 +88,47 @@ def frame_fields(model: FrameCamera) -> dict[str, Any]:
     row = interior.height / 2 - interior.y0 / interior.pitch_y
     quaternion = Rotation.from_matrix((_OURS_FROM_THEIRS @ turn).T).as_quat()
     return {
-        "m_nSamples": interior.width, "m_nLines": interior.height, "m_focalLength": interior.focal_length,
+        "m_nSamples": interior.width,
+        "m_nLines": interior.height,
+        "m_focalLength": interior.focal_length,
         "m_currentParameterValue": [*place.tolist(), *quaternion.tolist()],
-        "m_currentParameterCovariance": np.zeros(49).tolist(), "m_noAdjustments": [0.0] * 7,
-        "m_ccdCenter": [row, column], "m_samplePp": 0.0, "m_linePp": 0.0,
-        "m_iTransS": [0.0, 1 / interior.pitch_x, 0.0], "m_iTransL": [0.0, 0.0, 1 / interior.pitch_y],
-        "m_transX": [0.0, interior.pitch_x, 0.0], "m_transY": [0.0, 0.0, interior.pitch_y],
-        "m_detectorSampleSumming": 1.0, "m_detectorLineSumming": 1.0, "m_startingDetectorSample": 0.0,
-        "m_startingDetectorLine": 0.0, "m_distortionType": 0, "m_opticalDistCoeffs": [0.0, 0.0, 0.0],
-        "m_majorAxis": SEMI_MAJOR, "m_minorAxis": SEMI_MAJOR * float(np.sqrt(1 - ECCENTRICITY_SQUARED)),
-        "m_minElevation": model.heights[0], "m_maxElevation": model.heights[1],
-        "m_referencePointXyz": geocentric(_below(model))[0].tolist(), "m_spacecraftVelocity": [0.0] * 3,
-        "m_sunPosition": [0.0] * 3, "m_pixelPitch": interior.pitch_x, "m_imageIdentifier": "",
-        "m_collectionIdentifier": "", "m_platformIdentifier": "", "m_sensorIdentifier": "",
-        "m_trajectoryIdentifier": "",
-        "m_dateTime": "", "m_epsilon": 1e-9, "m_boresight": [0.0, 0.0, 1.0], "m_originalHalfLines": interior.height / 2,
-        "m_originalHalfSamples": interior.width / 2, "m_zDirection": 1.0,
+        "m_currentParameterCovariance": np.zeros(49).tolist(),
+        "m_noAdjustments": [0.0] * 7,
+        "m_ccdCenter": [row, column],
+        "m_samplePp": 0.0,
+        "m_linePp": 0.0,
+        "m_iTransS": [0.0, 1 / interior.pitch_x, 0.0],
+        "m_iTransL": [0.0, 0.0, 1 / interior.pitch_y],
+        "m_transX": [0.0, interior.pitch_x, 0.0],
+        "m_transY": [0.0, 0.0, interior.pitch_y],
+        "m_detectorSampleSumming": 1.0,
+        "m_detectorLineSumming": 1.0,
+        "m_startingDetectorSample": 0.0,
+        "m_startingDetectorLine": 0.0,
+        "m_distortionType": 0,
+        "m_opticalDistCoeffs": [0.0, 0.0, 0.0],
+        "m_majorAxis": SEMI_MAJOR,
+        "m_minorAxis": SEMI_MAJOR * float(np.sqrt(1 - ECCENTRICITY_SQUARED)),
+        "m_minElevation": model.heights[0],
+        "m_maxElevation": model.heights[1],
+        "m_referencePointXyz": geocentric(_below(model))[0].tolist(),
+        "m_spacecraftVelocity": [0.0] * 3,
+        "m_sunPosition": [0.0] * 3,
+        "m_pixelPitch": interior.pitch_x,
+        **dict.fromkeys(_IDENTIFIERS, ""),
+        "m_epsilon": 1e-9,
+        "m_boresight": [0.0, 0.0, 1.0],
+        "m_originalHalfLines": interior.height / 2,
+        "m_originalHalfSamples": interior.width / 2,
+        "m_zDirection": 1.0,
         "m_ifov": interior.pitch_x / interior.focal_length,
-        "m_instrumentID": "", "m_spacecraftName": "", "m_targetName": "EARTH", "m_lineTimes": [], "m_lineJitter": [],
+        "m_instrumentID": "",
+        "m_spacecraftName": "",
+        "m_targetName": "EARTH",
+        "m_lineTimes": [],
+        "m_lineJitter": [],
         "m_sampleJitter": [],
-    }  # fmt: skip
+    }
 
 
 def _orientation(model: FrameCamera) -> tuple[Array, Array]:

@@ -60,8 +60,13 @@ DISAGREEMENT = 1.0
 @hookimpl
 def ortho_sensors() -> Iterable[Sensor]:
     """Offer the sensor ``ikonos``."""
-    yield Sensor("ikonos", "IKONOS Geo products (po_* with metadata.txt, with or without RPC)", recognises, open_scene,
-                 options=OPTIONS)  # fmt: skip
+    yield Sensor(
+        "ikonos",
+        "IKONOS Geo products (po_* with metadata.txt, with or without RPC)",
+        recognises,
+        open_scene,
+        options=OPTIONS,
+    )
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
@@ -89,9 +94,11 @@ def open_scene(
     image = OrderImage.of(path)
     if image is None and (metadata is None or bands != "one"):
         raise InputError(
-            "this is not a name of an image of an order", file=path, field="metadata",
+            "this is not a name of an image of an order",
+            file=path,
+            field="metadata",
             remedy="name it po_<order>_<band>_<component of 7 digits>.tif, or give the option metadata=FILE",
-        )  # fmt: skip
+        )
     delivery = read_metadata(metadata or (image.metadata if image else ""))
     component = delivery.component(image.component if image else None)
     source = delivery.source_of(component)
@@ -106,14 +113,7 @@ def open_scene(
     pieces, broken = _pieces(image, delivery, component, position, first == "rpc") if image else ((), [])
     contradiction = _disagreement(models)
     if contradiction and vendor is not None and rpc is None and geometry is None:
-        raise InputError(
-            contradiction[0], file=vendor[1], field="rpc",
-            remedy=Text(
-                "choose one: the RPC with ", Setting("scene.rpc", "tag"), ", ", Setting("scene.rpc", "sidecar"),
-                " or ", Setting("scene.rpc", "FILE"), ", or the metadata with ",
-                Setting("scene.sensor_options", "geo", key="geometry")
-            ),
-        )  # fmt: skip
+        raise _undecided(contradiction[0], vendor[1])
     return Scene(
         sensor="ikonos",
         path=path,
@@ -156,9 +156,15 @@ def _lacking(position: Position, source: SourceImage) -> list[str]:
 
 def _plane(dataset: gdal.Dataset, position: Position, source: SourceImage, heights: tuple[float, float]) -> MapPlane:
     return MapPlane.from_view(
-        position.crs, position.corner, position.pixel, (dataset.RasterXSize, dataset.RasterYSize),
-        position.reference_height, math.radians(source.azimuth), math.radians(source.elevation), heights,
-    )  # fmt: skip
+        position.crs,
+        position.corner,
+        position.pixel,
+        (dataset.RasterXSize, dataset.RasterYSize),
+        position.reference_height,
+        math.radians(source.azimuth),
+        math.radians(source.elevation),
+        heights,
+    )
 
 
 def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[float, float]:
@@ -189,13 +195,17 @@ def _first(
         )
     if first not in models:
         raise InputError(
-            f"there is no plane of Reference Height without {'; '.join(lacking)}", file=file,
+            f"there is no plane of Reference Height without {'; '.join(lacking)}",
+            file=file,
             field=f"component {component.component}: {lacking[0]}",
             remedy=Text(
-                "give the whole metadata file, an RPC (", Setting("scene.rpc"), "), or fit a model to points (",
-                Setting("points.fit_model"), ")"
+                "give the whole metadata file, an RPC (",
+                Setting("scene.rpc"),
+                "), or fit a model to points (",
+                Setting("points.fit_model"),
+                ")",
             ),
-        )  # fmt: skip
+        )
     return first
 
 
@@ -263,6 +273,25 @@ def _disagreement(models: dict[str, SensorModel]) -> list[Notice]:
     apart = f"{off:.1f} px" if math.isfinite(off) else "the whole scene"
     text = f"RPC and metadata differ by {apart} at Reference Height: one of them belongs to another image"
     return [Notice("metadata-contradict", text, difference_px=off)]
+
+
+def _undecided(contradiction: str, file: str) -> InputError:
+    """Return the error where nothing says which of RPC and metadata is right."""
+    return InputError(
+        contradiction,
+        file=file,
+        field="rpc",
+        remedy=Text(
+            "choose one: the RPC with ",
+            Setting("scene.rpc", "tag"),
+            ", ",
+            Setting("scene.rpc", "sidecar"),
+            " or ",
+            Setting("scene.rpc", "FILE"),
+            ", or the metadata with ",
+            Setting("scene.sensor_options", "geo", key="geometry"),
+        ),
+    )
 
 
 def _facts(
