@@ -53,7 +53,7 @@ class _Nodata(click.ParamType):  # type: ignore[type-arg]
         except ValueError:
             self.fail(f"{value!r} is not a number (or nan).", param, ctx)
         if math.isinf(number):
-            self.fail("infinity is not a value for nodata.", param, ctx)
+            self.fail("nodata cannot be infinite.", param, ctx)
         return "nan" if math.isnan(number) else number
 
 
@@ -88,9 +88,9 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
 def _help(option: Option) -> str | None:
     text = with_flags(option.help, FLAGS)
     if option.kind in ("integers", "files", "folders", "keys"):
-        text = f"{text.removesuffix('.')}; may be repeated."
+        text = f"{text} May be repeated."
     if option.unset:
-        text = f"{text.removesuffix('.')}  [default: {option.unset}]".strip()
+        text = f"{text}  [default: {option.unset}]"
     return text or None
 
 
@@ -172,7 +172,7 @@ def _keys(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> dict[s
         if not equals or not key:
             raise click.BadParameter(f"{text!r} is not KEY=VALUE")
         if key in found:
-            raise click.BadParameter("one key is given twice")
+            raise click.BadParameter(f"the key {key!r} is given twice")
         found[key] = value
     return found
 
@@ -237,7 +237,7 @@ def _scenes(
                 continue
             elif not equals:
                 raise InputError(
-                    f"{text} is said of one image, and there are {len(images)}",
+                    f"it is not clear to which of the {len(images)} images {text} belongs",
                     field=f"scene.{field}",
                     remedy=Text("name the image: ", Setting(f"scene.{field}", f"{Path(images[0]).name}={text}")),
                 )
@@ -248,8 +248,8 @@ def _scenes(
 
 
 _OF_IMAGES = ("sensor", "sensor_options", "allow_network", "roots")
-_RPC_OF_EACH = "Which RPC: 'tag' or 'sidecar' of all images, or a file of one; may be repeated."
-_OFFSET_OF_EACH = "First pixel of an image in the one that its model belongs to, where it is a crop; may be repeated."
+_RPC_OF_EACH = "Which RPC to use: 'tag' or 'sidecar' for all images, or a file for one. May be repeated."
+_OFFSET_OF_EACH = "If an image is a crop: position of its first pixel in the full image. May be repeated."
 #: All options of a scene, as `SceneOptions`.
 scene_options = _grouped("scene", SceneOptions)
 #: The same for the images of a block, where a saved model cannot take the place of all.
@@ -277,9 +277,7 @@ output_options = _grouped("output", OutputOptions)
 #: The file says which format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 
-dry_run_option = click.option(
-    "--dry-run", is_flag=True, help="Open and check everything, say what would be made, and make nothing."
-)
+dry_run_option = click.option("--dry-run", is_flag=True, help="Check all inputs and show the plan; write nothing.")
 #: The argument IMAGE.
 image_argument = click.argument("image", type=click.Path())
 #: One or several images.
@@ -290,7 +288,9 @@ def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
     """Return the name of a folder; that of a raster would become a folder by mistake."""
     stem, ending = os.path.splitext(text)
     if ending.lower() in (".tif", ".tiff", ".vrt", ".jp2") and not os.path.isdir(text):
-        raise click.BadParameter(f"{text!r} names a file, and outputs go to a folder; did you mean '-o {stem}'?")
+        raise click.BadParameter(
+            f"Outputs need a folder, but {text!r} is the name of a file; did you mean '-o {stem}'?"
+        )
     return text
 
 

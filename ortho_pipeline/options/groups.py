@@ -14,40 +14,40 @@ from ortho_pipeline.options.texts import Setting, Text
 @documented
 @dataclass(frozen=True)
 class SceneOptions:
-    """How the image is opened."""
+    """How to open the image."""
 
     sensor: Annotated[
         str | None,
-        Option("--sensor", "Sensor of the image (see 'ortho sensors').", "NAME"),
+        Option("--sensor", "Sensor of the image; 'ortho sensors' lists them.", "NAME"),
     ] = None
     rpc: Annotated[
         str | None,
-        Option("--rpc", "Which RPC, where there are several, or an RPC file.", "tag|sidecar|FILE"),
+        Option("--rpc", "Which RPC to use, if there are several, or an RPC file.", "tag|sidecar|FILE"),
     ] = None
     model: Annotated[
-        PathLike | None, Option("--model", "A saved *_model.json in place of the image's model.", kind="file")
+        PathLike | None, Option("--model", "Use this saved *_model.json instead of the image's own model.", kind="file")
     ] = None
     crop_offset: Annotated[
         Sequence[float] | None,
         Option(
             "--crop-offset",
-            "First pixel of this image in the one that its model belongs to, where it is a crop.",
+            "If the image is a crop: position of its first pixel in the full image.",
             "COL,ROW",
             kind="pair",
         ),
     ] = None
     sensor_options: Annotated[
         Mapping[str, str],
-        Option("--sensor-option", "Option of the sensor (see 'ortho sensors').", "K=V", kind="keys"),
+        Option("--sensor-option", "Option of the sensor; 'ortho sensors' lists them.", "K=V", kind="keys"),
     ] = field(default_factory=dict)
     allow_network: Annotated[
-        bool, Option("--allow-network", "Open URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
+        bool, Option("--allow-network", "Allow URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
     ] = False
     roots: Annotated[
         Sequence[PathLike],
         Option(
             "--root",
-            "A folder that files may lead to (a VRT), besides their own.",
+            "Also allow files in this folder, for example the sources of a VRT.",
             "DIR",
             kind="folders",
             in_file=False,
@@ -86,32 +86,34 @@ _MOST_MATCHES = 100_000
 _VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
 _PIXEL_ORIGIN = Option(
     "--pixel-origin",
-    "What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner or its "
-    "centre (1, 1).",
+    "What (0, 0) is in CSV, ODM and link files: the outer corner or the centre of the first pixel. With -1, that "
+    "place is (1, 1).",
     choices=tuple(PIXEL_ORIGINS),
 )
-_CHECK = Option("--check", "Points that check and do not control.", "every:N|ids:A,B")
-_MODEL_CRS = "Ground of fitted models: geocentric, geographic, utm or EPSG:n."
+_CHECK = Option("--check", "Reserve these points as check points: every Nth, or by id.", "every:N|ids:A,B")
+_MODEL_CRS = "Ground CRS of fitted models: geocentric, geographic, utm or EPSG:n."
 
 
 @documented
 @dataclass(frozen=True)
 class PointOptions:
-    """Which points there are, and what is adjusted to them.
+    """Points, and what to adjust to them.
 
-    `gcps` may be points that are read already, in pixels of this image, too.
+    `gcps` may also be a table of points that is already read, in pixels of this image.
     """
 
     gcps: Annotated[
         PathLike | PointTable | None,
         Option(
             "--gcps",
-            "Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, ArcGIS link table; or 'own' "
-            "for those in the image.",
+            "Points file: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp or ArcGIS link table. "
+            "'own' takes the GCPs stored in the image.",
             "FILE|own",
         ),
     ] = None
-    crs: Annotated[str | None, Option("--points-crs", "CRS of the points, where their file has none.", "CRS")] = None
+    crs: Annotated[str | None, Option("--points-crs", "CRS of the points, if their file does not state it.", "CRS")] = (
+        None
+    )
     vertical: Annotated[
         str | None, Option("--points-vertical", f"Height datum of the points: {_VERTICAL_FORMS}.", "DATUM")
     ] = None
@@ -121,7 +123,7 @@ class PointOptions:
         str | None,
         Option(
             "--select",
-            "Points that control: N well spread, N of one region, these, or N at random; all others check.",
+            "Points to use as control: N well spread, N of one region, by id, or N at random. All others check.",
             "even:N|cluster:N|ids:A,B|random:N:SEED",
         ),
     ] = None
@@ -129,8 +131,8 @@ class PointOptions:
         str | None,
         Option(
             "--correction",
-            "What is adjusted: the image points, or the parameters of the model itself, such as the exterior "
-            "orientation of a frame.",
+            "What to adjust: the image coordinates (shift, shift-drift, affine), or the model's own parameters "
+            "(model), such as the exterior orientation of a frame.",
             unset="shift if there are control points",
             choices=CORRECTIONS,
         ),
@@ -139,28 +141,33 @@ class PointOptions:
         str | None,
         Option(
             "--fit-model",
-            "Fit a model from the points alone (see 'ortho models'), in place of the image's own.",
+            "Fit this model to the points instead of using the image's own; 'ortho models' lists them.",
             "NAME",
         ),
     ] = None
-    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="that of the points")] = None
+    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="CRS of the points")] = None
     prune: Annotated[bool, Option("--prune", "Remove parameters that the points do not justify.")] = False
-    params: Annotated[str | None, Option("--params", "Adjust these parameters only.", "A,B,C", unset="all")] = None
+    params: Annotated[str | None, Option("--params", "Adjust only these parameters.", "A,B,C", unset="all")] = None
     significance: Annotated[
         float,
         Option(
-            "--significance", "Above this chance (p) a parameter is not justified.", kind="number", above=0, below=1
+            "--significance",
+            "Significance level: a parameter with a larger p is not justified.",
+            "P",
+            kind="number",
+            above=0,
+            below=1,
         ),
     ] = 0.05
     ridge: Annotated[
         str,
-        Option("--ridge", "Regularisation of fitted models: found, or of this weight.", "auto|none|gcv|lcurve|W"),
+        Option("--ridge", "Regularisation of fitted models: a method, or a weight W.", "auto|none|gcv|lcurve|W"),
     ] = "auto"
     near: Annotated[
         float | None,
         Option(
             "--near",
-            "Points closer than this are neighbours in the analysis of residuals.",
+            "Analysis of residuals: points closer than this are neighbours.",
             "M",
             kind="number",
             above=0,
@@ -245,14 +252,14 @@ class BlockOptions:
 @documented
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Where heights come from: a DEM, or one ellipsoidal height in metres."""
+    """Where the heights come from: a DEM, or one ellipsoidal height in metres."""
 
     dem: Annotated[
         PathLike | None,
         Option(
             "--dem",
-            "Digital elevation model: a file, a pattern of the files that make one, a STAC item or "
-            "collection, or 'auto' for the cells of the Copernicus DEM under the scene.",
+            "DEM: a file, a pattern of files, or a STAC item or collection. 'auto' takes the cells of the Copernicus "
+            "DEM under the scene.",
             "FILE|URL|auto",
         ),
     ] = None
@@ -263,24 +270,27 @@ class SurfaceOptions:
         bool,
         Option(
             "--override-dem-vertical",
-            Text("Believe ", Setting("surface.vertical"), " even where the DEM declares another datum."),
+            Text("Use ", Setting("surface.vertical"), " even if the DEM declares another datum."),
         ),
     ] = False
     fill: Annotated[
         str,
         Option(
             "--dem-fill",
-            "Where the DEM has no height: stop, leave pixels out, take the nearest, or an ellipsoidal height.",
+            "Gaps in the DEM: stop with an error, mask the pixels, take the nearest height, or ellipsoidal height M.",
             "error|mask|nearest|M",
             kind="number or word",
         ),
     ] = "error"
-    height: Annotated[float | None, Option("--height", "One ellipsoidal height, no DEM.", "M", kind="number")] = None
+    height: Annotated[
+        float | None,
+        Option("--height", "Flat ground at this ellipsoidal height, instead of a DEM.", "M", kind="number"),
+    ] = None
     sigma: Annotated[
         float | PathLike | None,
         Option(
             "--dem-sigma",
-            "Standard deviation of the heights, metres: a number or a raster, such as Copernicus' HEM.",
+            "Accuracy of the heights (standard deviation): a number, or a raster such as Copernicus' HEM.",
             "M|FILE",
             kind="number or word",
             unset="unknown",
@@ -293,10 +303,10 @@ class SurfaceOptions:
             Text(
                 "Where ",
                 Setting("surface.dem", "auto"),
-                " finds cells: a folder of them, or an address (https, s3, gs, az).",
+                " looks for cells: a folder, or an address (https, s3, gs, az).",
             ),
             "DIR|URL",
-            unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
+            unset="environment variable ORTHO_DEM_SOURCE, else the public bucket",
         ),
     ] = None
 
@@ -304,13 +314,13 @@ class SurfaceOptions:
 @documented
 @dataclass(frozen=True)
 class MatchOptions:
-    """Control points without hands: the scene is matched with reference orthoimages."""
+    """Automatic control points: the scene is matched with reference orthoimages."""
 
     reference: Annotated[
         Sequence[PathLike],
         Option(
             "--reference",
-            "Orthoimages to take control points from by matching; where several show a place, the first.",
+            "Orthoimages to match for control points. Where several overlap, the first is used.",
             "ORTHO[,...]",
             kind="files",
         ),
@@ -319,7 +329,7 @@ class MatchOptions:
         Sequence[int] | None,
         Option(
             "--reference-bands",
-            "Bands of the reference to compare, from 1.",
+            "Bands of the reference to match, numbered from 1.",
             "N[,...]",
             kind="integers",
             above=0,
@@ -330,30 +340,30 @@ class MatchOptions:
         float | None,
         Option(
             "--search",
-            "How far the image's model may be off on the ground.",
+            "Search radius on the ground: the largest expected error of the image's model.",
             "M",
             kind="number",
             above=0,
-            unset="three times the accuracy that the scene states, else 100",
+            unset="three times the accuracy that the metadata state, else 100",
         ),
     ] = None
     search_rotation: Annotated[
         float | None,
         Option(
             "--search-rotation",
-            "How far the image's model may be turned (degrees; 180 for any angle).",
+            "Largest expected rotation of the image's model, in degrees; 180 for any.",
             "DEG",
             kind="number",
             above=0,
             below=180.001,
-            unset="5 where the model comes from metadata on orbit or attitude, else none",
+            unset="5 if the model comes from orbit or attitude metadata, else 0",
         ),
     ] = None
     points: Annotated[
         int,
         Option(
             "--match-points",
-            "About how many matches are wanted.",
+            "Approximate number of matches.",
             "N",
             kind="integer",
             above=0,
@@ -364,7 +374,7 @@ class MatchOptions:
         float | None,
         Option(
             "--reference-sigma",
-            "Standard deviation of where the reference lies as a whole, in each axis.",
+            "Accuracy of the reference: standard deviation of its position, per axis.",
             "M",
             kind="number",
             above=0,
@@ -374,7 +384,7 @@ class MatchOptions:
         str,
         Option(
             "--gcps-as",
-            Text("What ", Setting("points.gcps"), " are beside matches: a test that takes no part, or control too."),
+            Text("Use of ", Setting("points.gcps"), " when matching: only as check points, or also as control."),
             choices=("check", "control"),
         ),
     ] = "check"

@@ -13,17 +13,19 @@ from ortho_pipeline.options.texts import Setting, Text
 @documented
 @dataclass(frozen=True)
 class OutputOptions:
-    """Form of the ortho, and how it is computed.
+    """Form of the ortho, and how to compute it.
 
     `memory` is in bytes.
     """
 
-    crs: Annotated[str | None, Option("--output-crs -t_srs", metavar="CRS", unset="the UTM zone of the scene")] = None
+    crs: Annotated[
+        str | None, Option("--output-crs -t_srs", "CRS of the ortho.", "CRS", unset="the UTM zone of the scene")
+    ] = None
     resolution: Annotated[
         float | Sequence[float] | None,
         Option(
             "--resolution -tr",
-            "Pixel size in units of the output CRS.",
+            "Pixel size, in units of the output CRS.",
             "X [Y]",
             unset="the ground sample distance",
             kind="one or two",
@@ -34,7 +36,7 @@ class OutputOptions:
         Sequence[float] | None,
         Option(
             "--extent -te",
-            "Bounds of the ortho, taken as they are.",
+            "Bounds of the ortho, used exactly.",
             "XMIN YMIN XMAX YMAX",
             kind="box",
             unset="the scene's footprint",
@@ -44,20 +46,20 @@ class OutputOptions:
         PathLike | None,
         Option(
             "--like",
-            "Take CRS, resolution and extent from this raster, so that pixels fall on pixels.",
+            "Take CRS, resolution and extent from this raster, so that pixels coincide.",
             "RASTER",
             kind="file",
         ),
     ] = None
     align: Annotated[
-        bool, Option("--align -tap", Text("Widen ", Setting("output.extent"), " to whole multiples of the resolution."))
+        bool, Option("--align -tap", Text("Widen ", Setting("output.extent"), " to multiples of the resolution."))
     ] = False
-    resampling: Annotated[str, Option("--resampling -r", choices=RESAMPLING)] = "bilinear"
+    resampling: Annotated[str, Option("--resampling -r", "Resampling method.", choices=RESAMPLING)] = "bilinear"
     bands: Annotated[
         Sequence[int] | None,
         Option(
             "--band -b",
-            "Only these bands of the image, from 1, in this order.",
+            "Bands of the image to use, numbered from 1, in this order.",
             "N[,...]",
             unset="all",
             kind="integers",
@@ -68,9 +70,9 @@ class OutputOptions:
         str | None,
         Option(
             "--output-type -ot",
-            "Type of the pixels; values beyond its range are clamped.",
+            "Pixel type; values outside its range are clamped.",
             "|".join(PIXEL_TYPES),
-            unset="that of the image",
+            unset="type of the image",
             choices=PIXEL_TYPES,
         ),
     ] = None
@@ -78,24 +80,24 @@ class OutputOptions:
         float | str | None,
         Option(
             "--nodata -dstnodata",
-            "Value of pixels without an image.",
+            "Pixel value outside the image.",
             "VALUE",
             kind="number or nan",
-            unset="that of the image, or a mask",
+            unset="nodata of the image, else a mask",
         ),
     ] = None
     dem_interpolation: Annotated[
-        str, Option("--dem-interpolation", "Between the samples of the DEM.", choices=("bilinear", "cubic"))
+        str, Option("--dem-interpolation", "Interpolation between samples of the DEM.", choices=("bilinear", "cubic"))
     ] = "bilinear"
-    format: Annotated[str, Option("--format -of", choices=("COG", "GTiff"))] = "COG"
+    format: Annotated[str, Option("--format -of", "Format of the ortho.", choices=("COG", "GTiff"))] = "COG"
     creation_options: Annotated[
-        Mapping[str, str], Option("--creation-option -co", "Option of GDAL's driver.", "K=V", kind="keys")
+        Mapping[str, str], Option("--creation-option -co", "Creation option of the GDAL driver.", "K=V", kind="keys")
     ] = field(default_factory=dict)
     engine: Annotated[
         str,
         Option(
             "--engine",
-            "Our warper, or GDAL's with its own transformers, exactly (slow; for comparison).",
+            "Our warper, or GDAL's with its exact transformers (slow; for comparison).",
             choices=("ortho", "gdal"),
         ),
     ] = "ortho"
@@ -103,27 +105,30 @@ class OutputOptions:
         int,
         Option(
             "--memory -wm",
-            "Bound on windows and caches; or with a unit, such as 2GB.",
+            "Memory for windows and caches, in MB or with a unit, such as 2GB.",
             "MB",
             kind="bytes",
             in_file=False,
         ),
     ] = 512_000_000
     threads: Annotated[
-        int | None, Option("--threads", unset="all processors", kind="integer", above=0, in_file=False)
+        int | None,
+        Option("--threads", "Number of threads.", "N", unset="all processors", kind="integer", above=0, in_file=False),
     ] = None
     tolerance: Annotated[
         float,
-        Option("--tolerance", "Bound on the warper's geometric error, in source pixels.", "PX", kind="number", above=0),
+        Option(
+            "--tolerance", "Largest geometric error of the warp, in pixels of the image.", "PX", kind="number", above=0
+        ),
     ] = 0.01
     accuracy_raster: Annotated[
         bool,
         Option(
             "--accuracy-raster",
             Text(
-                "Write a raster of how accurate the ortho is at each place; ",
+                "Also write a raster of the accuracy at each place. State the accuracy of the heights with ",
                 Setting("surface.sigma"),
-                " says how good the heights are.",
+                ".",
             ),
         ),
     ] = False
@@ -131,8 +136,8 @@ class OutputOptions:
         str | None,
         Option(
             "--visibility",
-            "Look for ground that other terrain hides: write a mask of it, or leave its pixels empty "
-            "(with a surface model a true ortho).",
+            "Find ground that other terrain hides: write a mask of it, or leave its pixels empty. With a DSM, the "
+            "latter gives a true ortho.",
             choices=("mask", "nodata"),
         ),
     ] = None
@@ -140,7 +145,9 @@ class OutputOptions:
         PathLike | None,
         Option(
             "--fill-from",
-            Text("Fill what ", Setting("output.visibility"), " leaves empty from this ortho, on any grid."),
+            Text(
+                "Fill the pixels that ", Setting("output.visibility", "nodata"), " empties from this ortho (any grid)."
+            ),
             "ORTHO",
             kind="file",
         ),
@@ -149,37 +156,37 @@ class OutputOptions:
         bool,
         Option(
             "--angles",
-            "Write angles of view at each place and, where the sun is known, of the sun, and which pixels "
-            "lie in shadow.",
+            "Also write the view angles at each place. If the position of the sun is known, also its angles and "
+            "the shadows.",
         ),
     ] = False
     sun: Annotated[
         Sequence[float] | None,
         Option(
             "--sun",
-            Text("Azimuth and elevation of the sun, degrees, for ", Setting("output.angles"), "."),
+            Text("Azimuth and elevation of the sun in degrees, for ", Setting("output.angles"), "."),
             "AZ,EL",
             kind="pair",
-            unset="that of the metadata",
+            unset="from the metadata",
         ),
     ] = None
     layer_step: Annotated[
         int,
         Option(
             "--layer-step",
-            "Pixels of the ortho to one of the layers of accuracy and angles.",
+            "Pixel size of the layers of accuracy and angles, in pixels of the ortho.",
             "N",
             kind="integer",
             above=0,
         ),
     ] = 16
-    stac: Annotated[bool, Option("--stac", "Write a STAC item of the ortho too.")] = False
+    stac: Annotated[bool, Option("--stac", "Also write a STAC item.")] = False
     acquired: Annotated[
-        str | None, Option("--acquired", "Time of acquisition (RFC 3339), where the metadata have none.", "TIME")
+        str | None, Option("--acquired", "Time of acquisition (RFC 3339), if the metadata do not state it.", "TIME")
     ] = None
 
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:
-        """Rasters besides the image that an ortho is made with, by what they are."""
+        """Rasters that an ortho is made with, apart from the image, by role."""
         given = {"other ortho": self.fill_from, "grid": self.like}
         return {role: path for role, path in given.items() if path is not None}
