@@ -178,16 +178,16 @@ class PointOptions:
 @documented
 @dataclass(frozen=True)
 class BlockOptions:
-    """Which points of a block there are, and what is adjusted to them.
+    """Points of a block, and what to adjust to them.
 
-    `model` is a name among the models of each scene, or a family that is fitted to the control points of each image.
+    `model` names a model of each scene, or a family to fit to the control points of each image.
     """
 
     points: Annotated[
         PathLike | None,
         Option(
             "--points",
-            "Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
+            "Image points: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
             "FILE",
         ),
     ] = None
@@ -195,16 +195,18 @@ class BlockOptions:
         str | None,
         Option(
             "--ties",
-            Text("Find tie points between the images by matching, besides those of ", Setting("points.points"), "."),
+            Text("Find tie points by matching the images, in addition to those of ", Setting("points.points"), "."),
             choices=("auto",),
         ),
     ] = None
     gcps: Annotated[
-        PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
+        PathLike | None, Option("--gcps", "Ground coordinates of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
     ] = None
-    crs: Annotated[str | None, Option("--points-crs", "CRS of the ground, where its file has none.", "CRS")] = None
+    crs: Annotated[
+        str | None, Option("--points-crs", "CRS of the ground coordinates, if their file does not state it.", "CRS")
+    ] = None
     vertical: Annotated[
-        str | None, Option("--points-vertical", f"Height datum of the ground: {_VERTICAL_FORMS}.", "DATUM")
+        str | None, Option("--points-vertical", f"Height datum of the ground coordinates: {_VERTICAL_FORMS}.", "DATUM")
     ] = None
     pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
     check: Annotated[str | None, _CHECK] = None
@@ -212,7 +214,7 @@ class BlockOptions:
         str | None,
         Option(
             "--model",
-            "One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models').",
+            "A model of the images, such as rpc or pushbroom, or one to fit to points; 'ortho models' lists these.",
             "NAME",
             unset="the images' best",
         ),
@@ -221,8 +223,8 @@ class BlockOptions:
         str | None,
         Option(
             "--correction",
-            "What is adjusted: the image points, or the parameters of the model itself.",
-            unset="the model's own if it has any, else a shift",
+            "What to adjust: the image coordinates (shift, shift-drift, affine), or the model's own parameters (model).",
+            unset="the model's own parameters if it has any, else a shift",
             choices=CORRECTIONS,
         ),
     ] = None
@@ -230,7 +232,7 @@ class BlockOptions:
         str | None,
         Option(
             "--ground-sigma",
-            "Sigmas (m) in plan and height of ground that states none in the points file.",
+            "Standard deviations (m) in plan and height of ground coordinates whose file states none.",
             "XY[,H]",
             unset="estimated",
         ),
@@ -240,11 +242,11 @@ class BlockOptions:
         float | None,
         Option(
             "--hold",
-            "Hold the orientation at its start values with this sigma.",
+            "Keep the orientation near its start values, with this sigma.",
             "PX",
             kind="number",
             above=0,
-            unset="10 where nothing else gives a datum",
+            unset="10 if nothing else defines the datum",
         ),
     ] = None
 
