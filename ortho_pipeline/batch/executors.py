@@ -324,7 +324,9 @@ def dask_executor(scheduler: str) -> Any:
         from distributed import Client
     except ImportError as error:
         raise InputError(
-            "dask is not installed", field="scheduler", remedy="pip install 'ortho-pipeline[dask]'"
+            "dask is not installed",
+            field="scheduler",
+            remedy="run pip install '.[dask]' in the checkout of ortho-pipeline",
         ) from error
     try:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)

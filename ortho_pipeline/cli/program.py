@@ -143,7 +143,7 @@ class _Commands(click.Group):
             missing = _without_gdal()
             return self._fail(ctx, missing or _fault(error), CORRECTABLE if missing else FAILED)
         except MemoryError as error:
-            short = OrthoError("there is not enough memory", remedy="give less work at once (--memory MB, --threads 1)")
+            short = OrthoError("not enough memory", remedy="reduce --memory, and use --threads 1")
             short.__cause__ = error
             return self._fail(ctx, short, FAILED)
         except click.UsageError as error:
@@ -185,7 +185,7 @@ def _fault(error: BaseException) -> OrthoError:
     """Return an error that nobody foresaw as one that people can report."""
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
-        remedy="this is a fault of ortho-pipeline: run it again with --debug and report the traceback",
+        remedy="this is a bug in ortho-pipeline; run the command again with --debug and report the traceback",
     )
     fault.__cause__ = error
     return fault
@@ -197,8 +197,8 @@ def _without_gdal() -> InputError | None:
         importlib.import_module("osgeo.gdal_array")
     except ImportError as problem:
         missing = InputError(
-            f"GDAL's Python bindings cannot be loaded ({problem})",
-            remedy='pip install "ortho-pipeline[wheel]", or build those of your GDAL library (docs/install.md)',
+            f"cannot load the Python bindings of GDAL ({problem})",
+            remedy="run 'make setup' in the checkout of ortho-pipeline (docs/install.md)",
         )
         missing.__cause__ = problem
         return missing

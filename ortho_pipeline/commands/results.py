@@ -243,7 +243,7 @@ def attempted(make: Callable[[], _R], files: dict[str, Path], *of_report: str) -
         for kind in of_report:
             files.pop(kind, None)
         why = f"{type(error).__name__}: {error}".removesuffix(": ")
-        remedy = "this is a fault of ortho-pipeline: please report it with the traceback"
+        remedy = "this is a bug in ortho-pipeline: please report it with the traceback"
         if isinstance(error, OrthoError):
             why, remedy = error.message, error.remedy or remedy
         failure = ReportError(

@@ -29,7 +29,7 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
 
     Columns are those of CSV files: `col` and `row` (px, from the outer corner of the first pixel), `h` (metres above
     the ellipsoid, NaN where it is not given), role and standard deviations, those in plan one by one. The geometry is
-    x, y in the CRS of the points. It needs GeoPandas (``pip install 'ortho-pipeline[geopandas]'``).
+    x, y in the CRS of the points. It needs GeoPandas (the extra ``geopandas``).
 
     Raises
     ------
@@ -42,7 +42,7 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
         raise InputError(
             "a GeoDataFrame needs GeoPandas, which is not installed",
             field="points",
-            remedy="pip install 'ortho-pipeline[geopandas]'",
+            remedy="run pip install '.[geopandas]' in the checkout of ortho-pipeline",
         ) from error
     columns: dict[str, Any] = {
         "id": list(points.ids),

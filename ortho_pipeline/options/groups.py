@@ -131,7 +131,7 @@ class PointOptions:
         str | None,
         Option(
             "--correction",
-            "What to adjust: the image coordinates (shift, shift-drift, affine), or the model's own parameters "
+            "What to adjust: image coordinates (shift, shift-drift, affine), or the parameters of the model "
             "(model), such as the exterior orientation of a frame.",
             unset="shift if there are control points",
             choices=CORRECTIONS,
@@ -223,7 +223,7 @@ class BlockOptions:
         str | None,
         Option(
             "--correction",
-            "What to adjust: the image coordinates (shift, shift-drift, affine), or the model's own parameters (model).",
+            "What to adjust: image coordinates (shift, shift-drift, affine), or the parameters of the model (model).",
             unset="the model's own parameters if it has any, else a shift",
             choices=CORRECTIONS,
         ),

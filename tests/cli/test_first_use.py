@@ -94,7 +94,7 @@ def test_what_is_missing_is_named_with_the_ways_to_get_it(folder):
     for word in ("--dem auto", "--height M", "--gcps FILE", "--reference ORTHO"):
         assert word in said
     (folder / "scene_RPC.TXT").unlink()
-    assert "No image with a model was found" in run("info", folder).stdout
+    assert "No image has a sensor model" in run("info", folder).stdout
 
 
 def test_outputs_are_no_inputs(folder):

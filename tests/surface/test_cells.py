@@ -555,5 +555,5 @@ def test_the_cache_is_listed_verified_and_cleared(bucket: PublicFolder, geoid: s
     verified = runner.invoke(cli, ["cache", "verify", "--json"])
     assert verified.exit_code == 1
     assert json.loads(verified.stdout)["files"][0]["state"] == "of another size"
-    assert "Removed" in runner.invoke(cli, ["cache", "clear"]).stdout
+    assert "Deleted" in runner.invoke(cli, ["cache", "clear"]).stdout
     assert json.loads(runner.invoke(cli, ["cache", "list", "--json"]).stdout)["files"] == []

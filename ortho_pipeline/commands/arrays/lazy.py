@@ -169,7 +169,7 @@ def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
         raise InputError(
             f"lazy arrays need {error.name}, which is not installed",
             field="ortho_array",
-            remedy="pip install 'ortho-pipeline[xarray]'",
+            remedy="run pip install '.[xarray]' in the checkout of ortho-pipeline",
         ) from error
     grid, profile = placed.grid, tiles.profile
     maker = dask.delayed(tiles, traverse=False)
