@@ -37,6 +37,10 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "dem-fill": "The DEM has holes or does not cover the scene, and you accept a substitute there.",
         "dem-source": "The cells of `--dem auto` are in your own folder or bucket.",
         "dem-sigma": "The reported accuracy must include the DEM error, or ties must search further.",
+        "dem-heights": "The DEM must help only to find ties, because it is wrong or much coarser than the images.",
+        "dem-bias": "You know how far all heights of the DEM may be off together.",
+        "dem-correlation": "You know that neighbouring heights of the DEM are off together, and over which distance.",
+        "dem-shift-sigma": "You know how far the DEM may be shifted in plan.",
         "dem-interpolation": "The DEM is so coarse that its facets are visible: then use `cubic`.",
     },
     "Control and check points": {
@@ -56,6 +60,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "units": "You want the table of `compare` in metres.",
         "ground-sigma": "The points file states no accuracy of the ground, and you know it.",
         "hold": "A block has no control, and you know how accurate its delivered orientation is.",
+        "join-limit": "Two images must fit better than 0.5 px, or may fit worse.",
     },
     "Automatic points": {
         "reference": "Control points come from an orthoimage of the same place.",

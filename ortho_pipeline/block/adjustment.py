@@ -22,6 +22,9 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selecti
 from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights.common_heights import CommonHeights
+from ortho_pipeline.block.heights.settling import Heights
+from ortho_pipeline.block.heights.source import DemHeights, started
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
@@ -40,6 +43,7 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import marks_warning
 from ortho_pipeline.runtime.process_limits import one_blas_thread
+from ortho_pipeline.surface.base import Surface
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3
@@ -58,6 +62,7 @@ def adjust(
     robust: bool = True,
     hold: float | None = None,
     exclude: Collection[str] = (),
+    heights: DemHeights | Surface | None = None,
 ) -> BlockFit:
     """Adjust the models of all images and the ground of all points together.
 
@@ -77,6 +82,8 @@ def adjust(
         where no control point and no prior defines the datum, and then 10 px; `BlockFit.gauge` says what did.
     exclude : collection of str
         Ids of points that take no part.
+    heights : DemHeights or Surface, optional
+        A DEM. Its height at each tie, and at each control point without a height, is an observation.
 
     Raises
     ------
@@ -91,7 +98,11 @@ def adjust(
     # Rays of a point beside each other, and points beside those of the same images: memory is read as it lies.
     order = Ordering.of(points, np.ones(points.rays, dtype=bool), points.control).rays
     stated = points.of_rays(order)
-    problem, state, whole = _prepared(chosen, stated, priors or {}, exclude)
+    dem = None if heights is None else DemHeights.of(heights)
+    problem, state, whole = _prepared(chosen, stated, priors or {}, exclude, dem)
+    dem_heights = None if dem is None else Heights.under(dem, problem, state.local)
+    if dem_heights is not None:
+        problem = dem_heights.applied(problem, state.local)
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
@@ -102,14 +113,7 @@ def adjust(
     common = BlockCommonError.of(problem, state, selection)
     if common is not None:
         problem = common.applied(problem)
-    # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
-    tolerance = NEAR if robust and not problem.unstated.any() else EXACT
-    solved = attempt(problem, state, whole, tolerance)
-    held = _held(solved, state, selection, whole) if robust else None
-    _refuse_many_outside(solved if held is None else held, whole)
-    solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
-    if problem.unstated.any():
-        solved = reweighed(solved, inside, estimate(solved), tolerance)
+    solved, inside, dem_heights = _first(problem, state, selection, whole, dem_heights, robust)
     rejected, near = tuple[GrossError, ...](), solved.state
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
@@ -123,11 +127,33 @@ def adjust(
     gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
-    solved, found, common = _weighed(solved, inside, common)
+    solved, found, common, dem_heights = _weighed(solved, inside, common, dem_heights)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
     notes += uncertain_images(solved, stated)
-    return _result(solved, found, common, inside, points, order, chosen, gauge, rejected, notes)
+    return _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
+
+
+def _first(
+    problem: BlockProblem,
+    state: State,
+    selection: Selection,
+    whole: Selection,
+    dem_heights: Heights | None,
+    robust: bool,
+) -> tuple[Solved, Selection, Heights | None]:
+    """Return the solution of everything, what takes part in it, and the heights of the DEM."""
+    # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
+    tolerance = NEAR if robust and not problem.unstated.any() else EXACT
+    solved = attempt(problem, state, whole, tolerance)
+    held = _held(solved, state, selection, whole) if robust else None
+    _refuse_many_outside(solved if held is None else held, whole)
+    solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
+    if dem_heights is not None:
+        solved, dem_heights = dem_heights.settled(solved, inside, tolerance)
+    if problem.unstated.any():
+        solved = reweighed(solved, inside, estimate(solved), tolerance)
+    return solved, inside, dem_heights
 
 
 def _held(solved: Solved, start: State, selection: Selection, whole: Selection) -> Solved | None:
@@ -179,6 +205,7 @@ def _prepared(
     points: BlockPoints,
     priors: Mapping[str, Mapping[str, Prior]],
     exclude: Collection[str],
+    dem: DemHeights | None = None,
 ) -> tuple[BlockProblem, State, Selection]:
     """Return the problem, its start, and what may take part; points whose rays do not meet yet are NaN."""
     frame = frame_of(models, points)
@@ -193,6 +220,8 @@ def _prepared(
     local = meet(frame, models, points, rays)
     problem = BlockProblem(points, models, frame, known, pseudo_of(models, points, priors))
     local = _at_known(problem, local, rays)
+    if dem is not None:
+        local = started(dem, problem, State(models, local), rays)
     seen = rays & np.isfinite(predict(frame, models, points, local)).all(axis=1)
     ground = points.control & takes_part
     nowhere = ~problem.active(Selection.of(seen, ground))
@@ -268,9 +297,9 @@ def _started(problem: BlockProblem, state: State, selection: Selection) -> Block
 
 
 def _weighed(
-    solved: Solved, selection: Selection, common: BlockCommonError | None
-) -> tuple[Solved, Posterior, BlockCommonError | None]:
-    """Return the solution with the sigmas that the observations have, what is known of these, and the common error."""
+    solved: Solved, selection: Selection, common: BlockCommonError | None, dem_heights: Heights | None
+) -> tuple[Solved, Posterior, BlockCommonError | None, Heights | None]:
+    """Return the solution with the sigmas that the observations have, what is known of these, and common errors."""
     if common is not None:
         solved, common = common.settled(solved, selection)
     found = posterior(solved)
@@ -286,7 +315,11 @@ def _weighed(
         before = solved
         solved, common = common.settled(solved, selection)
         found = found if solved is before else posterior(solved)
-    return solved, found, common
+    if dem_heights is not None:
+        before = solved
+        solved, dem_heights = dem_heights.settled(solved, selection)
+        found = found if solved is before else posterior(solved)
+    return solved, found, common, dem_heights
 
 
 def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
@@ -313,6 +346,7 @@ def _result(
     solved: Solved,
     found: Posterior,
     common: BlockCommonError | None,
+    dem_heights: Heights | None,
     selection: Selection,
     points: BlockPoints,
     order: Index,
@@ -338,8 +372,11 @@ def _result(
     object_residuals = problem.frame.apart(known, local)
     used_ground = selection.ground & active
     covariance, of_points = _with_common(covariance, common)
+    covariance, of_heights = _with_common(covariance, None if dem_heights is None else dem_heights.common)
+    taken = None if dem_heights is None else dem_heights.record(solved)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
+    ground_covariance = ground_covariance + of_heights
     doubts = outlying(solved, variances, object_residuals, ground_covariance + apart * of_points, used_ground)
     return BlockFit(
         models=dict(zip(points.images, state.models, strict=True)),
@@ -353,11 +390,7 @@ def _result(
         object_residuals=object_residuals,
         used_rays=used,
         used_ground=used_ground,
-        parameters=tuple(
-            (image, name)
-            for image, model in zip(points.images, state.models, strict=True)
-            for name in model.param_names
-        ),
+        parameters=_parameters(points, state.models),
         cofactors=covariance,
         redundancy=math.floor(freedom + 1e-6),
         degrees_of_freedom=freedom,
@@ -365,13 +398,20 @@ def _result(
         variances=variances,
         gauge=gauge,
         common_error=common,
+        heights=taken,
         shared_errors=shared,
         rejected=rejected,
         outlying=doubts,
-        warnings=(*notices(doubts, points, object_residuals), *notes),
+        warnings=(*notices(doubts, points, object_residuals), *notes, *([] if taken is None else taken.notices())),
         condition=solved.condition,
         iterations=solved.iterations,
     )
+
+
+def _parameters(points: BlockPoints, models: Sequence[SensorModel]) -> tuple[tuple[str, str], ...]:
+    """Return image and name of each parameter."""
+    named = zip(points.images, models, strict=True)
+    return tuple((image, name) for image, model in named for name in model.param_names)
 
 
 def _covariances(
@@ -390,7 +430,7 @@ def _covariances(
     return covariance, ground, {} if shared is None else shared.images
 
 
-def _with_common(covariance: Cofactors, common: BlockCommonError | None) -> tuple[Cofactors, Array]:
+def _with_common(covariance: Cofactors, common: BlockCommonError | CommonHeights | None) -> tuple[Cofactors, Array]:
     """Return the covariance of the parameters with the part of a common error, and its part in that of the ground."""
     if common is None:
         return covariance, np.zeros((1, 3, 3))

@@ -54,15 +54,26 @@ def with_datum(
         return problem, "no control points: the datum is that of the priors and constraints of the models"
     missed = 0.0 if control else _missed(linear)
     sigma = max(HOLD, missed) if hold is None else hold
-    held = _held(linear, sigma, 0.0 if control else SLOW * sigma / max(missed, _LEAST_WRONG))
+    # Heights of a DEM tell what ties leave to their slow errors.
+    by_ties = not control and problem.heights is None
+    held = _held(linear, sigma, SLOW * sigma / max(missed, _LEAST_WRONG) if by_ties else 0.0)
     of = f"sigma {sigma:.3g} px in the image for each parameter ({len(held)} of {problem.size})"
-    why = f"{counted(control, 'control point')}, and the orientation is held at its start values ({of})"
-    if not control:
-        why = (
+    return problem.with_pseudo(held), _why(control, by_ties, of)
+
+
+def _why(control: int, by_ties: bool, of: str) -> str:
+    """Say what the datum of a block is whose orientation is held with a sigma."""
+    if control:
+        return f"{counted(control, 'control point')}, and the orientation is held at its start values ({of})"
+    if by_ties:
+        return (
             "no control points: heights and positions are as accurate as the start values of the orientation, no more. "
             f"Only what the ties show was corrected; the rest stays at its start values ({of})"
         )
-    return problem.with_pseudo(held), why
+    return (
+        "no control points: heights are those of the DEM, positions as accurate as the start values of the "
+        f"orientation, no more ({of})"
+    )
 
 
 def by_control(problem: BlockProblem, selection: Selection) -> str:

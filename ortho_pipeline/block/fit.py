@@ -13,6 +13,7 @@ import pyproj
 from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.heights.settling import HeightsRecord
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
@@ -126,6 +127,7 @@ class BlockAdjustment(Record):
     notices: tuple[NoticeDocument, ...]
     common_error: CommonErrorRecord | None = None
     shared_errors: dict[str, SharedErrors] | None = None
+    heights: HeightsRecord | None = None
 
 
 def merged(*parts: Rmse | None) -> Rmse | None:
@@ -155,8 +157,8 @@ class BlockFit:
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
-    estimate. Of images whose neighbouring measurements share errors, `shared_errors` says what they do, and covariances
-    have grown by it.
+    estimate. `heights` is what was taken from a DEM. Of images whose neighbouring measurements share errors,
+    `shared_errors` says what they do, and covariances have grown by it.
     """
 
     models: dict[str, SensorModel]
@@ -181,6 +183,7 @@ class BlockFit:
     outlying: tuple[ContradictedPoint, ...] = ()
     warnings: tuple[Notice, ...] = ()
     common_error: BlockCommonError | None = None
+    heights: HeightsRecord | None = None
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
     iterations: int = 0
@@ -265,6 +268,8 @@ class BlockFit:
         )
         if self.shared_errors:
             shared["shared_errors"] = dict(self.shared_errors)
+        if self.heights is not None:
+            shared["heights"] = self.heights
         return BlockAdjustment(
             gauge=self.gauge,
             sigma0=self.sigma0,

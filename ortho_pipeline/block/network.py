@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import largest_angles, ray_angles
 from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.relative.joins import Join
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
@@ -18,12 +20,20 @@ Index = NDArray[np.int64]
 
 
 class ImagePairRecord(Record):
-    """Two images, the number of points that both have rays of, and the median angle between these rays."""
+    """Two images, the number of points that both have rays of, and the median angle between these rays.
+
+    `sigma_px` and `sigma_m` are the standard deviation of their relative position along `azimuth_deg`, where it is
+    largest. The pair is `weak` if it exceeds the limit.
+    """
 
     first: str
     second: str
     points: Count
     angle_deg: float
+    sigma_px: float | None = None
+    sigma_m: float | None = None
+    azimuth_deg: float | None = None
+    weak: bool = False
 
 
 class Angles(Record):
@@ -47,22 +57,24 @@ class NetworkRecord(Record):
     largest_deg: tuple[float | None, ...]
 
 
-def network_of(fit: BlockFit) -> NetworkRecord:
-    """Return the network of an adjusted block, by the rays that were used."""
+def network_of(fit: BlockFit, joins: Sequence[Join] = (), limit: float = math.inf) -> NetworkRecord:
+    """Return the network of an adjusted block, by the rays that were used; joins beyond a limit (px) are weak."""
     points = fit.points
     one, other, angles = ray_angles(points.point, _directions(fit))
     largest = largest_angles(points, one, angles)
     ends = np.sort(np.stack([points.image[one], points.image[other]], axis=1), axis=1)
     found, which = np.unique(ends, axis=0, return_inverse=True)
+    relative = {(join.first, join.second): join.figures(limit) for join in joins}
     return NetworkRecord(
         pairs=tuple(
             ImagePairRecord(
-                first=points.images[first],
-                second=points.images[second],
+                first=first,
+                second=second,
                 points=int((which.ravel() == k).sum()),
                 angle_deg=np.median(angles[which.ravel() == k]),
+                **relative.get((first, second), {}),
             )
-            for k, (first, second) in enumerate(found.tolist())
+            for k, (first, second) in enumerate((points.images[a], points.images[b]) for a, b in found.tolist())
         ),
         angles=_angles(largest[np.isfinite(largest)]),
         parts=_parts(points.images, found),

@@ -9,7 +9,7 @@ from dataclasses import replace
 import click
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.options import GROUPS, MosaicOptions, options_of
+from ortho_pipeline.options import GROUPS, BlockOptions, MosaicOptions, options_of
 from ortho_pipeline.options.texts import Setting, Text
 
 #: Those of a scene, and of a mosaic.
@@ -17,7 +17,7 @@ _GROUPS = {**GROUPS, "mosaic": MosaicOptions}
 #: Name of an option in messages -> its flag, where a command has it under that flag.
 FLAGS = {
     f"{group}.{name}": option.flags.split()[0]
-    for group, options in _GROUPS.items()
+    for group, options in (("points", BlockOptions), *_GROUPS.items())
     for name, option in options_of(options).items()
 }
 

@@ -260,7 +260,20 @@ scenes_options = _of_each(*_OF_IMAGES, "model")
 point_options = _grouped("points", PointOptions)
 block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
 #: The rest of that group, which is taken by its decorator too.
-adjustment_options = click_options("points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold")
+adjustment_options = click_options(
+    "points",
+    BlockOptions,
+    "ties",
+    "correction",
+    "ground_sigma",
+    "model_crs",
+    "hold",
+    "dem_heights",
+    "dem_bias",
+    "dem_correlation",
+    "dem_shift_sigma",
+    "join_limit",
+)
 #: All options of heights, as `SurfaceOptions`.
 surface_options = _grouped("surface", SurfaceOptions)
 #: All options of matching with a reference, as `MatchOptions`.

@@ -25,6 +25,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
 from ortho_pipeline.commands.control.block_points import (
     gather,
+    observed,
     read_points,
     refuse_contradictions,
     relative_to_reference,
@@ -85,7 +86,7 @@ def adjust(
     match : MatchOptions
         References to take control points from, and how to match, also for ties (`points.ties`).
     surface : SurfaceOptions
-        Heights, for matching.
+        Heights, for matching and as observations of the ties.
 
     Returns
     -------
@@ -116,7 +117,11 @@ def adjust(
         table,
         priors={label: start.priors for label, start in starts.items()},
         hold=points.hold,
+        heights=observed(points, surface, gathered.heights),
     )
+    if fit.heights is not None:
+        # The block has the last word on the accuracy of the DEM.
+        notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
     exported: dict[str, rpc.RpcExport] = {}
     for label in labels:
@@ -128,7 +133,12 @@ def adjust(
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
-        fit=fit, starts=starts, exported=exported, provenance=record, warnings=[*_warnings(fit, starts), *notes]
+        fit=fit,
+        starts=starts,
+        exported=exported,
+        provenance=record,
+        warnings=[*_warnings(fit, starts), *notes],
+        join_limit=points.join_limit,
     )
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
@@ -266,8 +276,8 @@ def _record(
         for given in (options.points, options.gcps)
     ]
     first = next(iter(starts.values())).scene
-    matched = options.ties is not None or match.reference
-    asked = {"match": match, "surface": surface} if matched else {}
+    matched = options.ties is not None or bool(match.reference)
+    asked = ({"match": match} if matched else {}) | ({"surface": surface} if matched or heights is not None else {})
     whole = provenance(
         Request(images[0]),
         first,

@@ -60,6 +60,7 @@ LOOKS = {
     "chosen": Look(None, "control", fill_opacity=0.1),
     "link": Look("ink", None, 1.2, 0.4),
     "link-wide": Look("ink", None, 3.2, 0.4),
+    "weak": Look("stop", None, 3.2),
     "tie-mark": Look(None, "ink", fill_opacity=0.7),
     "outline-0": Look("ink", "ink", 1.8, 0.8, 0.04),
     "outline-1": Look("ink", "ink", 1.8, 0.8, 0.04, dash="7 3"),

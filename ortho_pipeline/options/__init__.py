@@ -4,12 +4,12 @@ Each option is stated here, once: its field and default, and in an `Option` what
 make their own options from. Messages name an option by a `texts.Setting`: as ``group.field``, which it is called in
 Python and in the pipeline file, and of which the command line shows the flag.
 
-Imports nothing but `errors`. A new option is a field in `groups`.
+Imports nothing but `errors`. A new option is a field in `groups`, of a block in `block`, of a mosaic in `mosaic`.
 """
 
+from ortho_pipeline.options.block import BlockOptions
 from ortho_pipeline.options.groups import (
     GROUPS,
-    BlockOptions,
     MatchOptions,
     PointOptions,
     PointTable,

@@ -83,15 +83,15 @@ class PointTable(Protocol):
 
 #: Chips are held in memory, and more matches say no more of a model.
 _MOST_MATCHES = 100_000
-_VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
-_PIXEL_ORIGIN = Option(
+VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
+PIXEL_ORIGIN = Option(
     "--pixel-origin",
     "What (0, 0) is in CSV, ODM and link files: the outer corner or the centre of the first pixel. With -1, that "
     "place is (1, 1).",
     choices=tuple(PIXEL_ORIGINS),
 )
-_CHECK = Option("--check", "Reserve these points as check points: every Nth, or by id.", "every:N|ids:A,B")
-_MODEL_CRS = "Ground CRS of fitted models: geocentric, geographic, utm or EPSG:n."
+CHECK = Option("--check", "Reserve these points as check points: every Nth, or by id.", "every:N|ids:A,B")
+MODEL_CRS = "Ground CRS of fitted models: geocentric, geographic, utm or EPSG:n."
 
 
 @documented
@@ -115,10 +115,10 @@ class PointOptions:
         None
     )
     vertical: Annotated[
-        str | None, Option("--points-vertical", f"Height datum of the points: {_VERTICAL_FORMS}.", "DATUM")
+        str | None, Option("--points-vertical", f"Height datum of the points: {VERTICAL_FORMS}.", "DATUM")
     ] = None
-    pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
-    check: Annotated[str | None, _CHECK] = None
+    pixel_origin: Annotated[str, PIXEL_ORIGIN] = "corner"
+    check: Annotated[str | None, CHECK] = None
     select: Annotated[
         str | None,
         Option(
@@ -145,7 +145,7 @@ class PointOptions:
             "NAME",
         ),
     ] = None
-    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS", unset="CRS of the points")] = None
+    model_crs: Annotated[str | None, Option("--model-crs", MODEL_CRS, "CRS", unset="CRS of the points")] = None
     prune: Annotated[bool, Option("--prune", "Remove parameters that the points do not justify.")] = False
     params: Annotated[str | None, Option("--params", "Adjust only these parameters.", "A,B,C", unset="all")] = None
     significance: Annotated[
@@ -177,82 +177,6 @@ class PointOptions:
 
 @documented
 @dataclass(frozen=True)
-class BlockOptions:
-    """Points of a block, and what to adjust to them.
-
-    `model` names a model of each scene, or a family to fit to the control points of each image.
-    """
-
-    points: Annotated[
-        PathLike | None,
-        Option(
-            "--points",
-            "Image points: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
-            "FILE",
-        ),
-    ] = None
-    ties: Annotated[
-        str | None,
-        Option(
-            "--ties",
-            Text("Find tie points by matching the images, in addition to those of ", Setting("points.points"), "."),
-            choices=("auto",),
-        ),
-    ] = None
-    gcps: Annotated[
-        PathLike | None, Option("--gcps", "Ground coordinates of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
-    ] = None
-    crs: Annotated[
-        str | None, Option("--points-crs", "CRS of the ground coordinates, if their file does not state it.", "CRS")
-    ] = None
-    vertical: Annotated[
-        str | None, Option("--points-vertical", f"Height datum of the ground coordinates: {_VERTICAL_FORMS}.", "DATUM")
-    ] = None
-    pixel_origin: Annotated[str, _PIXEL_ORIGIN] = "corner"
-    check: Annotated[str | None, _CHECK] = None
-    model: Annotated[
-        str | None,
-        Option(
-            "--model",
-            "A model of the images, such as rpc or pushbroom, or one to fit to points; 'ortho models' lists these.",
-            "NAME",
-            unset="the images' best",
-        ),
-    ] = None
-    correction: Annotated[
-        str | None,
-        Option(
-            "--correction",
-            "What to adjust: image coordinates (shift, shift-drift, affine), or the parameters of the model (model).",
-            unset="the model's own parameters if it has any, else a shift",
-            choices=CORRECTIONS,
-        ),
-    ] = None
-    ground_sigma: Annotated[
-        str | None,
-        Option(
-            "--ground-sigma",
-            "Standard deviations (m) in plan and height of ground coordinates whose file states none.",
-            "XY[,H]",
-            unset="estimated",
-        ),
-    ] = None
-    model_crs: Annotated[str | None, Option("--model-crs", _MODEL_CRS, "CRS")] = None
-    hold: Annotated[
-        float | None,
-        Option(
-            "--hold",
-            "Keep the orientation near its start values, with this sigma.",
-            "PX",
-            kind="number",
-            above=0,
-            unset="10 if nothing else defines the datum",
-        ),
-    ] = None
-
-
-@documented
-@dataclass(frozen=True)
 class SurfaceOptions:
     """Where the heights come from: a DEM, or one ellipsoidal height in metres."""
 
@@ -266,7 +190,7 @@ class SurfaceOptions:
         ),
     ] = None
     vertical: Annotated[
-        str | None, Option("--dem-vertical", f"Height datum of the DEM: {_VERTICAL_FORMS}.", "DATUM")
+        str | None, Option("--dem-vertical", f"Height datum of the DEM: {VERTICAL_FORMS}.", "DATUM")
     ] = None
     override_vertical: Annotated[
         bool,

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
+from ortho_pipeline.block.heights.settling import HeightsRecord
+from ortho_pipeline.block.network import NetworkRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
@@ -65,10 +67,11 @@ def build_report(
     exported: Mapping[str, RpcExport],
     provenance: Mapping[str, Any],
     warnings: Sequence[Notice],
+    join_limit: float = math.inf,
 ) -> BlockReport:
     """Collect everything that the report says (docs/engineering/formats.md)."""
     places = placed(fit, starts)
-    network, parted = found_network(fit)
+    network, of_network = found_network(fit, join_limit)
     suffices = suffices_for(fit)
     images = {}
     for label, start in starts.items():
@@ -83,7 +86,7 @@ def build_report(
             rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
             **places[label],
         )
-    adjustment, noted = fit.record, to_document([*warnings, *parted, *thinly_covered(places)])
+    adjustment, noted = fit.record, to_document([*warnings, *of_network, *thinly_covered(places)])
     return BlockReport(
         images=images,
         adjustment=adjustment,
@@ -197,12 +200,35 @@ def summary_text(report: BlockReport) -> str:
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
+    lines += [*height_lines(adjustment.heights), *join_lines(report.network)]
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     height = f", height {head.height}" if head.height else ""
     lines += [f"{head.figure}{height}: {head.what}", *head.notes]
     return Text.joined("\n", [*lines, *(Text("Warning: ", text) for text in report.warnings)])
+
+
+def height_lines(heights: HeightsRecord | None) -> list[str]:
+    """Say how many heights a DEM gave to points, how accurate they are, and its bias."""
+    if heights is None:
+        return []
+    left = f", {len(heights.left_out)} left out" if heights.left_out else ""
+    return [
+        f"{counted(heights.used, 'height')} of the DEM{left}: sigma {heights.sigma_m:.2g} m ({heights.sigma_is}), "
+        f"bias {heights.bias_m:+.2f} m (sigma {heights.bias_sigma_m:.2g} m)"
+    ]
+
+
+def join_lines(network: NetworkRecord) -> list[str]:
+    """Say how accurate the relative positions of images with points in common are."""
+    known = sorted(one.sigma_px for one in network.pairs if one.sigma_px is not None)
+    if not known:
+        return []
+    return [
+        f"Relative accuracy of {counted(len(known), 'pair')} of images: sigma {known[len(known) // 2]:.2g} px "
+        f"(median), {known[-1]:.2g} px (worst)"
+    ]
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:
@@ -287,6 +313,8 @@ def _marks(report: BlockReport) -> list[str]:
     kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
     said = [what for role, what in kinds.items() if role in there]
     said += ["crosses are what was left out"] if report.adjustment.rejected else []
+    weak = any(pair.weak for pair in report.network.pairs)
+    said += ["red lines join images whose relative position is uncertain"] if weak else []
     return [*said, "in red rings what contradicts"] if doubted(report.notices) else said
 
 

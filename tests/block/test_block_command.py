@@ -30,6 +30,7 @@ from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.delivered import accuracy_before
 from ortho_pipeline.report.wording import NO_SCALE
 from ortho_pipeline.stores.objects import Objects
+from ortho_pipeline.surface.writing import write_dem
 
 LON, LAT, SIZE = 24.4, -33.65, 400
 #: Height of EGM96 there above the ellipsoid (field notes, trap 1).
@@ -608,3 +609,39 @@ def test_control_that_was_held_has_no_rmse_of_zero(stereo: Stereo, tmp_path: Pat
     said = summary_text(BlockReport.read(document))
     assert "1504 control points: held at the given coordinates, so no RMSE on the ground" in said
     assert "RMSE E 0.000" not in said
+
+
+def test_heights_of_a_dem_hold_a_pair_without_control(tmp_path: Path) -> None:
+    """A DEM is read for points of a file too; the report has its heights, and how well the images fit."""
+    pair = Stereo(tmp_path)
+    rows = ["id,image,col,row,sigma_image"]
+    for name, seen in pair.seen.items():
+        rows += [f"p{k},{name}/BAND.tif,{col},{row},0.2" for k, (col, row) in enumerate(seen.tolist())]
+    ties = tmp_path / "ties.csv"
+    ties.write_text("\n".join(rows))
+    plane = tmp_path / "dem.tif"
+    # Heights of a smooth DEM through the points' own would be better: this one says 500 m to 200 m.
+    write_dem(plane, np.full((40, 40), 500.0), (LON - 0.05, LAT + 0.05), 0.0025, "EPSG:4326")
+    dem = ["--dem", str(plane), "--dem-vertical", "ellipsoid", "--dem-sigma", "200"]
+    words = ["adjust", *pair.images, "--points", str(ties), "--correction", "shift", "--json"]
+
+    def adjusted(*more: str) -> tuple[int, dict]:
+        result = CliRunner().invoke(cli, [*words, "-o", str(tmp_path / "out"), *more])
+        return result.exit_code, json.loads(result.stdout) if result.exit_code == 0 else {"said": result.output}
+
+    code, document = adjusted(*dem)
+    assert code == 0
+    report = document["report"]
+    assert report["adjustment"]["heights"]["used"] == 30
+    assert report["adjustment"]["heights"]["sigma_is"] == "stated"
+    assert report["network"]["pairs"][0]["sigma_px"] > 0.5
+    assert report["network"]["pairs"][0]["weak"]
+    assert "weak-join" in [notice["code"] for notice in report["notices"]]
+    code, document = adjusted(*dem, "--join-limit", "1000")
+    assert "weak-join" not in [notice["code"] for notice in document["report"]["notices"]]
+    code, document = adjusted(*dem, "--dem-heights", "off")
+    assert code == 2
+    assert "nothing is matched" in document["said"]
+    code, document = adjusted("--dem-bias", "3")
+    assert code == 2
+    assert "--dem" in document["said"]

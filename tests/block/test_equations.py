@@ -417,7 +417,7 @@ class OnASlope(BlockProblem):
     """A block whose ties have an observed height: they lie on a surface with a slope, 5 cm along its normal."""
 
     normal = np.array([0.3, -0.2, 1.0]) / np.sqrt(1.13)
-    heights: np.ndarray
+    distances: np.ndarray
 
     def _grounded(self, selection: Selection) -> np.ndarray:
         return np.asarray(super()._grounded(selection) | self.points.tie)
@@ -426,7 +426,7 @@ class OnASlope(BlockProblem):
         found, tie = super().on_points(local, rows), self.points.tie[rows]
         turn = np.linalg.qr(np.column_stack([self.normal, np.eye(3)[:, :2]]))[0].T[[1, 2, 0]]
         turn[2] = self.normal
-        along = np.where(tie, self.heights[rows] - local[rows] @ self.normal, found.apart[:, 2])
+        along = np.where(tie, self.distances[rows] - local[rows] @ self.normal, found.apart[:, 2])
         sigmas = np.where(tie[:, None], (np.inf, np.inf, 0.05), found.sigmas)
         axes = np.where(tie[:, None, None], turn, found.axes)
         return OnPoints(np.column_stack([found.apart[:, :2], along]), axes, sigmas)
@@ -439,7 +439,7 @@ def test_a_further_type_of_observation_of_points_needs_no_change_of_the_solver()
     known = np.where(points.control[:, None], points.ground, np.nan)
     problem, everything = OnASlope(points, ordered, frame, known), np.ones(points.rays, dtype=bool)
     local = meet(frame, ordered, points, everything)
-    object.__setattr__(problem, "heights", local @ problem.normal)
+    object.__setattr__(problem, "distances", local @ problem.normal)
     rays = np.isfinite(local).all(axis=1)[points.point]
     solved = solve(problem, State(ordered, local), Selection.of(rays, points.control))
     design, misfits = dense(solved.linear)

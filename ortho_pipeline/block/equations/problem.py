@@ -15,7 +15,7 @@ from ortho_pipeline.block.equations.unknowns import Columns, Mask, Ordering
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.buffers import Buffers
-from ortho_pipeline.estimation.observations.on_points import OnPoints
+from ortho_pipeline.estimation.observations.on_points import OnPoints, Planes
 from ortho_pipeline.models.base import Array, SensorModel
 
 #: Ground is never weighted with less than this sigma (m): far below any pixel, far above rounding.
@@ -120,8 +120,9 @@ class PseudoEquations:
 class BlockProblem:
     """Everything that is observed; `known` ``(N, 3)`` is the ground of control as lon, lat, h (NaN: not observed).
 
-    `assumed` are the sigmas (m) in plan and height of known ground that states none. `target` ``(N, 3)`` is known
-    ground in the frame, `enu` ``(N, 3, 3)`` turns from the frame to east, north, up there.
+    `assumed` are the sigmas (m) in plan and height of known ground that states none, `heights` the heights of a surface
+    under points without a known height. `target` ``(N, 3)`` is known ground in the frame, `enu` ``(N, 3, 3)`` turns
+    from the frame to east, north, up there.
     """
 
     points: BlockPoints
@@ -130,6 +131,7 @@ class BlockProblem:
     known: Array
     pseudo: tuple[Pseudo, ...] = ()
     assumed: tuple[float, float] = (PERFECT_GROUND, PERFECT_GROUND)
+    heights: Planes | None = None
     buffers: Buffers = field(default_factory=Buffers, repr=False)
     columns: Columns = field(init=False)
     target: Array = field(init=False)
@@ -161,6 +163,12 @@ class BlockProblem:
         object.__setattr__(found, "assumed", assumed)
         return found
 
+    def with_heights(self, heights: Planes | None) -> BlockProblem:
+        """Return this problem with other heights of a surface."""
+        found = copy.copy(self)
+        object.__setattr__(found, "heights", heights)
+        return found
+
     def with_pseudo(self, more: Sequence[Pseudo]) -> BlockProblem:
         """Return this problem with further pseudo-observations."""
         return replace(self, pseudo=(*self.pseudo, *more))
@@ -170,15 +178,22 @@ class BlockProblem:
     def active(self, selection: Selection) -> Mask:
         """Return the points ``(N,)`` that are determined by two rays, or by one with known ground."""
         counts = np.bincount(self.points.point[selection.rays], minlength=len(self.points))
-        return np.asarray((counts >= 2) | ((counts >= 1) & self._grounded(selection)))
+        return np.asarray((counts >= 2) | ((counts >= 1) & selection.ground & self.placed))
 
-    def _grounded(self, selection: Selection) -> Mask:
-        return np.asarray(selection.ground & np.isfinite(self.known[:, :2]).all(axis=1))
+    @cached_property
+    def placed(self) -> Mask:
+        """Points ``(N,)`` whose place in plan is known."""
+        return np.asarray(np.isfinite(self.known[:, :2]).all(axis=1))
 
     def ordering(self, selection: Selection) -> Ordering:
         """Return the order in which the unknowns of the active points and of the models are eliminated."""
         rays = selection.rays & self.active(selection)[self.points.point]
         return Ordering.of(self.points, rays, self._grounded(selection))
+
+    def _grounded(self, selection: Selection) -> Mask:
+        """Return the points ``(N,)`` whose place is observed by itself: known ground, and heights of a surface."""
+        grounded: Mask = selection.ground & self.placed
+        return grounded if self.heights is None else grounded | self.heights.on
 
     # -- sigmas ------------------------------------------------------------------------------------------------------
 
@@ -242,7 +257,8 @@ class BlockProblem:
         """Return what is observed of the places of points `rows` ``(n,)`` by themselves, with points at `local`."""
         apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
         apart = np.where(np.isfinite(self.known[rows]), apart, 0.0)
-        return OnPoints(apart, self.enu[rows], self.ground_sigmas[rows])
+        found = OnPoints(apart, self.enu[rows], self.ground_sigmas[rows])
+        return found if self.heights is None else found.with_heights(self.heights, local, rows)
 
     def pseudo_equations(self, state: State) -> PseudoEquations:
         """Return the equations of priors, datum and the models' constraints at a state."""

@@ -15,6 +15,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection, Stat
 from ortho_pipeline.block.equations.steps import Steps
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import meet, predict
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.errors import InputError, NotConverged
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.estimation.statistics import effective_parameters, unit_weight
@@ -56,6 +57,15 @@ class Solved:
         """Those of the parameters."""
         return self.step.solution.cofactors
 
+    @cached_property
+    def heights(self) -> tuple[Index, Array]:
+        """Points ``(n,)`` with a height of a surface, and the parts of the hat matrix ``(n,)`` of these heights."""
+        grounded, planes = self.linear.ordering.grounded, self.problem.heights
+        if planes is None:
+            return grounded[:0], np.zeros(0)
+        rows = grounded[planes.on[grounded]]
+        return rows, np.asarray(self.points.hats(self.cofactors)[1][rows, 2, 2])
+
     @property
     def condition(self) -> float:
         """Condition of the reduced system."""
@@ -79,6 +89,7 @@ class Solved:
         """Return the standard error of unit weight (None without redundancy), and the degrees of freedom.
 
         What holds the datum, or is fictitious, is not an observation; nor are the parameters that it decides unknown.
+        Heights of a surface have a sigma of their own, of which this says nothing: they only leave less to the others.
         """
         linear, ordering, misfits = self.linear, self.linear.ordering, self.linear.misfits
         true = linear.pseudo.true
@@ -88,6 +99,9 @@ class Solved:
         freedom = ordering.observations + known + int(true.sum()) - (effective + 3 * ordering.points)
         square = sum(float((part**2).sum()) for part in (misfits.rays, misfits.ground))
         square += float((misfits.pseudo[true] ** 2).sum())
+        rows, hats = self.heights
+        square -= float((misfits.ground[rows, 2] ** 2).sum())
+        freedom -= float((1.0 - hats).sum())
         # Below half an observation too many there is no redundancy.
         return unit_weight(square, freedom, 0.5), freedom
 

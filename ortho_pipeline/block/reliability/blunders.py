@@ -182,7 +182,8 @@ def _suspects(problem: BlockProblem, tests: StandardisedResiduals, variances: Va
     """Return the points with a part that lies far off by the robust scale."""
     estimated = variances.of_ground(problem)
     rays, ground = tests.sizes(estimated)
-    return _points_of(problem, rays > _SUSPECT, ground > np.where(estimated, limit, _SUSPECT))
+    far = (tests.ground_rank > 0) & (ground > np.where(estimated, limit, _SUSPECT))
+    return _points_of(problem, rays > _SUSPECT, far)
 
 
 def _worst(problem: BlockProblem, tests: StandardisedResiduals, variances: Variances) -> Mask:

@@ -76,5 +76,8 @@ def _of_ground(solved: Solved, hats: Array) -> tuple[Array, Index]:
     used = solved.linear.ordering.grounded
     squares, rank = np.zeros(len(hats)), np.zeros(len(hats), dtype=np.int64)
     found = left_out(np.eye(3) - hats[used], solved.linear.misfits.ground[used], known=TESTABLE)
-    squares[used], rank[used] = found.squares, found.rank
+    squares[used] = found.squares
+    # Heights of a surface are weighed by their squares too, but tested in `block.heights`.
+    control = solved.problem.placed[used]
+    rank[used[control]] = found.rank[control]
     return squares, rank

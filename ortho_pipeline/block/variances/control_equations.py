@@ -68,7 +68,8 @@ class ControlEquations:
     def __init__(self, solved: Solved) -> None:
         problem, linear = solved.problem, solved.linear
         self.size = problem.size
-        self.rows = linear.ordering.grounded
+        grounded = linear.ordering.grounded
+        self.rows = grounded[problem.placed[grounded]]
         ground = problem.on_points(linear.state.local, self.rows)
         self.observed, self.d = ground.observed, ground.apart
         self.u, by_params, self.ue = self._control(linear, ground.axes)
@@ -90,7 +91,9 @@ class ControlEquations:
         self.image_right = flat.T @ right.ravel() - self.pseudo_right
         self.square = float((linear.misfits.rays**2).sum())
         self.points = linear.ordering.points
-        self.observations = linear.ordering.observations
+        # Heights of a surface under ties are not of the control, but determine a part of the unknowns.
+        of_heights, hats = solved.heights
+        self.observations = linear.ordering.observations + float(hats[~problem.placed[of_heights]].sum())
         pixel = np.linalg.norm(linear.by_point, axis=2)[linear.by_point.any(axis=(1, 2))]
         sigma = float(np.median(problem.points.sigma_image))
         self.finest = math.log(_FINEST / sigma)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.points import BlockPoints, joined
 from ortho_pipeline.commands import inputs
@@ -28,6 +29,7 @@ from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, Sur
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface
 
 #: Ground of matches is exact (m): what is not known of it stands in the covariances in the image.
 _EXACT = 1e-3
@@ -89,6 +91,9 @@ def gather(
             notices += found.notices
             document |= found.document
             text += found.text
+    elif observes(options, surface):
+        alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
+        heights = open_surface(surface, scenes[0], under=alone)
     return Gathered(joined(labels, tables), notices, document, text, heights)
 
 
@@ -152,12 +157,13 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
                     field=f"match.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.ties", "auto")),
                 )
-        if has_surface(surface):
+        if has_surface(surface) and not observes(options, surface):
             raise InputError(
                 "heights serve matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",
                 remedy=Text("leave them out, or give ", Setting("points.ties", "auto")),
             )
+    _refuse_of_heights(options, surface)
     for name in ("reference_bands", "search_rotation", "reference_sigma"):
         if getattr(match, name) is not None and not match.reference:
             raise InputError(
@@ -167,6 +173,30 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
             )
     if options.ties is not None or match.reference:
         require_heights(surface)
+
+
+def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
+    """Refuse options of observed heights if no heights are observed."""
+    remedy = Setting("surface.dem") if surface.dem is None else Setting("points.dem_heights", "on")
+    for name in ("dem_bias", "dem_correlation", "dem_shift_sigma"):
+        if getattr(options, name) is not None and not observes(options, surface):
+            raise InputError(
+                "this describes DEM heights that are observations, and there are none",
+                field=f"points.{name}",
+                remedy=Text("leave it out, or give ", remedy),
+            )
+
+
+def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
+    """Tell whether the heights of a DEM are observations of the ties."""
+    return surface.dem is not None and options.dem_heights == "on"
+
+
+def observed(options: BlockOptions, surface: SurfaceOptions, heights: Surface | None) -> DemHeights | None:
+    """Return the heights of a DEM as observations; None without."""
+    if not observes(options, surface) or not isinstance(heights, DemSurface):
+        return None
+    return DemHeights(heights, options.dem_bias, options.dem_correlation, options.dem_shift_sigma)
 
 
 def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOptions) -> list[Notice]:

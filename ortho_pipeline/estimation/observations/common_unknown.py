@@ -1,7 +1,8 @@
 r"""An error that many observations have in common, as an unknown of an adjustment: of one image, and of a block.
 
-It is one vector :math:`c \sim N(0, I)` in plan, in units of its standard deviation. What the adjustment tells of it is
-information :math:`T` (``told``), and the slope :math:`g` of half the sum of squares: a step of it is
+It is one vector :math:`c \sim N(0, I)`, of known ground in plan, in units of its standard deviation. What the
+adjustment tells of it is information :math:`T` (``told``), and the slope :math:`g` of half the sum of squares: a step
+of it is
 
 .. math:: (I + T)\, dc = g - c
 
@@ -37,10 +38,10 @@ class CommonUnknown:
         Its standard deviation per axis, m: the largest, where points state several.
     points : int
         Control points that share it.
-    value : (2,)
-        Its estimate, in standard deviations: how far true east and north of the truth the ground of these points lies;
-        0 where nothing tells of it.
-    told : (2, 2)
+    value : (k,)
+        Its estimate, in standard deviations: of ground how far true east and north of the truth that of these points
+        lies; 0 where nothing tells of it.
+    told : (k, k)
         Information of other points and of priors on it; that of its own standard deviation is I.
     """
 
@@ -51,8 +52,8 @@ class CommonUnknown:
 
     @property
     def left(self) -> Array:
-        """Covariance ``(2, 2)`` of its estimate, in standard deviations."""
-        return np.asarray(np.linalg.inv(np.eye(2) + self.told))
+        """Covariance ``(k, k)`` of its estimate, in standard deviations."""
+        return np.asarray(np.linalg.inv(np.eye(len(self.value)) + self.told))
 
     def started(self, each: Array) -> Self:
         """Return it as others see it one by one ``(n, 2)``, by their median: a start that gross errors do not spoil.
@@ -62,6 +63,10 @@ class CommonUnknown:
         each = each[np.isfinite(each).all(axis=1)]
         value = np.median(each, axis=0) if len(each) else np.zeros(2)
         return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
+
+    def step(self, slope: Array) -> Array:
+        """Return how far ``(k,)`` its estimate is from its best, by the slope there."""
+        return np.asarray(np.linalg.solve(np.eye(len(self.value)) + self.told, slope - self.value))
 
     def settled_with(
         self,
@@ -84,7 +89,7 @@ class CommonUnknown:
         found = self
         for _ in range(_ROUNDS):
             found, slope = seen(found, solution)
-            step = np.linalg.solve(np.eye(2) + found.told, slope - found.value)
+            step = found.step(slope)
             if np.abs(step).max() < stands:
                 break
             found = replace(found, value=found.value + step)

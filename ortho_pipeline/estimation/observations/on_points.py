@@ -4,7 +4,7 @@ There is one form of all of them, which is all that the solver, the sigmas and t
 three axes of each point, how far what was observed is from where the point is, and with what sigma.
 
 - Known ground has the axes east, north and up. Of ground without a known height nothing is observed along the third.
-- A height of a surface would be observed along the normal of its tangent plane at the point's present place.
+- A height of a surface is observed along the normal of its plane at the point (`Planes`).
 
 A further type gives its apart, axes and sigmas for its points in `block.equations.problem.BlockProblem.on_points`. The
 sigmas of a block (`block.variances`) give covariances of these points along the axes.
@@ -43,6 +43,15 @@ class OnPoints:
         """Along which axes ``(n, 3)`` something is observed: each is one equation."""
         return np.isfinite(self.sigmas)
 
+    def with_heights(self, planes: Planes, local: Array, rows: NDArray[np.int64]) -> OnPoints:
+        """Return these observations, of points `rows` ``(n,)`` at `local` ``(N, 3)``, with those of their heights."""
+        on = planes.on[rows]
+        axes = np.where(on[:, None, None], planes.axes[rows], self.axes)
+        apart, sigmas = self.apart.copy(), self.sigmas.copy()
+        apart[on, 2] = (axes[on, 2] * (planes.places[rows] - local[rows])[on]).sum(axis=1)
+        sigmas[on, 2] = planes.sigmas[rows][on]
+        return OnPoints(apart, axes, sigmas)
+
     def misfits(self, weights: Array) -> Array:
         """Return the misfits ``(n, 3)`` over their sigmas, with weights ``(n,)``."""
         return self.apart / self.sigmas * np.sqrt(weights)[:, None]
@@ -50,3 +59,31 @@ class OnPoints:
     def partials(self, weights: Array) -> Array:
         """Return the derivatives ``(n, 3, 3)`` of what is predicted by the place in the frame, over the sigmas."""
         return self.axes * (np.sqrt(weights)[:, None] / self.sigmas)[:, :, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Heights of a surface under N points, each as a plane near its point: one observation along its normal.
+
+    Parameters
+    ----------
+    places : ndarray (N, 3)
+        A place on each plane, in the frame.
+    axes : ndarray (N, 3, 3)
+        Rotations from the frame to axes of which the third is the normal.
+    sigmas : ndarray (N,)
+        Standard deviations in metres along the normal; infinite where nothing is observed.
+    """
+
+    places: Array
+    axes: Array
+    sigmas: Array
+
+    @property
+    def on(self) -> NDArray[np.bool_]:
+        """Of which points ``(N,)`` a height is observed."""
+        return np.isfinite(self.sigmas)
+
+    def above(self, local: Array) -> Array:
+        """Return how far ``(N,)`` the planes are above points `local` ``(N, 3)``, along their normals."""
+        return np.asarray((self.axes[:, 2] * (self.places - local)).sum(axis=1))

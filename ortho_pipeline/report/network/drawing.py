@@ -90,8 +90,11 @@ def _draw_pairs(drawing: Drawing, report: BlockReport, middles: dict[str, Array]
         if math.hypot(x2 - x1, y2 - y1) < _SHORT:
             continue
         text = f"{one.first} – {one.second}: {counted(one.points, 'point')} in common, rays {one.angle_deg:.1f}° apart"
+        if one.sigma_px is not None:
+            text += f"\nrelative position: sigma {one.sigma_px:.2g} px"
+        look = "weak" if one.weak else "link-wide" if one.points > most / 2 else "link"
         with drawing.titled(text):
-            drawing.line("link-wide" if one.points > most / 2 else "link", x1, y1, x2, y2)
+            drawing.line(look, x1, y1, x2, y2)
             if math.hypot(x2 - x1, y2 - y1) > 60 and len(pairs) <= _NAMES:
                 drawing.text((x1 + x2) / 2 + 5, (y1 + y2) / 2 - 5, str(one.points), quiet=True)
 

@@ -10,6 +10,7 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.network import NetworkRecord, network_of
+from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.geodesy.crs import ground_transform
@@ -21,14 +22,16 @@ if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
 
 
-def found_network(fit: BlockFit) -> tuple[NetworkRecord, tuple[Notice, ...]]:
-    """Return the network of a block, and a notice if it falls into parts."""
-    network = network_of(fit)
+def found_network(fit: BlockFit, join_limit: float) -> tuple[NetworkRecord, tuple[Notice, ...]]:
+    """Return the network of a block, and notices if joins are weaker than a limit (px) or it falls into parts."""
+    joins = joins_of(fit)
+    network = network_of(fit, joins, join_limit)
+    weak = weak_joins(joins, join_limit, with_heights=fit.heights is not None)
     if len(network.parts) < 2:
-        return network, ()
+        return network, weak
     said = " and ".join(", ".join(part[:4]) + (" ..." if len(part) > 4 else "") for part in network.parts[:3])
     text = f"the images fall into {len(network.parts)} parts without points in common: {said}"
-    return network, (Notice("block-in-parts", text, parts=[list(part) for part in network.parts]),)
+    return network, (*weak, Notice("block-in-parts", text, parts=[list(part) for part in network.parts]))
 
 
 def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...]:

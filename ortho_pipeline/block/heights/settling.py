@@ -1,0 +1,287 @@
+"""Heights of a DEM in a block, repeated until they are stable: planes under the points, shared errors, wrong heights.
+
+A height that contradicts its tie is left out and the tie stays: on a roof or a tree both are right. It takes part again
+if it agrees again. No height is used in a void, beside one, or at a cliff within the uncertainty of the point's place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ortho_pipeline.block.equations.problem import BlockProblem, Selection
+from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
+from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
+from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights, planes_at
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import metres
+from ortho_pipeline.estimation.observations.on_points import Planes
+from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.files.json.records import Count, Pair, Record
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.options.texts import Setting, Text, counted
+
+#: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma.
+_ROUNDS, _STABLE, _FEW = 10, 0.02, 0.02
+#: The estimate of shared errors is stable if it changes by less than this, in standard deviations.
+_SHARED_STABLE = 0.02
+#: A height farther off than so many of its sigmas is left out.
+_WRONG = 4.0
+#: A height is at a break if the DEM is more sigmas off its plane within the uncertainty of the place.
+_BREAKS = 4.0
+#: A sigma is estimated from so many heights or more, each of at least this redundancy.
+_ENOUGH, _REDUNDANT = 50, 0.2
+#: A notice names so many points.
+_NAMED = 10
+#: The sigma of a normal distribution over its median absolute value.
+_NORMAL = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """The heights of a DEM in a block.
+
+    Parameters
+    ----------
+    source : DemHeights
+    of : ndarray (N,) of bool
+        Points that take the height of the DEM, if it has one there.
+    stated : ndarray (N,) or None
+        Stated sigmas of the heights, m upwards.
+    sigma : float
+        Sigma of all heights if none is stated.
+    own : ndarray (N,)
+        Variances of the errors that heights do not share, over their squared sigmas.
+    common : CommonHeights
+        The errors that they share.
+    wrong, broken : ndarray (N,) of bool
+        Left out: heights that contradict their ties, and heights at breaks of the DEM.
+    estimated : bool
+        Whether `sigma` was.
+    """
+
+    source: DemHeights
+    of: Mask
+    stated: Array | None
+    sigma: float
+    own: Array
+    common: CommonHeights
+    wrong: Mask
+    broken: Mask
+    estimated: bool = False
+
+    @classmethod
+    def under(cls, source: DemHeights, problem: BlockProblem, local: Array) -> Heights:
+        """Return the heights under points at `local` ``(N, 3)`` before the adjustment.
+
+        Of ties, and of known ground without a height of its own.
+        """
+        count, of = len(local), problem.points.tie | (problem.placed & ~np.isfinite(problem.known[:, 2]))
+        ground = problem.frame.geodetic(local)
+        rows = np.flatnonzero(of & np.isfinite(ground).all(axis=1))
+        stated = source.sigmas(ground[rows])
+        sigmas = None if stated is None else np.full(count, np.nan)
+        if stated is not None and sigmas is not None:
+            sigmas[rows] = stated
+        each = np.full(len(rows), DEFAULT_SIGMA) if stated is None else stated
+        typical = float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else DEFAULT_SIGMA
+        bias = typical if source.bias is None else source.bias
+        own = np.ones(count)
+        own[rows] = source.sharing(ground[rows])
+        loads = np.zeros((count, 3))
+        loads[:, 0] = bias
+        if source.correlation is not None and len(rows):
+            shared, left = correlated(local[rows], source.correlation)
+            more = np.zeros((count, shared.shape[1]))
+            more[rows], own[rows] = shared * np.nan_to_num(each)[:, None], left
+            loads = np.hstack([loads, more])
+        none = np.zeros(count, dtype=bool)
+        common = CommonHeights.of(loads, bias, len(rows), problem.size)
+        return cls(source, of, sigmas, DEFAULT_SIGMA, own, common, none, none)
+
+    @property
+    def shift(self) -> float:
+        """Standard deviation (m) of the position of the DEM, east and north."""
+        stated = self.source.shift
+        return self.source.surface.sample_size / 2.0 if stated is None else stated
+
+    @property
+    def sigmas(self) -> Array:
+        """Sigmas ``(N,)`` of the heights, m upwards."""
+        return np.full(len(self.of), self.sigma) if self.stated is None else self.stated
+
+    def applied(self, problem: BlockProblem, local: Array) -> BlockProblem:
+        """Return the problem with planes under points at `local` ``(N, 3)``."""
+        return problem.with_heights(self._planes(problem, local, self.of & ~self.wrong & ~self.broken)[0])
+
+    def _planes(self, problem: BlockProblem, local: Array, of: Mask) -> tuple[Planes, Array]:
+        """Return the planes under points of a mask ``(N,)``, and their slopes ``(N, 2)``."""
+        return planes_at(self.source, problem, local, of, self.sigmas * np.sqrt(self.own), self.common.offset)
+
+    def settled(self, solved: Solved, selection: Selection, tolerance: float = EXACT) -> tuple[Solved, Heights]:
+        """Return the solution with stable heights, from one near it, and these heights."""
+        found = self
+        for number in range(_ROUNDS):
+            judged = found._judged(solved, number)
+            problem = judged.applied(solved.problem, solved.state.local)
+            planes, before = problem.heights, solved.problem.heights
+            assert planes is not None
+            assert before is not None
+            off = np.abs(planes.above(solved.state.local) - before.above(solved.state.local)) / planes.sigmas
+            same = bool((planes.on == before.on).all()) and judged.sigma == found.sigma
+            same &= np.array_equal(judged.common.value, found.common.value)
+            if same and (off > _STABLE)[planes.on].sum() <= _FEW * planes.on.sum():
+                return solved, judged
+            again = attempt(problem, solved.state, selection, tolerance)
+            if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
+                return solved, found
+            solved, found = again, judged
+        return solved, found
+
+    def _judged(self, solved: Solved, number: int) -> Heights:
+        """Return them with sigma, shared errors and wrong heights by a solution."""
+        _, slopes = self._planes(solved.problem, solved.state.local, self.of)
+        common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
+        step = common.step(slope)
+        if np.abs(step).max() > _SHARED_STABLE:
+            common = replace(common, value=common.value + step)
+        found = replace(self, common=common)
+        apart, spread, used = found._apart(solved)
+        if self.stated is None:
+            found = found._estimated(apart, spread, used)
+        if number > _ROUNDS // 2:
+            # Otherwise heights at the limit may be left out and return without end.
+            return found
+        sigma = np.sqrt(np.maximum(spread, (0.2 * found.sigmas) ** 2))
+        with np.errstate(invalid="ignore"):
+            wrong = np.abs(apart) > _WRONG * sigma
+        return replace(found, wrong=np.asarray(found.of & wrong), broken=found._breaking(solved))
+
+    def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
+        """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
+
+        Of one that takes part the residual varies less than the height, of one that does not more.
+        """
+        problem, local = solved.problem, solved.state.local
+        planes, _ = self._planes(problem, local, self.of)
+        rows = np.zeros(len(local), dtype=bool)
+        rows[solved.linear.ordering.numbers] = True
+        used = rows & self.of & planes.on
+        assert problem.heights is not None
+        taking = used & problem.heights.on
+        # Along the normal; over its share of the vertical both are upwards.
+        covariance = solved.points.ground(solved.cofactors, 1.0)
+        normal = planes.axes[:, 2]
+        told = np.einsum("nc,ncd,nd->n", normal, covariance, normal)
+        upright = np.where(planes.on, planes.sigmas / (self.sigmas * np.sqrt(self.own)), 1.0)
+        whole = np.maximum(planes.sigmas**2, (upright * self.sigmas) ** 2)
+        spread = np.where(taking, whole - told, whole + told)
+        apart = planes.above(local)
+        with np.errstate(invalid="ignore"):
+            return np.where(used, apart / upright, 0.0), np.where(used, spread / upright**2, np.inf), taking
+
+    def _estimated(self, apart: Array, spread: Array, used: Mask) -> Heights:
+        """Return them with a robust sigma of the residuals; unchanged if too few have enough redundancy."""
+        redundancy = spread / self.sigma**2
+        testable = used & (redundancy > _REDUNDANT)
+        if testable.sum() < _ENOUGH:
+            return self
+        sigma = _NORMAL * float(np.median(np.abs(apart[testable]) / np.sqrt(redundancy[testable])))
+        same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
+        return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
+
+    def _breaking(self, solved: Solved) -> Mask:
+        """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
+        problem, local = solved.problem, solved.state.local
+        _, slopes = self._planes(problem, local, self.of)
+        covariance = solved.ground_covariance(solved.cofactors, 1.0)
+        plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
+        rows = np.flatnonzero(self.of & np.isfinite(plan))
+        ground, found = problem.frame.geodetic(local), self.broken.copy()
+        # The uncertainty is larger while the images are still displaced.
+        far = self.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], self.source.surface.sample_size))
+        with np.errstate(invalid="ignore"):
+            found[rows] = far > _BREAKS * self.sigmas[rows]
+        return found
+
+    def record(self, solved: Solved) -> HeightsRecord:
+        """Return what is published of them."""
+        rows = solved.linear.ordering.grounded
+        planes = solved.problem.heights
+        assert planes is not None
+        used = rows[planes.on[rows]]
+        apart = planes.above(solved.state.local)[used]
+        sigmas = self.sigmas[used]
+        known = sigmas[np.isfinite(sigmas)]
+        bias, bias_sigma = self.common.bias
+        active = np.zeros(len(self.of), dtype=bool)
+        active[solved.linear.ordering.numbers] = True
+        wrong, broken = active & self.wrong, active & self.broken & ~self.wrong
+        shift, shift_covariance = self.common.shift(self.shift)
+        return HeightsRecord(
+            used=len(used),
+            left_out=tuple(solved.problem.points.ids[k] for k in np.flatnonzero(wrong)),
+            at_breaks=int(broken.sum()),
+            without=int((active & self.of & ~wrong & ~broken).sum()) - len(used),
+            sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else self.sigma,
+            sigma_is="stated" if self.stated is not None else "estimated" if self.estimated else "assumed",
+            rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
+            bias_m=bias,
+            bias_sigma_m=bias_sigma,
+            bias_prior_m=self.common.sigma,
+            shift_m=tuple(shift.tolist()),
+            shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
+            shift_prior_m=self.shift,
+            correlation_m=self.source.correlation,
+        )
+
+
+class HeightsRecord(Record):
+    """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
+
+    The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
+    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment.
+    """
+
+    used: Count
+    left_out: tuple[str, ...]
+    at_breaks: Count
+    without: Count
+    sigma_m: float
+    sigma_is: Literal["stated", "estimated", "assumed"]
+    rms_m: float | None
+    bias_m: float
+    bias_sigma_m: float
+    bias_prior_m: float
+    shift_m: Pair
+    shift_sigma_m: Pair
+    shift_prior_m: float
+    correlation_m: float | None
+
+    def notices(self) -> list[Notice]:
+        """Return notices of an unstated sigma and of heights that were left out."""
+        found = []
+        if self.sigma_is == "assumed":
+            text = Text(
+                f"accuracy of the heights not given; assuming {metres(self.sigma_m)}. Set it with ",
+                Setting("surface.sigma"),
+            )
+            found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
+        elif self.sigma_is == "estimated":
+            text = Text(
+                f"accuracy of the heights not given; estimated as {metres(self.sigma_m)} from "
+                f"{counted(self.used, 'height')}. Set it with ",
+                Setting("surface.sigma"),
+            )
+            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
+        if self.left_out:
+            number, named = len(self.left_out), self.left_out[:_NAMED]
+            said = (
+                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees: these heights were not "
+                f"used, the ties were ({', '.join(named)})"
+            )
+            found.append(Notice("heights-left-out", said, count=number, points=list(named)))
+        return found

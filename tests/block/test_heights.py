@@ -1,0 +1,150 @@
+"""Heights of a DEM as observations: neighbours meet, common errors are in the sigmas, roofs cost no tie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chains import Block, Chain, apart, dem, fly, misfits, neighbours, with_control
+
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights.source import DemHeights
+from ortho_pipeline.block.relative.joins import joins_of, weak_joins
+from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.surface.flat import FlatSurface
+
+
+@pytest.mark.parametrize("convergence_deg", [1.0, 3.0])
+def test_neighbours_meet_by_the_heights_of_a_dem(tmp_path: Path, convergence_deg: float) -> None:
+    """Ties alone leave them pixels apart; DEM heights of 2 m bring them together."""
+    alone, together = [], []
+    for seed in range(3):
+        block = fly(Chain(convergence_deg=convergence_deg), seed)
+        heights = dem(block, tmp_path / f"{seed}.tif", seed, white=2.0).with_sigma(2.0)
+        alone.append(misfits(block, adjust(block.start, block.points)).max())
+        fit = adjust(block.start, block.points, heights=heights)
+        together.append(misfits(block, fit).max())
+        assert fit.heights is not None
+        assert fit.heights.used > 190
+        assert 0.8 < float(fit.sigma0 or 0) < 1.2
+    assert min(alone) > 2.0
+    assert max(together) < 0.15
+
+
+def test_control_in_one_image_reaches_the_others(tmp_path: Path) -> None:
+    block = fly(Chain(), 1)
+    points = with_control(block)
+    with pytest.raises(DegeneratePoints, match="do not determine"):
+        adjust(block.start, points)
+    fit = adjust(block.start, points, heights=dem(block, tmp_path / "dem.tif", 1, white=2.0).with_sigma(2.0))
+    assert misfits(block, fit).max() < 0.5
+    off = fit.values - np.concatenate([model.params for model in block.truth.values()])
+    assert (np.abs(off) < 4 * fit.sigmas).all()
+
+
+def test_a_bias_of_the_dem_does_not_average_out(tmp_path: Path) -> None:
+    """Two hundred heights say of a common error of 5 m no more than one."""
+    block = fly(Chain(normal=True, errors=5.0), 2)
+    heights = dem(block, tmp_path / "dem.tif", 2, white=2.0, bias=5.0).with_sigma(2.0)
+    fit = adjust(block.start, block.points, heights=DemHeights(heights, bias=5.0), hold=5.0)
+    assert fit.heights is not None
+    assert fit.heights.bias_sigma_m > 3.0
+    assert np.nanmedian(fit.ground_sigmas[:, 2]) > 3.0
+    claimed = [np.hypot(*fit_sigma) for fit_sigma in _claims(block, fit)]
+    assert (misfits(block, fit) < 3.5 * np.array(claimed)).all()
+
+
+def _claims(block: Block, fit: BlockFit) -> list[tuple[float, float]]:
+    found = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+    return [tuple(np.sqrt(np.linalg.eigvalsh(found[pair]))) for pair in neighbours(block)]
+
+
+def test_trees_cost_their_heights_and_no_tie(tmp_path: Path) -> None:
+    block = fly(Chain(convergence_deg=10.0), 0)
+    heights = dem(block, tmp_path / "dem.tif", 0, white=1.0, trees=0.05).with_sigma(1.0)
+    fit = adjust(block.start, block.points, heights=heights)
+    assert fit.heights is not None
+    assert len(fit.heights.left_out) >= 5
+    assert fit.used_rays.all()
+    assert not fit.rejected
+    assert any(notice.code == "heights-left-out" for notice in fit.warnings)
+
+
+def test_the_sigma_is_found_where_nobody_states_it(tmp_path: Path) -> None:
+    block = fly(Chain(convergence_deg=10.0), 3)
+    fit = adjust(block.start, block.points, heights=dem(block, tmp_path / "dem.tif", 3, white=2.0))
+    assert fit.heights is not None
+    assert fit.heights.sigma_is == "estimated"
+    assert 1.4 < fit.heights.sigma_m < 2.8
+    # Nearly parallel rays do not tell it: then it is taken to be 10 m, and that is said.
+    parallel = fly(Chain(convergence_deg=0.1), 3)
+    fit = adjust(parallel.start, parallel.points, heights=dem(parallel, tmp_path / "other.tif", 3, white=2.0))
+    assert fit.heights is not None
+    assert fit.heights.sigma_is == "assumed"
+    assert any(notice.code == "dem-sigma-by-default" for notice in fit.warnings)
+
+
+def test_no_heights_in_voids(tmp_path: Path) -> None:
+    block = fly(Chain(images=4), 0)
+    heights = dem(block, tmp_path / "dem.tif", 0, white=2.0, void=100.0).with_sigma(2.0)
+    fit = adjust(block.start, block.points, heights=heights)
+    assert fit.heights is not None
+    assert fit.heights.without > 20
+    taken = fit.heights.used + len(fit.heights.left_out) + fit.heights.at_breaks
+    assert taken + fit.heights.without == len(block.points)
+    assert fit.used_rays.all()
+
+
+def test_flat_ground_is_no_observation() -> None:
+    block = fly(Chain(images=2, ties=20), 0)
+    with pytest.raises(InputError, match="flat ground"):
+        adjust(block.start, block.points, heights=FlatSurface(200.0))
+
+
+def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
+    """By ties alone the sigma covers the misfit, and it is warned of; with heights neither is there."""
+    block = fly(Chain(), 4)
+    alone = adjust(block.start, block.points)
+    weak = weak_joins(joins_of(alone), 0.5, with_heights=False)
+    assert len(weak) == 1
+    assert weak[0].fields["pairs"] == 5
+    claims = np.array([one[1] for one in _claims(block, alone)])
+    assert (claims > 0.5).all()
+    assert (misfits(block, alone) < 3 * claims).all()
+    heights = dem(block, tmp_path / "dem.tif", 4, white=2.0).with_sigma(2.0)
+    fit = adjust(block.start, block.points, heights=heights)
+    assert not weak_joins(joins_of(fit), 0.5, with_heights=True)
+    assert max(one[1] for one in _claims(block, fit)) < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("made", "sigma", "told"),
+    [
+        ({"white": 2.0}, 2.0, {"bias": 0.0, "shift": 0.0}),
+        ({"white": 2.0, "bias": 5.0}, 2.0, {"bias": 5.0, "shift": 0.0}),
+        ({"correlated": 3.0, "length": 1000.0}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 1000.0}),
+        ({"correlated": 3.0, "length": 200.0}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 200.0}),
+    ],
+)
+def test_claims_between_neighbours_are_kept(
+    tmp_path: Path, made: dict[str, float], sigma: float, told: dict[str, float]
+) -> None:
+    """Misfits of neighbours over what is claimed of them have a spread of 1 over sixty draws."""
+    normalised = []
+    for seed in range(60):
+        block = fly(Chain(convergence_deg=3.0, normal=True, errors=5.0), seed)
+        bias = made.get("bias", 0.0) * np.random.default_rng(777 + seed).normal()
+        heights = dem(block, tmp_path / f"{seed}.tif", seed, **{**made, "bias": bias}).with_sigma(sigma)
+        fit = adjust(block.start, block.points, heights=DemHeights(heights, **told), hold=5.0)
+        covariances = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+        for pair in neighbours(block):
+            root = np.linalg.cholesky(covariances[pair])
+            normalised.append(np.linalg.solve(root, apart_of(block, fit, pair)))
+    assert 0.85 < float(np.sqrt(np.mean(np.square(normalised)))) < 1.15
+
+
+def apart_of(block: Block, fit: BlockFit, pair: tuple[str, str]) -> np.ndarray:
+    return apart(block, fit, *pair)
