@@ -48,7 +48,7 @@ class _Strict(BaseModel):
 
 def _usable(number: float) -> float:
     if not is_usable(number):
-        raise ValueError(f"{number:g} is not a number to compute with")
+        raise ValueError(f"{number:g} is not a usable number: too large, too small, or not finite")
     return number
 
 
@@ -108,7 +108,7 @@ OutputSettings = _settings("OutputSettings", OutputOptions)
 
 
 class Settings(_Strict):
-    """All that can be said of a scene."""
+    """All settings of a scene."""
 
     scene: SceneSettings = SceneSettings()  # type: ignore[valid-type]
     points: PointSettings = PointSettings()  # type: ignore[valid-type]
@@ -120,17 +120,17 @@ class Settings(_Strict):
 class Entry(Settings):
     """One image, or all that match; a later entry for the same image overrides fields of earlier ones."""
 
-    image: str | None = Field(default=None, description="One image file, by its name as it is.")
-    images: str | list[str] | None = Field(default=None, description="Patterns with * ? [] and **.")
-    exclude: str | list[str] = Field(default=[], description="Patterns of images that are left out.")
+    image: str | None = Field(default=None, description="One image file, without patterns.")
+    images: str | list[str] | None = Field(default=None, description="Patterns of image files, with * ? [] and **.")
+    exclude: str | list[str] = Field(default=[], description="Patterns of images to leave out.")
     name: str | None = Field(
-        default=None, description="Name of the scene; may hold {stem} and {folder}. Default: {stem}."
+        default=None, description="Name of the scene; may contain {stem} and {folder}. Default: {stem}."
     )
 
     @pydantic.model_validator(mode="after")
     def _one_way(self) -> Entry:
         if (self.image is None) == (self.images is None):
-            raise ValueError("an entry has either 'image' (one file) or 'images' (patterns)")
+            raise ValueError("an entry needs either 'image' (one file) or 'images' (patterns)")
         return self
 
 
@@ -146,10 +146,10 @@ class Config(_Strict):
     output: str = Field(default="out", description="Output folder, relative to this file.")
     root: str | None = Field(
         default=None,
-        description="Folder that every path has to lie in, relative to this file; within the file's own, or that of "
-        "the command. Default: that one.",
+        description="Allow only paths inside this folder, relative to this file. It can only narrow the root of the "
+        "command. Default: that root.",
     )
-    defaults: Settings = Field(default=Settings(), description="What holds for all scenes.")
+    defaults: Settings = Field(default=Settings(), description="Settings of all scenes.")
     mosaic: MosaicSettings | None = None  # type: ignore[valid-type]
 
 
@@ -188,7 +188,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     """
     content = read_bounded(path, _MAX_BYTES, remedy="check the path")
     if len(content) > _MAX_BYTES:
-        raise InputError("a pipeline file of more than 5 MB is not read", file=path, remedy="use patterns")
+        raise InputError("the pipeline file is larger than 5 MB", file=path, remedy="name images by patterns")
     document, lines = _parse(content, path)
     try:
         return Config.model_validate(document)
@@ -227,7 +227,7 @@ def _parse(content: bytes, path: str | os.PathLike[str]) -> tuple[Any, dict[Plac
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         # A pattern such as */a.tif without quotes is an alias to YAML.
-        remedy = "put quotes around text that begins with *" if "alphabetic" in problem else _SEE
+        remedy = "quote text that begins with *" if "alphabetic" in problem else _SEE
         field = None if mark is None else f"line {mark.line + 1}"
         raise InputError(f"this is not YAML ({problem})", file=path, field=field, remedy=remedy) from error
     if node is None:
@@ -241,17 +241,17 @@ def _check_events(content: bytes, path: str | os.PathLike[str]) -> None:
     depth = 0
     for count, event in enumerate(yaml.parse(content, _Loader)):
         if count > _MAX_EVENTS:
-            raise InputError("there are too many entries", file=path, remedy="name images by patterns")
+            raise InputError("too many entries", file=path, remedy="name images by patterns")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         line = f"line {event.start_mark.line + 1}" if event.start_mark else None
         if depth > _MAX_DEPTH:
-            raise InputError(f"more than {_MAX_DEPTH} levels are not read", file=path, field=line)
+            raise InputError(f"more than {_MAX_DEPTH} nested levels", file=path, field=line)
         if isinstance(event, yaml.AliasEvent):
-            remedy = "put what scenes share under 'defaults'"
-            raise InputError("aliases are not followed", file=path, field=line, remedy=remedy)
+            remedy = "put common settings under 'defaults'"
+            raise InputError("YAML aliases are not supported", file=path, field=line, remedy=remedy)
 
 
 class _Reader:
@@ -270,7 +270,7 @@ class _Reader:
         if isinstance(node, yaml.SequenceNode) and kind == "seq":
             return [self.value(item, (*place, i)) for i, item in enumerate(node.value)]
         if kind not in ("str", "int", "float", "bool", "null"):
-            raise self._error(node, place, f"the tag {node.tag!r} is not known", "leave it out")
+            raise self._error(node, place, f"unknown YAML tag {node.tag!r}", "leave it out")
         return self._scalar(node, place, kind)
 
     def _mapping(self, node: Any, place: Place) -> dict[str, Any]:
@@ -278,11 +278,11 @@ class _Reader:
         for key, item in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
             if name is None:
-                raise self._error(key, place, "a key is a word", _SEE)
+                raise self._error(key, place, "this key is not a word", _SEE)
             here = (*place, name)
             if name in found:
                 before = self.lines[here]
-                raise self._error(key, here, f"this key is given twice (before in line {before})", "leave one out")
+                raise self._error(key, here, f"duplicate key, already in line {before}", "leave one out")
             self.lines[here] = key.start_mark.line + 1
             found[name] = self.value(item, here)
         return found
@@ -323,12 +323,12 @@ def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path
         while known and known not in lines:
             known = known[:-1]
         if one["type"] == "missing":
-            known, message = place, "this field is missing"
+            known, message = place, "missing field"
         else:
             message = one["msg"].removeprefix("Value error, ")
         remedy = _SEE
         if one["type"] == "extra_forbidden":
-            message, remedy = "there is no such field", _allowed(place)
+            message, remedy = "unknown field", _allowed(place)
         line = lines.get(known, lines.get(known[:-1], 1))
         found.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
     found = list(dict.fromkeys(found))

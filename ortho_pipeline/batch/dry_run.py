@@ -1,4 +1,4 @@
-"""A run without pixels: everything that it would be made from is opened, and what stands in its way is said."""
+"""A run without pixels: opens all inputs and reports their errors and warnings."""
 
 from __future__ import annotations
 

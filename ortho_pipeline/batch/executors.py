@@ -305,7 +305,7 @@ def _died(future: Future[Outcome]) -> Future[Outcome]:
     told: Future[Outcome] = Future()
     told.set_exception(
         WorkerDied(
-            "the process that made this scene was killed",
+            "the process of this scene was killed",
             remedy=Text("give it more memory, or ", Setting("workers", "1")),
         )
     )
@@ -332,7 +332,7 @@ def dask_executor(scheduler: str) -> Any:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})",
+            f"cannot connect to the dask scheduler at {scheduler!r} ({error or type(error).__name__})",
             field="scheduler",
             remedy="give its address, for example tcp://host:8786",
         ) from error
@@ -346,16 +346,18 @@ def crew_of(
     """Yield who does the work, and the threads of each scene."""
     if scheduler is not None and executor not in ("dask", None):
         raise InputError(
-            "a scheduler is for dask",
+            "only dask has a scheduler",
             field="scheduler",
-            remedy=Text("leave out ", Setting("executor"), ", or say dask"),
+            remedy=Text("leave out ", Setting("executor"), ", or set it to dask"),
         )
     if isinstance(executor, Executor):
         yield executor, threads or 1
     elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
         if scheduler is None:
             raise InputError(
-                "dask needs the address of its scheduler", field="scheduler", remedy="for example tcp://host:8786"
+                "dask needs the address of its scheduler",
+                field="scheduler",
+                remedy="give it, for example tcp://host:8786",
             )
         client, pool = dask_executor(scheduler)
         with client:
@@ -368,4 +370,4 @@ def crew_of(
         budget = threads or max(1, processors // count)
         yield Processes(count, budget), budget
     else:
-        raise InputError(f"no executor is called {executor!r}", field="executor", remedy=", ".join(EXECUTORS))
+        raise InputError(f"there is no executor {executor!r}", field="executor", remedy=", ".join(EXECUTORS))

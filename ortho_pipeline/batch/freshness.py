@@ -57,7 +57,7 @@ def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
     states = _local_states(job, roles)
     for state in states:
         if state.path in used and used[state.path]["sha256"] != state.sha256:
-            raise InputError("this file changed while the scene was made", file=state.path, remedy="run again")
+            raise InputError("this file changed during the run", file=state.path, remedy="run again")
     return states
 
 
@@ -88,7 +88,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
         try:
             size, tag = Objects(folder, allow_network=job.request.scene.allow_network).stated(name)
         except FileNotFoundError as error:
-            raise InputError("there is no such object", file=address, remedy="check the address") from error
+            raise InputError("file not found", file=address, remedy="check the address") from error
         found.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
     return tuple(found)
 

@@ -128,17 +128,17 @@ class Plan:
         for name in only:
             if name not in known:
                 raise InputError(
-                    f"no scene is called {name!r}",
+                    f"there is no scene {name!r}",
                     file=self.path,
                     field="only",
-                    remedy="'ortho run FILE --list' lists the names",
+                    remedy="see the names with 'ortho run FILE --list'",
                 )
         jobs = tuple(known[name] for name in dict.fromkeys(only)) if only else self.jobs
         if shard is None:
             return jobs
         part, parts = shard
         if not 1 <= part <= parts:
-            raise InputError(f"there is no part {part} of {parts}", field="shard", remedy="for example 1/4")
+            raise InputError(f"there is no part {part} of {parts}", field="shard", remedy="use a part such as 1/4")
         return jobs[part - 1 :: parts]
 
 
@@ -190,10 +190,10 @@ class _Planner:
     def plan(self) -> Plan:
         if self.output == self.places.base:
             raise InputError(
-                "the outputs would lie among the inputs",
+                "the output folder cannot be the folder of the pipeline file",
                 file=self.path,
                 field="output",
-                remedy="choose a folder of their own, for example out",
+                remedy="choose another output folder, for example out",
             )
         found: dict[Place, list[tuple[int, Entry]]] = {}
         for number, entry in enumerate(self.config.scenes):
@@ -218,7 +218,7 @@ class _Planner:
             matches = [image for image in self._matches(pattern, f"scenes[{number}].images") if image not in excluded]
             if not matches:
                 raise InputError(
-                    f"nothing matches {pattern!r}",
+                    f"no file matches {pattern!r}",
                     file=self.path,
                     field=f"scenes[{number}].images",
                     remedy=f"check the pattern, which is relative to {self.places.address or self.places.base}",
@@ -333,7 +333,7 @@ class _Planner:
             return self.places.name(text, field)
         if _exists(Path(text)):
             raise InputError(
-                f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
+                f"{text!r} is in the current folder, but paths are relative to the pipeline file",
                 file=self.path,
                 field=field,
                 remedy=f"give its path relative to {self.places.base}",
@@ -345,7 +345,9 @@ class _Planner:
 
         def value(match: re.Match[str]) -> str:
             if match[1] not in values:
-                raise InputError(f"{match[0]} is not known", file=self.path, field=field, remedy="{stem} or {folder}")
+                raise InputError(
+                    f"unknown placeholder {match[0]}", file=self.path, field=field, remedy="use {stem} or {folder}"
+                )
             return values[match[1]]
 
         return _PLACEHOLDER.sub(value, text)
@@ -356,10 +358,10 @@ class _Planner:
         bad = not name or name.startswith(".") or name != name.strip() or len(os.fsencode(name)) > _NAME_BYTES
         if bad or any(letter in "/\\:\0" or not letter.isprintable() for letter in name):
             raise InputError(
-                f"{name!r} is not a name of a folder (for {image.name})",
+                f"{name!r} cannot be a folder name (for {image.name})",
                 file=self.path,
                 field=f"{where}.name",
-                remedy="letters, digits, blanks, dashes; not first a dot",
+                remedy="use letters, digits, blanks and dashes, without a leading dot",
             )
         return name
 
@@ -370,7 +372,7 @@ class _Planner:
             key = unicodedata.normalize("NFC", job.name).casefold()
             if key in (*RUN_FILES.values(), "mosaic.vrt", "mosaic.tif"):
                 raise InputError(
-                    f"{job.name!r} is a file of the run itself",
+                    f"the run writes a file of the name {job.name!r}",
                     file=self.path,
                     field="name",
                     remedy="give the scene another name",
@@ -378,10 +380,10 @@ class _Planner:
             other = taken.setdefault(key, job)
             if other is not job:
                 raise InputError(
-                    f"{other.image} and {job.image} would both be the scene {job.name!r}",
+                    f"{other.image} and {job.image} have the same scene name {job.name!r}",
                     file=self.path,
                     field="scenes.name",
-                    remedy="tell them apart, for example with name: '{folder}_{stem}'",
+                    remedy="give them different names, for example name: '{folder}_{stem}'",
                 )
 
     def _check_mosaic(self, jobs: Sequence[Job]) -> None:
@@ -391,10 +393,10 @@ class _Planner:
             for field in ("crs", "resolution"):
                 if getattr(job.request.output, field) is None:
                     raise InputError(
-                        "the scenes of a mosaic share a grid",
+                        "the scenes of a mosaic need a common grid",
                         file=self.path,
                         field=f"defaults.output.{field}",
-                        remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
+                        remedy="set it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
                     )
 
 

@@ -134,7 +134,7 @@ class RunRecord(Record):
         with contextlib.suppress(InputError):
             found = cls.parse(files.read_bounded(path, MAX_BYTES, remedy="run again"))
         if found is None:
-            _log.warning("%s: this record cannot be read; what it is of is made again", path)
+            _log.warning("%s: cannot read this record; its outputs are made again", path)
         return found
 
     @classmethod
@@ -264,17 +264,17 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
         with path.open("rb") as file:
             holder = file.read(500).decode(errors="replace").strip() or "another run"
         raise InputError(
-            f"{holder} works in this output folder",
+            f"{holder} is using this output folder",
             file=path.parent.parent,
             field="output",
-            remedy="wait for its end, or choose another output folder",
+            remedy="wait until it ends, or choose another output folder",
         ) from error
     except OSError as error:
         raise InputError(
             f"cannot write here ({error.strerror})",
             file=path.parent,
             field="output",
-            remedy="choose a folder that you may write to, on a file system that has locks",
+            remedy="choose a folder with write permission, on a file system with locks",
         ) from error
     with contextlib.closing(lock):
         if not wait:

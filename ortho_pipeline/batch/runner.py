@@ -140,13 +140,13 @@ def _rectified(job: Job) -> Result:
 def _check_versions(job: Job) -> None:
     here = versions()
     other = [
-        f"{name} {here[name]} in place of {job.versions.get(name)}"
+        f"{name} {here[name]} instead of {job.versions.get(name)}"
         for name in here
         if here[name] != job.versions.get(name)
     ]
     if other:
         raise InputError(
-            f"this worker has other software than the run: {'; '.join(other)}",
+            f"this worker has different software versions: {'; '.join(other)}",
             field="scheduler",
             remedy="install the same versions everywhere",
         )
@@ -240,10 +240,10 @@ def run(
     planned = config if isinstance(config, Plan) else plan(config, allow_network=allow_network)
     if store is None and Location(planned.path).is_far:
         raise InputError(
-            "what a pipeline file of another machine asks for goes to a store",
+            "a remote pipeline file needs an output in object storage",
             file=planned.path,
             field="output",
-            remedy="give a folder of objects for the outputs, such as s3://bucket/prefix, or copy the file",
+            remedy="give an address for the outputs, such as s3://bucket/prefix, or copy the file to this machine",
         )
     jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
     if store is not None:
@@ -266,10 +266,10 @@ def run(
 def _refuse_unshared(planned: Plan) -> None:
     if planned.mosaic is not None:
         raise InputError(
-            "workers that share a store make no mosaic",
+            "workers that share object storage cannot make a mosaic",
             file=planned.path,
             field="mosaic",
-            remedy="take it out of the file, and make it of the orthos with `ortho mosaic` afterwards",
+            remedy="remove it from the file, and run `ortho mosaic` on the orthos afterwards",
         )
 
 

@@ -129,7 +129,7 @@ def adjust(
             exported[label] = rpc.export_rpc(_plain(fit.models[label]))
             notes += [notice.in_image(label) for notice in exported[label].warnings]
         except InputError as error:
-            notes.append(Notice("no-rpc", Text("no RPC is written (", error.message, ")")).in_image(label))
+            notes.append(Notice("no-rpc", Text("no RPC written: ", error.message)).in_image(label))
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
@@ -303,20 +303,22 @@ def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     found += fit.warnings
     for one in fit.rejected[:50]:
         where = f" in {one.image}" if one.image else (" (its ground)" if one.what == "ground" else "")
-        text = f"point {one.point}{where} was left out: {one.reason}"
+        text = f"point {one.point}{where} was rejected: {one.reason}"
         found.append(Notice("left-out", text, point=one.point, reason=one.reason))
     if (more := len(fit.rejected) - 50) > 0:
-        text = f"and {counted(more, 'more gross error')}, all of them in the report"
+        text = f"{counted(more, 'more gross error')}; the report lists all"
         found.append(Notice("more-left-out", text, count=more))
     sizes = np.array([(start.scene.width, start.scene.height) for start in starts.values()])[points.image]
     outside = ((points.measured < 0) | (points.measured > sizes)).any(axis=1)
     if outside.any():
         names = list(dict.fromkeys(points.ids[i] for i in points.point[outside][:10]))
         number = int(outside.sum())
-        text = f"{counted(number, 'measurement')} outside of their images (used all the same): {', '.join(names)}"
+        text = (
+            f"{counted(number, 'measurement is', 'measurements are')} outside the image, but used: {', '.join(names)}"
+        )
         found.append(Notice("outside-of-image", text, count=number, points=names))
     if fit.parameters and fit.redundancy == 0:
-        found.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and say nothing"))
+        found.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and prove nothing"))
     checks = max((rms.n for rms in _check_rms(fit) if rms), default=0)
     if points.control.any() and checks < ENOUGH_CHECK_POINTS:
         found.append(few_check_points(checks))
@@ -395,7 +397,7 @@ def _writer(path: str | os.PathLike[str]) -> Any:
     suffix = Path(path).suffix.lower()
     if suffix not in writers:
         raise InputError(
-            "ground points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}"
+            "ground points cannot be written in this format", file=path, remedy=f"one of {', '.join(writers)}"
         )
     return writers[suffix]
 
@@ -455,7 +457,7 @@ def _left_open(found: Intersection) -> list[Notice]:
     names = np.array(found.points.ids)[open_][:10].tolist()
     text = (
         f"{counted(int(open_.sum()), 'point has', 'points have')} no intersection (one ray, parallel rays, or "
-        f"outside of the models): {', '.join(names)}"
+        f"outside the models): {', '.join(names)}"
     )
     return [Notice("no-intersection", text, count=int(open_.sum()), points=names)]
 

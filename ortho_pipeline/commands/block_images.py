@@ -34,7 +34,7 @@ def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
     paths = [Path(os.path.abspath(image)) for image in images]
     for number, path in enumerate(paths):
         if path in paths[:number]:
-            raise InputError("this image is given twice", file=images[number], remedy="give each image once")
+            raise InputError("this image is listed twice", file=images[number], remedy="list each image once")
     parts = [(*path.parent.parts[1:], path.stem) for path in paths]
     labels = ["_".join(part[-1:]) for part in parts]
     for depth in range(2, max(map(len, parts), default=1) + 1):
@@ -89,9 +89,9 @@ def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str)
     if len(meant) != 1:
         which = " or ".join(os.fspath(images[number]) for number in meant)
         raise InputError(
-            f"{name!r} could mean {which}" if meant else f"no image is called {name!r}",
+            f"{name!r} is ambiguous: {which}" if meant else f"there is no image {name!r}",
             field=field,
-            remedy=f"name one of {', '.join(labels_of(images))}",
+            remedy=f"use one of {', '.join(labels_of(images))}",
         )
     return meant[0]
 
@@ -117,10 +117,10 @@ def points_of_images(
         meant = [k for k, image in enumerate(images) if _means(name, image)]
         if len(meant) > 1:
             raise InputError(
-                f"the name {name!r} could mean {' or '.join(os.fspath(images[k]) for k in meant)}",
+                f"the name {name!r} is ambiguous: {' or '.join(os.fspath(images[k]) for k in meant)}",
                 file=points.source,
                 field="image",
-                remedy="write the folder in the points file too, such as aft/BAND.tif",
+                remedy="add the folder to the name in the points file, such as aft/BAND.tif",
             )
         if meant:
             owner[number] = meant[0]
@@ -129,10 +129,10 @@ def points_of_images(
     without = [os.fspath(image) for k, image in enumerate(images) if k not in owner.values()]
     if without and (whole or not owner):
         raise InputError(
-            f"no point was measured in {without[0]}; there are points of {', '.join(points.images[:5])}",
+            f"no point belongs to {without[0]}; the file has points of {', '.join(points.images[:5])}",
             file=points.source,
             field="image",
-            remedy="use the names of the images in the points file",
+            remedy="correct the image names in the points file",
         )
     of_images = points.of_rays(np.isin(points.image, list(owner)))
     kept = replace(
@@ -180,26 +180,26 @@ def start_of(
         return _family_start(opened, str(name), options, table, heights)
     if options.model_crs is not None:
         raise InputError(
-            Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"),
+            Text(Setting("points.model_crs"), " is only for fitted models"),
             field="points.model_crs",
-            remedy=Text("give ", Setting("points.model"), f" with one of {', '.join(sorted(named))}"),
+            remedy=Text("leave it out, or set ", Setting("points.model"), f" to one of {', '.join(sorted(named))}"),
         )
     if name is not None and name not in opened.models:
         raise InputError(
             f"this image has no model {name!r}",
             file=image,
             field="points.model",
-            remedy=f"its models are {', '.join(opened.models)}; models fitted to points are {', '.join(sorted(named))}",
+            remedy=f"use {', '.join(opened.models)}, or a model fitted to points: {', '.join(sorted(named))}",
         )
     own = name if name is not None else next(iter(opened.models))
     model = opened.models[own]
     correction = options.correction or (OWN if model.param_names else "shift")
     if correction == OWN and not model.param_names:
         raise InputError(
-            f"the model {own!r} has no parameters of its own to adjust",
+            f"the model {own!r} has no adjustable parameters",
             file=image,
             field="points.correction",
-            remedy="take shift, shift-drift or affine",
+            remedy="use shift, shift-drift or affine",
         )
     first = own == next(iter(opened.models))
     source = opened.model_source if first else f"metadata of {Path(opened.path).name}"
@@ -216,7 +216,7 @@ def _family_start(
 ) -> Start:
     if options.correction not in (None, OWN):
         raise InputError(
-            f"the model {name!r} is fitted as a whole",
+            f"the model {name!r} is fitted to the points and takes no correction",
             field="points.correction",
             remedy=Text("leave out ", Setting("points.correction")),
         )

@@ -155,28 +155,27 @@ def _compared(resolved: Resolved, measured: Points, names: Sequence[str]) -> com
 def _refuse_options_of_fit(points: PointOptions) -> None:
     if points.correction is not None or points.fit_model is not None:
         raise InputError(
-            Text("compare takes its models from ", Setting("models")),
-            remedy=Text("for example ", Setting("models", "all")),
+            Text("ortho compare chooses its models with ", Setting("models")),
+            remedy=Text("leave this option out; for example use ", Setting("models", "all")),
             field="points.fit_model" if points.correction is None else "points.correction",
         )
     if points.params is not None or points.prune:
         raise InputError(
-            "compare fits whole models",
+            "ortho compare always fits all parameters of a model",
             field="points.params" if points.params else "points.prune",
-            remedy="take ortho fit",
+            remedy="use ortho fit",
         )
 
 
 def _require_points(request: Request) -> None:
     if not request.has_control:
         raise InputError(
-            "there are no points to fit to",
+            "no control points given",
             field="points.gcps",
             remedy=Text(
                 "give a file of points with ",
                 Setting("points.gcps"),
-                ", or an orthoimage to match with (",
+                ", or an ortho to match with ",
                 Setting("match.reference"),
-                ")",
             ),
         )

@@ -43,7 +43,10 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
     if isinstance(image, Scene):
         if dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
             raise InputError(
-                "this scene is open already", file=image, field="scene", remedy="give its path, or open it so"
+                "options cannot change a scene that is already open",
+                file=image,
+                field="scene",
+                remedy="give its path, or open it with these options",
             )
         return image
     if options.model is None:
@@ -51,7 +54,7 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
         if options.rpc is not None:
             if "rpc" in given:
                 raise InputError(
-                    "the RPC is chosen twice",
+                    "two options choose the RPC",
                     field="scene.rpc",
                     remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")),
                 )
@@ -65,7 +68,7 @@ def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model
     """Open an image with the model of a model file, which takes the place of its own."""
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
-            "a model file takes the place of the image's model",
+            "a model file replaces the image's model, so options of that model have no effect",
             field="scene.model",
             remedy=Text(
                 "leave out ",
@@ -85,14 +88,13 @@ def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model
         offset = crop.noted_offset(dataset)
     if saved.size is not None and not crop.fits(size, saved.size, offset):
         raise InputError(
-            f"this model is of an image of {saved.size[0]} x {saved.size[1]} pixels, {Path(image).name} has "
+            f"this model belongs to an image of {saved.size[0]} x {saved.size[1]} pixels; {Path(image).name} has "
             f"{size[0]} x {size[1]}",
             file=model,
             field="size",
             remedy=Text(
-                "give the model file of this image, or ",
+                "give the model file of this image; if it is a crop, give its position with ",
                 Setting("scene.crop_offset", "COL,ROW"),
-                " if it is a crop of that one",
             ),
         )
     scene = Scene(
@@ -162,25 +164,25 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
     for path in (*map(allowed, files.values()), *removed):
         if path.resolve() in inputs:
             raise InputError(
-                "this path would be read and written", file=path, field="folder", remedy="choose another output folder"
+                "this file is both input and output", file=path, field="folder", remedy="choose another output folder"
             )
     folder = next(iter(files.values())).parent
     attaching = any(str(path).endswith(SIDE_CARS) for path in files.values())
     if attaching and folder.resolve() == Path(request.image).resolve().parent:
         raise InputError(
-            "the RPC files written here would attach to the source image and change its model",
+            "RPC files in this folder would attach to the source image and change its model",
             file=folder,
             field="folder",
-            remedy="choose an output folder of its own",
+            remedy="choose a different output folder",
         )
     if "ortho" in files and not overwrite:
         # Statistics, overviews and masks go with an ortho that is replaced; a model is nothing that an ortho has.
         for stale in old_side_cars(files["ortho"]):
             if stale.name.endswith(SIDE_CARS) or not files["ortho"].exists():
                 raise InputError(
-                    "an old side-car lies here that GDAL would attach to the ortho",
+                    "GDAL would attach this old sidecar file to the ortho",
                     file=stale,
-                    remedy=Text("remove it (", Setting("overwrite"), " does), or choose another output folder"),
+                    remedy=Text("delete it, use ", Setting("overwrite"), ", or choose another output folder"),
                 )
 
 

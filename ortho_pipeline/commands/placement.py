@@ -42,8 +42,8 @@ class Placement(NamedTuple):
         if part >= _SPARSE:
             return []
         text = (
-            f"only {part:.2%} of the pixels that the scene covers have a value: check the heights, and the nodata "
-            "value and the mask of the image"
+            f"only {part:.2%} of the pixels inside the footprint have a value. Check the heights, and the nodata value "
+            "and mask of the image"
         )
         return [Notice("sparse-ortho", text, share=part)]
 

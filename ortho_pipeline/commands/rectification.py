@@ -137,7 +137,7 @@ def rectify(
     resolved.ledger.require_unchanged()
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     if isinstance(made, ReportError):
-        return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
+        return Result(files, {"report": None}, "Ortho and model are complete, but the report is missing.", made)
     return Result(files, {"report": made.to_json()}, report.summary_text(made))
 
 
@@ -265,9 +265,9 @@ def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
         return acquisition_time(facts, output.acquired)
     if output.acquired is not None:
         raise InputError(
-            "only a STAC item says when",
+            "the time of acquisition is only for a STAC item",
             field="output.acquired",
-            remedy=Text("give ", Setting("output.stac"), " too, or leave it out"),
+            remedy=Text("add ", Setting("output.stac"), ", or leave it out"),
         )
     return None
 
@@ -277,7 +277,7 @@ def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
     try:
         exported = rpc.export_rpc(model)
     except InputError as error:
-        return None, [Notice("no-rpc", Text("no RPC files were written: ", error.message))]
+        return None, [Notice("no-rpc", Text("no RPC written: ", error.message))]
     return exported, list(exported.warnings)
 
 

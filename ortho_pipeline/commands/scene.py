@@ -139,7 +139,7 @@ def write_plots(
     InputError
         If it is not a report, or PNG is asked for and matplotlib is not installed.
     """
-    with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
+    with completed(report_file, remedy="give an unmodified <stem>_report.json, or make the report again"):
         made = report.read_report(located(report_file, allow_network=allow_network))
         stem = Path(report_file).stem
         files = report.write_plots(made, Path(folder), stem, kind)
@@ -219,7 +219,7 @@ def dem_check(
             f"none of the {counted(len(ids), 'check point')} has a height in this DEM",
             file=dem_file,
             field="points",
-            remedy="check the CRS of the points, and whether they lie on the DEM",
+            remedy="check the CRS of the points and the extent of the DEM",
         )
     document = {
         "dem": str(dem_file),

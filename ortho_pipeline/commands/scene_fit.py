@@ -98,27 +98,27 @@ class Adjusted:
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
             outside = np.array(points.ids)[~inside].tolist()
-            text = f"points outside of the image (used all the same): {', '.join(outside)}"
+            text = f"points outside the image, but used: {', '.join(outside)}"
             found.append(Notice("outside-of-image", text, points=outside))
         found += self._elsewhere()
         if len(adjusted.param_names):
             found += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
-            text = "no redundancy: the RMSE of the control points is zero by construction and says nothing"
+            text = "no redundancy: the RMSE of the control points is zero by construction and proves nothing"
             found.append(Notice("no-redundancy", text))
         checks = int(points.check.sum())
         if len(points) and checks < ENOUGH_CHECK_POINTS:
             found.append(few_check_points(checks))
         if self.removed:
             names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
-            text = f"parameters that the points do not justify were removed: {names}"
+            text = f"removed parameters that the points do not justify: {names}"
             found.append(Notice("parameters-removed", text, parameters=[one.name for one in self.removed]))
         return tuple(dict.fromkeys(found))
 
     def _doubtful(self) -> list[Notice]:
         """Return a notice for each point left out, and each that contradicts the others unless one of all says it."""
         left = [
-            Notice("left-out", f"point {name} was left out: {reason}", point=name, reason=reason)
+            Notice("left-out", f"point {name} was rejected: {reason}", point=name, reason=reason)
             for name, reason in self.fit.rejected
         ]
         told = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
@@ -142,8 +142,8 @@ class Adjusted:
         if not sizes > _ELSEWHERE:
             return []
         text = (
-            f"the model as delivered is {sizes:.3g} image sizes away from the points: points or metadata of another "
-            "scene, longitude and latitude exchanged, or an angle of another sign or unit"
+            f"the delivered model is {sizes:.3g} image sizes away from the points. Possible causes: points or metadata "
+            "of another scene, swapped longitude and latitude, or an angle with the wrong sign or unit"
         )
         return [Notice("model-elsewhere", text, image_sizes=sizes)]
 
@@ -161,13 +161,13 @@ def adjustable(request: Request) -> Resolved:
     if points.fit_model is None:
         if points.model_crs is not None:
             raise InputError(
-                Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"),
+                Text(Setting("points.model_crs"), " is only for fitted models"),
                 field="points.model_crs",
                 remedy=Text("give ", Setting("points.fit_model")),
             )
         if points.ridge != "auto":
             raise InputError(
-                Text(Setting("points.ridge"), " regularises a fitted model"),
+                Text(Setting("points.ridge"), " is only for fitted models"),
                 field="points.ridge",
                 remedy=Text("give ", Setting("points.fit_model")),
             )
@@ -177,24 +177,24 @@ def adjustable(request: Request) -> Resolved:
         raise InputError(
             Text(
                 Setting("points.fit_model"),
-                " takes the place of the image's own model, ",
+                " replaces the image's own model, and ",
                 Setting(other),
-                " starts from it",
+                " needs it",
             ),
             field="points.fit_model",
             remedy=Text("leave out one of ", Setting("points.fit_model"), " and ", Setting(other)),
         )
     if not request.has_control:
         raise InputError(
-            "a model is fitted to points",
+            "a fitted model needs control points",
             field="points.gcps",
             remedy=Text("give a file of points with ", Setting("points.gcps")),
         )
     if points.fit_model not in {family.name for family in families()}:
         raise InputError(
-            f"no model is called {points.fit_model!r}",
+            f"there is no model {points.fit_model!r}",
             field="points.fit_model",
-            remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
+            remedy=f"use one of {', '.join(family.name for family in families())} (see `ortho models`)",
         )
     return resolve(request, needs_model=False)
 
@@ -240,20 +240,22 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
     if not count:
         return []
     sigma = float(adjusted.points.sigma_common[adjusted.used].max()) or match.reference_sigma
-    part = "all control was matched" if count == control else f"{count} of {control} control points were matched"
+    part = (
+        "all control points were matched" if count == control else f"{count} of {control} control points were matched"
+    )
     common = adjusted.common_error
-    floor = "how accurate that is was not stated"
+    floor = "The accuracy of the reference is not stated"
     if sigma:
-        floor = f"its own {metres(sigma)} per axis are the floor of all residuals"
+        floor = f"The reference is accurate to {metres(sigma)} per axis, which the residuals do not show"
     if common is not None:
-        floor += ", and in the sigmas of the parameters"
+        floor += " but the sigmas of the parameters include"
     text = (
-        f"{part}: the accuracy is relative to the reference, and {floor}; an error that scene and reference have in "
-        "common is not seen"
+        f"accuracy is relative to the reference, because {part}. {floor}. An error common to scene and reference "
+        "cannot be detected"
     )
     if common is not None and common.value.any():
         east, north = common.value * common.sigma
-        text += f"; the other points put the reference {east:+.2f} m along x and {north:+.2f} m along y"
+        text += f". The other points place the reference {east:+.2f} m along x and {north:+.2f} m along y"
     relative = Notice(
         "relative-to-reference",
         text,
@@ -267,8 +269,8 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
         return [relative]
     east, north = off.mean(axis=0).tolist()
     text = (
-        f"{counted(len(off), 'measured point')} that took no part put the reference {east:+.2f} m along x and "
-        f"{north:+.2f} m along y, and the ortho lies where it does"
+        f"{counted(len(off), 'measured check point')} show that the reference, and so the ortho, is displaced by "
+        f"{east:+.2f} m along x and {north:+.2f} m along y"
     )
     return [relative, Notice("reference-displaced", text, reference_off_m=[east, north], points=len(off))]
 
@@ -297,9 +299,8 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     compared = comparing.compare(points, tuple(names), own=own, priors=scene.priors, size=(scene.width, scene.height))
     chosen = "shift" if compared.recommended is None else names[compared.recommended]
     text = Text(
-        "the correction was chosen by the matches (",
+        f"correction {chosen!r} chosen automatically: {compared.recommendation.reason}. Choose another with ",
         Setting("points.correction"),
-        f" chooses another): {compared.recommendation.reason}",
     )
     return chosen, Notice("correction-by-matches", text, correction=chosen)
 
@@ -323,9 +324,9 @@ def _corrected(
         correction = "shift" if points.control.any() and is_delivered else "none"
     elif correction != "none" and not is_delivered:
         raise InputError(
-            "a model file is an adjusted model: adjusting it again would count points twice",
+            "this model is already adjusted; adjusting it again would count points twice",
             field="points.correction",
-            remedy=Text("adjust the scene's own model with all points (leave out ", Setting("scene.model"), ")"),
+            remedy=Text("leave out ", Setting("scene.model"), " to adjust the delivered model with all points"),
         )
     if correction == OWN:
         scene = _by_own_parameters(scene)

@@ -122,7 +122,7 @@ def _check(job: WarpJob) -> None:
     job.check()
     if not 0 < job.tolerance < math.inf:
         raise InputError(
-            "the tolerance must be positive and finite", field="tolerance", remedy="the default is 0.01 px"
+            "the tolerance must be positive and finite", field="tolerance", remedy="use the default, 0.01 px"
         )
 
 

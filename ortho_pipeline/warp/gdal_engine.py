@@ -227,7 +227,7 @@ def _check(job: WarpJob) -> None:
         )
     if len(job.source.paths) > 1:
         raise InputError(
-            "GDAL's warper accepts only one file",
+            "GDAL's warper reads only one file",
             file=job.source.paths[1],
             field="engine",
             remedy="use the default engine",
@@ -250,7 +250,7 @@ def _standing(
             continue
         if error <= candidate.limit:
             return replace(candidate, max_error_px=error)
-        tried.append(f"{candidate.method}: {error:.3g} px off")
+        tried.append(f"{candidate.method}: {error:.3g} px error")
     raise InputError(
         f"none of GDAL's transformers represents this model ({'; '.join(tried)})",
         field="output.engine",

@@ -44,7 +44,7 @@ def test_an_image_that_changes_meanwhile_is_refused_and_the_old_outputs_stay(tin
         return found
 
     monkeypatch.setattr(rectification, "_warp", meddling)
-    with pytest.raises(InputError, match="changed while it was being used"):
+    with pytest.raises(InputError, match="changed during the run"):
         rectify(tiny, out)
     assert contents(out) == before
 

@@ -23,11 +23,11 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
     """
     kinds = [name for name in (_AWS, _KUBERNETES, _SLURM) if name in environment]
     if len(kinds) != 1:
-        what = "no array of jobs" if not kinds else f"several arrays of jobs ({', '.join(kinds)})"
+        what = "no job array" if not kinds else f"several job arrays ({', '.join(kinds)})"
         raise InputError(
-            f"the environment is that of {what}",
+            f"the environment describes {what}",
             field="shard",
-            remedy=f"say the part itself, such as 1/4; one of {_AWS}, {_KUBERNETES}, {_SLURM} is looked for",
+            remedy=f"give the part, such as 1/4, or set one of {_AWS}, {_KUBERNETES}, {_SLURM}",
         )
     kind = kinds[0]
     index, first, step = _number(environment, kind, 0), 0, 1
@@ -42,14 +42,16 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
         count = _number(environment, COUNT, 1)
     if count is None:
         raise InputError(
-            f"{kind} says which worker this is, and nothing how many there are",
+            f"{kind} gives the number of this worker, but not how many there are",
             field="shard",
             remedy=f"set the environment variable {COUNT} to the number of workers",
         )
     part, rest = divmod(index - first, step)
     if rest or not 0 <= part < count:
         raise InputError(
-            f"{kind} is {index}, which is no worker of {count}", field="shard", remedy=f"correct {COUNT} or the array"
+            f"{kind} is {index}, which does not fit {count} workers",
+            field="shard",
+            remedy=f"correct {COUNT} or the array",
         )
     return part + 1, count
 
@@ -57,5 +59,5 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
 def _number(environment: Mapping[str, str], name: str, least: int) -> int:
     text = environment[name].strip()
     if not (text.isascii() and text.isdigit() and len(text) < 10 and least <= int(text) <= _MOST):
-        raise InputError(f"{name} is {text[:40]!r}, which is no number of a worker", field="shard", remedy="correct it")
+        raise InputError(f"{name} is {text[:40]!r}, which is not a valid number", field="shard", remedy="correct it")
     return int(text)

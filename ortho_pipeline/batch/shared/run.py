@@ -122,7 +122,7 @@ def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
     Outputs are asked of the store: size and tag, or with `where.checksums` the content.
     """
     if not is_scene(record):
-        return "its record is that of no finished scene"
+        return "its record is incomplete"
     store = Objects(where.address_of(job.name), allow_network=where.allow_network)
     for one in record.outputs:
         try:
@@ -131,9 +131,9 @@ def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
             else:
                 same = store.stated(one.path) == (one.bytes, one.tag)
         except (FileNotFoundError, InputError):
-            return f"{one.path} is gone, or larger than it was"
+            return f"{one.path} is missing or has grown"
         if not same:
-            return f"{one.path} is not as it was written"
+            return f"{one.path} has changed"
     if inputs_as_recorded(record, job, where.checksums) is None:
         return "its inputs, settings or software have changed"
     return ""
@@ -221,7 +221,7 @@ def _collected(
             continue
         there = leases.result(job.name)
         unfinished = there is None or there.status not in ("done", "failed")
-        why = "nobody has finished it" if unfinished else ""
+        why = "no worker has finished it" if unfinished else ""
         if there is not None and there.status == "done":
             why = why_stale(where, job, there)
         if there is None or why:

@@ -58,13 +58,11 @@ def match(
         For whatever the user can correct; a place that cannot be told is no point.
     """
     if not match.reference:
-        raise InputError(
-            "there is nothing to match with", field="match.reference", remedy="give an orthoimage of the same place"
-        )
+        raise InputError("no reference given", field="match.reference", remedy="give an ortho of the same place")
     files = {"points": Path(output)}
     if files["points"].suffix.lower() not in _SUFFIXES:
         raise InputError(
-            "matches are not written in this format",
+            "matches cannot be written in this format",
             file=output,
             field="output",
             remedy=f"one of {', '.join(_SUFFIXES)}",
@@ -101,7 +99,9 @@ def _page(report: str | os.PathLike[str] | None) -> dict[str, Path]:
         return {}
     page = Path(report)
     if page.suffix.lower() != ".html":
-        raise InputError("the report of matches is a page", file=page, field="report", remedy="a name with `.html`")
+        raise InputError(
+            "the report of matches is an HTML page", file=page, field="report", remedy="use a name that ends in .html"
+        )
     return {"html": page, "report": page.with_suffix(".json")}
 
 

@@ -191,20 +191,20 @@ class Matched:
         column, row = said.shift_px
         reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said.reasons.items())
         levels = "; ".join(
-            f"{one.agreeing} of {counted(one.chips, 'chip')} of 1/{one.factor} resolution agree" for one in said.levels
+            f"{one.agreeing} of {counted(one.chips, 'chip')} agree at 1/{one.factor} resolution" for one in said.levels
         )
         sigma = self.options.reference_sigma
         return [
             (
                 "reference",
                 ", ".join(Path(one).name for one in self.references)
-                + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated"),
+                + (f", accuracy {metres(sigma)} per axis" if sigma else ", accuracy not stated"),
             ),
             ("matches", f"{said.kept} of {said.tried} tried{': ' + reasons if reasons else ''}"),
             (
                 "",
-                f"{said.control} control, {said.check} check (every fifth cell), in "
-                f"{said.coverage.share:.0%} of the fields of the image",
+                f"{said.control} control, {said.check} check (one cell in five); they cover "
+                f"{said.coverage.share:.0%} of the image",
             ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             (
@@ -213,8 +213,7 @@ class Matched:
             ),
             (
                 "accuracy",
-                f"{px(said.sigma_px)} in the middle of the matches, relative to the reference: "
-                f"{said.components.text()}",
+                f"{px(said.sigma_px)} (median of the matches), relative to the reference: {said.components.text()}",
             ),
         ]
 
@@ -302,10 +301,10 @@ def open_reference_views(
         )
     if not scene.models:
         raise InputError(
-            "this image has no model of its own to begin matching with",
+            "this image has no sensor model, which matching needs",
             file=scene.path,
             field="match.reference",
-            remedy=Text("give control points by hand with ", Setting("points.gcps")),
+            remedy=Text("give measured control points with ", Setting("points.gcps")),
         )
     with _of_references():
         references = open_references(options.reference, options.reference_bands or (), **opened.access)
@@ -339,15 +338,15 @@ def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
     """
     if options.search is not None:
         least = 2.0 * pixel  # as far as chips are moved in any case
-        return Search(options.search, "as asked for") if options.search >= least else Search(least, "two pixels")
+        return Search(options.search, "as requested") if options.search >= least else Search(least, "two pixels")
     stated = _stated(scene, pixel)
     if stated is not None:
         sigma, source = stated
         return Search(max(_SIGMAS * sigma, _LEAST * pixel), f"{_SIGMAS:.0f} times {metres(sigma)}, {source}")
     part = _PART * min(scene.width, scene.height) * pixel
     if part < DEFAULT_SEARCH:
-        return Search(part, f"a default: the scene states no accuracy; {_PART:.0%} of its side", known=False)
-    return Search(DEFAULT_SEARCH, "a default: the scene states no accuracy", known=False)
+        return Search(part, f"default, as the scene states no accuracy; {_PART:.0%} of its side", known=False)
+    return Search(DEFAULT_SEARCH, "default, as the scene states no accuracy", known=False)
 
 
 def rotation_of(scene: Scene, options: MatchOptions) -> float:
@@ -371,13 +370,13 @@ def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
     sigma = scene.facts.get("position_sigma_m")
     # Of what has an orientation it is the position of the sensor, and the attitude errs too.
     if not names and isinstance(sigma, int | float) and sigma > 0:
-        return float(sigma) * math.sqrt(2), "the accuracy of position in the metadata"
+        return float(sigma) * math.sqrt(2), "the position accuracy in the metadata"
     known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
     if names and set(names) <= set(known):
         centre = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
         spread = model.param_partials(centre)[0] * np.array([known[name] for name in names])
         if np.isfinite(spread).all():
-            return float(np.linalg.norm(spread)) * pixel, "what the sensor knows of its parameters"
+            return float(np.linalg.norm(spread)) * pixel, "the sigmas of the parameters in the metadata"
     return None
 
 
@@ -385,7 +384,7 @@ def _default_search(search: Search) -> list[Notice]:
     if search.known:
         return []
     text = Text(
-        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change it with ",
+        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change this with ",
         Setting("match.search"),
     )
     return [Notice("search-by-default", text, search_m=search.distance)]
@@ -412,8 +411,8 @@ def _bands_apart(matches: Matches) -> list[Notice]:
         for one in bands
     )
     text = Text(
-        "bands of the reference disagree about the place of the scene. Compared with the result, single ",
-        f"bands move it (column, row, px): {said}. The result is not known better than {spread(bands):.1f} px. ",
+        "bands of the reference give different positions of the scene, so the result is uncertain by ",
+        f"{spread(bands):.1f} px. Shifts of single bands from the result (column, row, px): {said}. ",
         "Choose bands that agree and look like the scene: ",
         Setting("match.reference_bands", ",".join(map(str, agree))),
     )
@@ -430,10 +429,10 @@ def _refuse_scene(scene: Scene, reference: Reference) -> None:
     shown = {os.path.realpath(name) for name in reference.intensity.source.dataset.GetFileList() or ()}
     if own & {os.path.realpath(reference.path), *shown}:
         raise InputError(
-            "the reference is the scene itself: that says nothing of where it lies",
+            "the reference is the scene itself, so matching cannot find its position",
             file=reference.path,
             field="match.reference",
-            remedy="give an orthoimage that was made of other images",
+            remedy="give an ortho that was made from other images",
         )
 
 
@@ -442,10 +441,10 @@ def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Mat
     name, alike, agreement = Path(scene.path).name, median_correlation(matches), _agreement(matches)
     why = next((f"{Path(one.path).name} names {name} as its source" for one in references if _names(one, name)), None)
     if why is None and alike >= _SAME and agreement < _EXACT:
-        why = f"scene and reference are the same to {px(agreement)} (correlation {alike:.3f}), as two images hardly are"
+        why = f"scene and reference agree to {px(agreement)} (correlation {alike:.3f}), which two images hardly do"
     if why is None:
         return []
-    text = f"{why}: if the reference was made of this scene, the matches say nothing of where it lies"
+    text = f"{why}. If the reference was made from this scene, the matches prove nothing about its position"
     return [Notice("reference-made-of-scene", text, correlation=alike)]
 
 

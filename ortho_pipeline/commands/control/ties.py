@@ -101,17 +101,17 @@ class Tied:
         tracks = ", ".join(
             f"{number} in {counted(int(count), 'image')}" for count, number in said["tracks_by_images"].items()
         )
-        lines = [f"{counted(said['tracks'], 'tie point')}: {tracks}; {px(said['sigma_px'])} in the median"]
+        lines = [f"{counted(said['tracks'], 'tie point')}: {tracks}; median sigma {px(said['sigma_px'])}"]
         for one in said["pairs"]:
             pair = f"{one['images'][0]} - {one['images'][1]}"
             if one["reason"]:
-                lines.append(f"{pair}: no ties ({one['reason']})")
+                lines.append(f"{pair}: no tie points ({one['reason']})")
                 continue
             column, row = one["shift_px"]
             lines.append(
-                f"{pair}: {counted(one['ties'], 'tie')}; {one['matched']} of {one['tried']} matches tried "
-                f"between these two images succeeded; models apart by column "
-                f"{column:+.2f} px, row {row:+.2f} px; heights off by {metres(one['height_m'])}"
+                f"{pair}: {counted(one['ties'], 'tie point')} ({one['matched']} of {one['tried']} matches between them "
+                f"succeeded); models differ by column {column:+.2f} px, row {row:+.2f} px; heights differ by "
+                f"{metres(one['height_m'])}"
             )
         return "\n".join(lines)
 
@@ -136,14 +136,14 @@ def tie_scenes(
     from ortho_pipeline.imaging.ties import TieSettings, tie
 
     if len(scenes) < 2:
-        raise InputError("ties are between two images or more", field="images", remedy="give more images")
+        raise InputError("tie points need at least two images", field="images", remedy="give more images")
     for scene in scenes.values():
         if not scene.models:
             raise InputError(
-                "this image has no model of its own to begin matching with",
+                "this image has no sensor model, which matching needs",
                 file=scene.path,
                 field="images",
-                remedy="measure tie points by hand",
+                remedy="measure tie points yourself",
             )
     views = [
         SceneView(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
@@ -194,7 +194,7 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
         if number >= _FEW:
             continue
         why = f" ({one.reason})" if one.reason else ""
-        text = f"{counted(number, 'tie')} between {pair}, which show the same ground{why}"
+        text = f"only {counted(number, 'tie point')} between {pair}, which show the same ground{why}"
         found.append(Notice("few-ties", text, images=[names[image] for image in one.images], count=number))
     return found
 
@@ -227,7 +227,9 @@ def ties(
     names = names_of(images)
     files = {"ties": Path(output)}
     if files["ties"].suffix.lower() != ".csv":
-        raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
+        raise InputError(
+            "tie points cannot be written in this format", file=output, field="output", remedy="give a .csv file"
+        )
     require_heights(surface)
     given = scenes_of(images, scene)
     for image, own in zip(images, given, strict=True):

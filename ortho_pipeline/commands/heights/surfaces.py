@@ -47,9 +47,9 @@ def open_surface(
     """
     if options.dem is not None and options.height is not None:
         raise InputError(
-            Text(Setting("surface.dem"), " and ", Setting("surface.height"), " exclude each other"),
+            Text(Setting("surface.dem"), " and ", Setting("surface.height"), " cannot be used together"),
             field="surface.height",
-            remedy="give one of them",
+            remedy="use one of them",
         )
     require_heights(options)
     sigma = open_sigma(options, scene, memory)
@@ -85,9 +85,9 @@ def open_sigma(
     if 0 < number <= _LARGEST_SIGMA:
         return number
     raise InputError(
-        f"{options.sigma} is no standard deviation",
+        f"{options.sigma} is not a standard deviation",
         field="surface.sigma",
-        remedy="give metres, or a raster of them such as Copernicus' height error mask",
+        remedy="give a number of metres, or a raster such as Copernicus' height error mask",
     )
 
 
@@ -107,7 +107,7 @@ def dem_as_stated(
     """
     if options.source is not None:
         raise InputError(
-            "this says where heights are found, and the DEM is given",
+            "this option is only for automatic heights, and a DEM is given",
             field="surface.source",
             remedy=Text("leave it out, or give ", Setting("surface.dem", "auto")),
         )
@@ -135,7 +135,7 @@ def require_heights(options: SurfaceOptions) -> None:
     """Raise an `InputError` if there are no heights."""
     if not has_surface(options):
         raise InputError(
-            "there are no heights of the ground",
+            "no heights given",
             field="surface.dem",
             remedy=Text(
                 "give ",
@@ -164,7 +164,7 @@ def has_surface(options: SurfaceOptions) -> bool:
     }
     for field in (field for field, given in idle.items() if given and options.dem is None):
         raise InputError(
-            "this is said of a DEM, and there is none",
+            "this option is for a DEM, and none is given",
             field=field,
             remedy=Text("leave it out, or give ", Setting("surface.dem")),
         )

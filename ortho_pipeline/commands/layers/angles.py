@@ -30,9 +30,9 @@ def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
     if not output.angles:
         if output.sun is not None:
             raise InputError(
-                "only the angles depend on the sun",
+                "the position of the sun is only used for angles",
                 field="output.sun",
-                remedy=Text("give ", Setting("output.angles"), " too, or leave it out"),
+                remedy=Text("add ", Setting("output.angles"), ", or leave it out"),
             )
         return None
     from ortho_pipeline.warp.quality.angles import Sun

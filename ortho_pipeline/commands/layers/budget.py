@@ -82,7 +82,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     ]
     if not budget.knows_model and surface.sigma is None:
         raise InputError(
-            "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
+            "no accuracy raster possible: neither the model nor the heights have a stated accuracy",
             field="output.accuracy_raster",
             remedy=Text(
                 "give ",
@@ -94,9 +94,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
         )
     assumed = _assumptions(budget, surface)
     if output.fill_from is not None:
-        assumed.append(
-            f"pixels from {Path(output.fill_from).name} are as accurate as that is: the layer is of the others"
-        )
+        assumed.append(f"the layer does not describe pixels from {Path(output.fill_from).name}")
     known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None, _common(placed))
     if not unknown:
         return known, []
@@ -107,7 +105,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     }
     said = Text.joined(" and of ", (names[name] for name in unknown))
     text = Text(
-        "the raster of accuracy knows nothing of the errors of ", said, ": its figures are the least that there is"
+        "the accuracy raster does not include the errors of ", said, ", which are unknown; real errors are larger"
     )
     return known, [Notice("accuracy-in-part", text, unknown=unknown)]
 
@@ -189,16 +187,16 @@ def _common(placed: Placement) -> float:
 
 def _assumptions(budget: Budget, surface: Surface) -> list[str]:
     said = [
-        "errors of the model, of the heights and of the reference are independent of each other",
-        "the model follows the scene but for its parameters",
-        "an error is where the ortho shows a point, at its height, less where that is",
+        "errors of model, heights and reference are independent",
+        "the model is right apart from its parameters",
+        "an error is the position of a point in the ortho, at its height, minus its true position",
     ]
     if budget.datum:
-        said.insert(1, f"the height datum is good to {metres(budget.datum)}")
+        said.insert(1, f"the height datum is accurate to {metres(budget.datum)}")
     if budget.stated is not None:
-        said.append(f"the model is as good as its vendor states, {metres(budget.stated)} per axis")
+        said.append(f"the model is accurate to {metres(budget.stated)} per axis, as its vendor states")
     if isinstance(surface.sigma, float | int):
-        said.append(f"the heights are as good as {metres(surface.sigma)} everywhere")
+        said.append(f"the heights are accurate to {metres(surface.sigma)} everywhere")
     return said
 
 
@@ -235,9 +233,9 @@ def write_layers(
     )
     if not found.known:
         raise InputError(
-            "the standard deviations of the heights reach no pixel of the ortho",
+            "the raster of height accuracy does not overlap the ortho",
             field="surface.sigma",
-            remedy="give a raster of this place, or a number",
+            remedy="give a raster of this area, or a number",
         )
     layer = _record(found, known, output.layer_step)
     write_text(files["accuracy_style"], accuracy_style(layer))

@@ -80,28 +80,30 @@ def _refuse_far(orthos: Sequence[Path]) -> None:
     for ortho in orthos:
         if Location(ortho).is_far:
             raise InputError(
-                "a VRT refers to orthos below its own folder",
+                "a VRT can only refer to orthos in its folder or below",
                 file=ortho,
                 field="output",
-                remedy="let the name of the mosaic end in .tif",
+                remedy="use a name of the mosaic that ends in .tif",
             )
 
 
 def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
     if len(set(files.values())) < len(files):
         raise InputError(
-            "record and page lie beside the mosaic under its name",
+            "record (.json) and page (.html) need other names than the mosaic",
             file=files["mosaic"],
             field="output",
-            remedy="let the name end in .tif or .vrt",
+            remedy="use a name that ends in .tif or .vrt",
         )
     known = [ortho.resolve() for ortho in orthos]
     for path in map(allowed, files.values()):
         if path.resolve() in known:
-            raise InputError("this path would be read and written", file=path, field="output", remedy="choose another")
+            raise InputError(
+                "this file is both input and output", file=path, field="output", remedy="choose another name"
+            )
     for ortho in orthos:
         if known.count(ortho.resolve()) > 1:
-            raise InputError("this ortho is given twice", file=ortho, field="orthos", remedy="name it once")
+            raise InputError("this ortho is listed twice", file=ortho, field="orthos", remedy="list it once")
 
 
 def assemble(
@@ -132,10 +134,10 @@ def assemble(
     for field in ("seamlines", "balance"):
         if options.format == "VRT" and getattr(options, field):
             raise InputError(
-                "a VRT refers to pixels as they are",
+                "a VRT cannot change pixels",
                 file=files["mosaic"],
                 field=f"mosaic.{field}",
-                remedy="make a COG, or leave it out",
+                remedy="write a COG, or leave it out",
             )
     pairs = overlaps(placed) if options.seams or options.balance else []
     memory, threads = resources.memory, resources.threads or 1

@@ -120,7 +120,7 @@ class Ledger:
         now = states(self.begun)
         for path, state in self.begun.items():
             if now.get(path) != state:
-                raise InputError("this file changed while it was being used", file=path, remedy="run again")
+                raise InputError("this file changed during the run", file=path, remedy="run again")
 
     def hashed(self, digest: Callable[..., str] = sha256, stop: threading.Event | None = None) -> list[dict[str, Any]]:
         """Return role, path, bytes and SHA-256 of each file.

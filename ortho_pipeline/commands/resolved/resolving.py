@@ -69,9 +69,9 @@ def _grid_like(request: Request) -> Grid | None:
     given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
     if given:
         raise InputError(
-            Text(Setting("output.like"), " gives the grid, and ", Setting(f"output.{given[0]}"), " would change it"),
+            Text(Setting("output.like"), " sets the grid, which ", Setting(f"output.{given[0]}"), " would change"),
             field=f"output.{given[0]}",
-            remedy="leave out one of the two",
+            remedy="leave out one of them",
         )
     with completed(os.fspath(output.like), field="output.like"):
         return grid_of(output.like, **request.scene.access)

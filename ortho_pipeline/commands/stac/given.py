@@ -115,9 +115,9 @@ def _one_of_several(image: Any, scene: SceneOptions) -> Any:
     rpc = item.rpc_of(chosen)
     if rpc is not None:
         raise InputError(
-            f"the RPC of this image lies elsewhere ({rpc.name}), and several images have no option for it",
+            f"the RPC of this image lies elsewhere ({rpc.name}), and there is no option to give it for several images",
             file=image,
-            remedy="put it beside the image, under its name",
+            remedy="put it beside the image, with the same stem",
         )
     return chosen.href
 

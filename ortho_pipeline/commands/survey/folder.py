@@ -100,13 +100,13 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
     """
     place = Path(folder)
     if not place.is_dir():
-        raise InputError("this is no folder", file=folder, remedy="give a folder")
+        raise InputError("this is not a folder", file=folder, remedy="give a folder")
     names = list(islice(_files(place, _DEPTH), _MOST + 1))
     if len(names) > _MOST:
         raise InputError(
-            f"more than {_MOST} files lie here",
+            f"the folder has more than {_MOST} files",
             file=folder,
-            remedy="give the folder of one delivery, or write the file of the run by hand (docs/run.md)",
+            remedy="give the folder of one delivery, or write the pipeline file yourself (docs/run.md)",
         )
     found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
     return FolderSurvey(place, tuple(_without_parts(found)))
@@ -175,9 +175,7 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
     except OrthoError as error:
         # Any text may end so; a table that says in its first line what it is gets told what it lacks.
         return (
-            SurveyedFile(name, "points", f"to be completed: {error.message}")
-            if error.field in ("crs", "vertical")
-            else None
+            SurveyedFile(name, "points", f"incomplete: {error.message}") if error.field in ("crs", "vertical") else None
         )
     roles = [
         counted(int(mask.sum()), f"{role} point")

@@ -44,16 +44,20 @@ def init(
     allowed(target)
     if target.exists() and not overwrite:
         raise InputError(
-            "this file is there already", file=target, remedy=Text("give another name, or allow ", Setting("overwrite"))
+            "this file already exists", file=target, remedy=Text("choose another name, or use ", Setting("overwrite"))
         )
     if not seen.of("scene"):
         raise InputError(
-            "no image with a model lies here", file=folder, remedy="put the metadata (RPC, DIMAP, .IMD ...) beside it"
+            "no image has a sensor model",
+            file=folder,
+            remedy="put the metadata (RPC, DIMAP, .IMD ...) beside the image",
         )
     prefix = os.path.relpath(Path(folder).resolve(), target.resolve().parent)
     if prefix.startswith(os.pardir):
         raise InputError(
-            "the file of a run lies in the folder of its scenes or above it", file=target, remedy="give such a name"
+            "a pipeline file must be in the folder of its scenes or above it",
+            file=target,
+            remedy="choose another path",
         )
     write_text(target, text(seen, prefix))
     skipped = [one for one in seen.found if one.kind == "image"]
@@ -66,7 +70,7 @@ def init(
         next_lines = f"  ortho run {file} --dry-run\n  ortho run {file}"
     else:
         next_lines = f"  ortho run {file} --allow-network --dry-run\n  ortho run {file} --allow-network"
-    lines += ["Look at the file, then:", next_lines]
+    lines += ["Check the file, then run:", next_lines]
     document = {"scenes": seen.of("scene"), "skipped": {one.path: one.said for one in skipped}}
     return Result({"pipeline": target}, document, "\n".join(lines))
 
@@ -80,17 +84,17 @@ def text(seen: FolderSurvey, prefix: str = ".") -> str:
 
     lines = [
         "# Scenes for 'ortho run'. Paths are relative to this file; every field: docs/run.md, 'ortho run --schema'.",
-        "# 'ortho run FILE --dry-run' opens everything and makes nothing; 'ortho run FILE' makes what is missing.",
-        "output: out                     # a folder of each scene goes here",
-        "defaults:                       # what holds for all scenes; a scene below may say otherwise",
+        "# 'ortho run FILE --dry-run' checks all inputs; 'ortho run FILE' makes the scenes that are missing.",
+        "output: out                     # each scene gets a folder in it",
+        "defaults:                       # settings of all scenes; a scene below may override them",
         "  surface:",
         "    dem: auto                   # the Copernicus DEM under the scene; or a file:",
         "    # dem: dem.tif",
-        "    # vertical: egm2008         # its height datum, where the file does not declare it",
+        "    # vertical: egm2008         # its height datum, if the file does not declare it",
         "  # points:",
-        '  #   gcps: "gcps/{stem}.csv"   # control points: a file for each scene, by its name',
+        '  #   gcps: "gcps/{stem}.csv"   # control points: one file per scene, named like it',
         "  # match:",
-        "  #   reference: ortho.tif      # control points without a hand, from an ortho of the place",
+        "  #   reference: ortho.tif      # automatic control points, from an ortho of the place",
         "  # output:",
         '  #   crs: "EPSG:32636"         # default: the UTM zone of the scene',
         "  #   resolution: 2.5           # default: about that of the image",

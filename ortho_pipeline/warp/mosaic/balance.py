@@ -86,7 +86,7 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
     for one in opened:
         if one.source.palette:
             raise InputError(
-                "palette indices have no brightness to balance",
+                "palette indices have no brightness",
                 file=one.layer.ortho.path,
                 field="mosaic.balance",
                 remedy="leave it out",
@@ -115,11 +115,11 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
     if len(wrong):
         layer, band = wrong[0]
         raise InputError(
-            f"band {band + 1} of {placed.layers[layer].ortho.name} would need a gain of {gains[layer, band]:.3g}: it "
+            f"band {band + 1} of {placed.layers[layer].ortho.name} needs a gain of {gains[layer, band]:.3g}: it "
             "does not match the orthos that overlap it",
             file=placed.layers[layer].ortho.path,
             field="mosaic.balance",
-            remedy="leave the option out, or make a mosaic of scenes of one kind",
+            remedy="leave the option out, or combine only scenes of one kind",
         )
     return Balance(gains, offsets, before, after, len(cells), float(outlying.mean()))
 

@@ -67,7 +67,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
         If they do not share a grid, or differ in bands, type or nodata; if one has no accuracy that would decide.
     """
     if not orthos:
-        raise InputError("a mosaic needs an ortho", field="mosaic")
+        raise InputError("a mosaic needs at least one ortho", field="mosaic")
     without = [ortho for ortho in orthos if ortho.accuracy is None]
     if order == "most-accurate" and without:
         raise InputError(
@@ -122,7 +122,7 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
             raise InputError(
                 f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
                 file=ortho.path,
-                remedy="make a mosaic of scenes of one kind",
+                remedy="combine only scenes of one kind",
             )
 
 

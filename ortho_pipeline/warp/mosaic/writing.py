@@ -51,7 +51,7 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
         missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (placed.grid.width, placed.grid.height):
             raise InputError(
-                f"GDAL leaves out {', '.join(missing) or 'pixels'} in this VRT", file=path, remedy="write a COG"
+                f"a VRT of GDAL would lose {', '.join(missing) or 'pixels'}", file=path, remedy="write a COG"
             )
 
 

@@ -52,7 +52,7 @@ class Sun:
     def __post_init__(self) -> None:
         if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
             raise InputError(
-                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} degrees are no position of the sun",
+                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} deg are not a position of the sun",
                 field="output.sun",
                 remedy="give the azimuth from north and an elevation above 0, in degrees",
             )
