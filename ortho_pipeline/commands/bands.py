@@ -72,7 +72,7 @@ def register(
     elif opened.models:
         files["model"] = Path(folder) / f"{chosen.stem}_bands_model.json"
     for path in map(allowed, files.values()):
-        if path.resolve() in {one.resolve() for one in (*paths, place(opened.model_source))}:
+        if path.resolve() in {file.resolve() for file in (*paths, place(opened.model_source))}:
             raise InputError(
                 "this file is both input and output", file=path, field="folder", remedy="choose another folder"
             )
@@ -110,13 +110,13 @@ def _document(
         "sensor": scene.sensor,
         "reference": reference.stem,
         "bands": names,
-        "registrations": [one.row() for one in done],
+        "registrations": [registration.row() for registration in done],
         "inputs": read,
     }
 
 
 def _text(reference: Path, done: tuple[Registration, ...]) -> str:
-    rows = [one.row() for one in done]
+    rows = [registration.row() for registration in done]
     wide = max(len(row["band"]) for row in rows)
     lines = [
         f"{counted(len(rows) + 1, 'band')} in the geometry of {reference.name}; residuals of tie points in pixels:"

@@ -39,7 +39,7 @@ def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
     labels = ["_".join(part[-1:]) for part in parts]
     for depth in range(2, max(map(len, parts), default=1) + 1):
         labels = [
-            "_".join(part[-depth:]) if [one.lower() for one in labels].count(label.lower()) > 1 else label
+            "_".join(part[-depth:]) if [other.lower() for other in labels].count(label.lower()) > 1 else label
             for part, label in zip(parts, labels, strict=True)
         ]
     # The last resort: stems that differ by suffix alone (a.tif, a.jp2).
@@ -64,9 +64,9 @@ def scenes_of(
         If there are not as many as images.
     """
     scenes = [scene] * len(images) if isinstance(scene, SceneOptions) else list(scene)
-    for field, given in (("scene", scenes), ("models", models)):
-        if given and len(given) != len(images):
-            what = counted(len(given), field.removesuffix("s"))
+    for field, values in (("scene", scenes), ("models", models)):
+        if values and len(values) != len(images):
+            what = counted(len(values), field.removesuffix("s"))
             raise InputError(
                 f"{what} for {counted(len(images), 'image')}",
                 field=field,
@@ -74,7 +74,7 @@ def scenes_of(
                 if field == "models"
                 else "give one for each image, in their order",
             )
-    return [replace(one, model=model) for one, model in zip(scenes, models, strict=True)] if models else scenes
+    return [replace(options, model=model) for options, model in zip(scenes, models, strict=True)] if models else scenes
 
 
 def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str) -> int:
@@ -145,11 +145,11 @@ def points_of_images(
 
 def _means(name: str, image: str | os.PathLike[str]) -> bool:
     """Tell whether a name in a points file means an image: its stem, and as many folders as are named, are the same."""
-    said = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
+    named = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
     path = [part.lower() for part in Path(os.path.abspath(image)).parts]
-    if not said or len(said) > len(path) or said[:-1] != path[len(path) - len(said) : -1]:
+    if not named or len(named) > len(path) or named[:-1] != path[len(path) - len(named) : -1]:
         return False
-    return said[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(said[-1]).stem == PurePath(path[-1]).stem
+    return named[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(named[-1]).stem == PurePath(path[-1]).stem
 
 
 def start_of(

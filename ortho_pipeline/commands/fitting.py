@@ -120,9 +120,9 @@ def compare(
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: chosen.model}, model_source="control points")
     adjusted = Adjusted(opened, chosen, matched=matched)
-    asked = request.asked("scene", "surface", "match")
-    record = provenance(request, opened, heights, resolved.ledger.hashed(), command, asked)
-    made = report.build_report(
+    settings = request.asked("scene", "surface", "match")
+    record = provenance(request, opened, heights, resolved.ledger.hashed(), command, settings)
+    document = report.build_report(
         scene=opened,
         fit=chosen,
         surface=heights,
@@ -132,7 +132,7 @@ def compare(
         warnings=adjusted.warnings(heights),
         matching=adjusted.matching,
     )
-    write_report(made, chosen, files, matched, open_rasters(opened, request))
+    write_report(document, chosen, files, matched, open_rasters(opened, request))
     return CompareResult(resolved.scene, compared, matched, files)
 
 

@@ -50,17 +50,19 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
             )
         return image
     if options.model is None:
-        given: dict[str, Any] = dict(options.sensor_options)
+        sensor_options: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
-            if "rpc" in given:
+            if "rpc" in sensor_options:
                 raise InputError(
                     "two options choose the RPC",
                     field="scene.rpc",
                     remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")),
                 )
-            given["rpc"] = options.rpc
-        given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
-        return host.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
+            sensor_options["rpc"] = options.rpc
+        sensor_options = {
+            name: _perhaps_elsewhere(value, options.allow_network) for name, value in sensor_options.items()
+        }
+        return host.open_scene(image, options.sensor, sensor_options, crop_offset=options.crop_offset, **options.access)
     return _with_model_file(image, options, options.model)
 
 
@@ -123,8 +125,10 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     Scene
         Without models and of the sensor "points only" where no sensor recognises the image.
     """
-    asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
-    if needs_model or asked:
+    has_options = isinstance(image, Scene) or bool(
+        options.model or options.rpc or options.sensor or options.sensor_options
+    )
+    if needs_model or has_options:
         return open_scene(image, options)
     plugins = host.Host.discover()
     dataset = plugins.open_image(image, **options.access)

@@ -54,7 +54,7 @@ class Placement(NamedTuple):
             "sensor": self.scene.sensor,
             "model": fit.model_name,
             "points": {"control": int(fit.points.control.sum()), "check": int(fit.points.check.sum())},
-            "rmse_px": {which: one and one["total"] for which, one in fit.rmses.given().items()},
+            "rmse_px": {which: rmse and rmse["total"] for which, rmse in fit.rmses.given().items()},
             "coverage": self.footprint.coverage,
             "grid": {
                 "crs": crs_text(grid.crs),
@@ -80,18 +80,18 @@ def place_scene(resolved: Resolved) -> Placement:
     assert surface is not None, "who places a scene requires heights"
     model, size = adjusted.model, (adjusted.scene.width, adjusted.scene.height)
     with completed(adjusted.scene.model_source, of="model"):
-        found = lay(model, surface, *size)
-        found.require_coverage()
-        model = found.fitted(model)
+        footprint = lay(model, surface, *size)
+        footprint.require_coverage()
+        model = footprint.fitted(model)
         grid = resolved.grid
         if grid is None:
             with of_option("output.crs"):
                 crs = map_crs(output.crs) if output.crs else None
             grid = choose_grid(
-                model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+                model, footprint, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
             )
-        scene_pixels(model, found, grid)
-    return Placement(adjusted, model, found.surface, found, grid, resolved.request)
+        scene_pixels(model, footprint, grid)
+    return Placement(adjusted, model, footprint.surface, footprint, grid, resolved.request)
 
 
 def open_rasters(scene: Scene, request: Request) -> RasterSource:

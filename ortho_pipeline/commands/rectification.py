@@ -119,26 +119,26 @@ def rectify(
         stage("Layers and report", 0.0)
         accuracy = layers.write_layers(placed, budget, warped, files)
         angles = write_angles(placed, sun, files)
-        asked = request.asked("scene", "surface", "output", "match")
-        record = provenance(request, opened, placed.surface, hashing.result(), command, asked)
+        settings = request.asked("scene", "surface", "output", "match")
+        record = provenance(request, opened, placed.surface, hashing.result(), command, settings)
     _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
 
     def described() -> SceneReport:
-        made = _report_of(placed, exported, warped, record | read_since(before), [*complaints, *notes])
-        made = report.with_layers(made, accuracy=accuracy, angles=angles)
-        write_report(made, adjusted.fit, files, adjusted.matched, source)
+        outcome = _report_of(placed, exported, warped, record | read_since(before), [*complaints, *notes])
+        outcome = report.with_layers(outcome, accuracy=accuracy, angles=angles)
+        write_report(outcome, adjusted.fit, files, adjusted.matched, source)
         if acquired is not None:
             from ortho_pipeline.report.stac import write_item
 
-            write_item(files["stac"], made, files, acquired, name or stem)
-        return made
+            write_item(files["stac"], outcome, files, acquired, name or stem)
+        return outcome
 
-    made = attempted(described, files, *OF_REPORT)
+    outcome = attempted(described, files, *OF_REPORT)
     resolved.ledger.require_unchanged()
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
-    if isinstance(made, ReportError):
-        return Result(files, {"report": None}, "Ortho and model are complete, but the report is missing.", made)
-    return Result(files, {"report": made.to_json()}, report.summary_text(made))
+    if isinstance(outcome, ReportError):
+        return Result(files, {"report": None}, "Ortho and model are complete, but the report is missing.", outcome)
+    return Result(files, {"report": outcome.to_json()}, report.summary_text(outcome))
 
 
 @with_items
@@ -212,7 +212,7 @@ def export(
         For an unknown format, a geolocation without heights, and as `fit`.
     """
     chosen = check_formats(formats, Host.discover().formats)
-    files = {one.name: Path(folder) / f"{Path(image).stem}{one.ending}" for one in chosen}
+    files = {file_format.name: Path(folder) / f"{Path(image).stem}{file_format.ending}" for file_format in chosen}
     request = Request(image, scene, points, surface, match)
     inputs.check_paths(files, request)
     adjusted, heights = adjust(resolved := adjustable(request)), resolved.surface
@@ -231,8 +231,8 @@ def export(
             adjustment.rejected,
             force=force,
         )
-        for one in chosen:
-            job.write(one, files[one.name])
+        for file_format in chosen:
+            job.write(file_format, files[file_format.name])
     document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
     return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source, chosen))
 

@@ -143,10 +143,10 @@ class CompareResult:
         return {**document, **matching, "files": {name: str(path) for name, path in self.files.items()}}
 
 
-def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:
+def outputs(folder: str | os.PathLike[str], stem: str, options: OutputOptions) -> dict[str, Path]:
     """Return the paths of the outputs of a scene by what they are, of those that are made if all goes well."""
-    idle = {kind for field, kinds in _ASKED.items() if not getattr(asked, field) for kind in kinds}
-    idle |= {"visibility"} if asked.visibility == "nodata" else set()
+    idle = {kind for field, kinds in _ASKED.items() if not getattr(options, field) for kind in kinds}
+    idle |= {"visibility"} if options.visibility == "nodata" else set()
     return {kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in idle}
 
 

@@ -61,7 +61,7 @@ def sensors() -> dict[str, Any]:
 
 def formats() -> dict[str, str]:
     """Return the formats that models are written in, by name, each with its title; broken plugins are left out."""
-    return {name: one.title for name, one in host.Host(installed=True, lenient=True).formats.items()}
+    return {name: file_format.title for name, file_format in host.Host(installed=True, lenient=True).formats.items()}
 
 
 @with_items
@@ -140,9 +140,9 @@ def write_plots(
         If it is not a report, or PNG is asked for and matplotlib is not installed.
     """
     with completed(report_file, remedy="give an unmodified <stem>_report.json, or make the report again"):
-        made = report.read_report(located(report_file, allow_network=allow_network))
+        document = report.read_report(located(report_file, allow_network=allow_network))
         stem = Path(report_file).stem
-        files = report.write_plots(made, Path(folder), stem, kind)
+        files = report.write_plots(document, Path(folder), stem, kind)
     return Result(
         files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(ENDINGS['report'])}"
     )
@@ -171,9 +171,9 @@ def edge(
     InputError
         If there is no such edge, or none is found.
     """
-    given = None if edge is None else resolution.parse_edge(edge)
-    found = resolution.measure(image, edge=given, band=band, allow_network=allow_network)
-    document, stem = resolution.document(found, image, band), Path(image).stem
+    ends = None if edge is None else resolution.parse_edge(edge)
+    result = resolution.measure(image, edge=ends, band=band, allow_network=allow_network)
+    document, stem = resolution.document(result, image, band), Path(image).stem
     files = (
         {}
         if folder is None
@@ -181,7 +181,7 @@ def edge(
     )
     if files:
         write_json(files["json"], document)
-        write_text(files["svg"], resolution.plot(resolution.typical(found)).svg(alone=True) + "\n")
+        write_text(files["svg"], resolution.plot(resolution.typical(result)).svg(alone=True) + "\n")
     return Result(files, document, resolution.text(document))
 
 
@@ -213,8 +213,8 @@ def dem_check(
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
     extent = extent_of(ground_transform(plane, "EPSG:4979")(ground)[:, :2])
     heights = dem_as_stated(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
-    found = dem_accuracy.check_dem(heights, ground, plane, ids)
-    if not found.overall.count:
+    result = dem_accuracy.check_dem(heights, ground, plane, ids)
+    if not result.overall.count:
         raise InputError(
             f"none of the {counted(len(ids), 'check point')} has a height in this DEM",
             file=dem_file,
@@ -225,7 +225,7 @@ def dem_check(
         "dem": str(dem_file),
         "check_points": str(points),
         "surface": dict(heights.provenance),
-        **found.to_json(),
+        **result.to_json(),
     }
     return Result({}, document, dem_accuracy.summary(document))
 
@@ -266,9 +266,9 @@ def kept_files(*, verify: bool = False) -> dict[str, Any]:
     With `verify` also their state: sound, damaged, of another size, missing.
     """
     files = [
-        {"address": one.address, "path": str(one.path), "bytes": one.bytes, "sha256": one.sha256}
-        | ({"state": one.state()} if verify else {})
-        for one in kept.records()
+        {"address": record.address, "path": str(record.path), "bytes": record.bytes, "sha256": record.sha256}
+        | ({"state": record.state()} if verify else {})
+        for record in kept.records()
     ]
     return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": files}
 

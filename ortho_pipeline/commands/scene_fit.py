@@ -86,34 +86,36 @@ class Adjusted:
         """Return what people ought to know before they trust the numbers."""
         scene, adjusted, points = self.scene, self.fit, self.fit.points
         unsuited = [name for name in scene.models if name in scene.unsuited]
-        found = [*scene.notices, *(Notice("unsuited-model", scene.unsuited[name], model=name) for name in unsuited)]
-        found += adjusted.warnings
+        notices = [*scene.notices, *(Notice("unsuited-model", scene.unsuited[name], model=name) for name in unsuited)]
+        notices += adjusted.warnings
         if surface is not None:
-            found += surface.provenance.get("warnings", [])
+            notices += surface.provenance.get("warnings", [])
         if self.matched is not None:
-            found += self.matched.notices
-        found += self.notes
-        found += self._doubtful()
-        found += marks_warning(points.select(adjusted.used & points.control))
+            notices += self.matched.notices
+        notices += self.notes
+        notices += self._doubtful()
+        notices += marks_warning(points.select(adjusted.used & points.control))
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
             outside = np.array(points.ids)[~inside].tolist()
             text = f"points outside the image, but used: {', '.join(outside)}"
-            found.append(Notice("outside-of-image", text, points=outside))
-        found += self._elsewhere()
+            notices.append(Notice("outside-of-image", text, points=outside))
+        notices += self._elsewhere()
         if len(adjusted.param_names):
-            found += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
+            notices += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
             text = "no redundancy: the RMSE of the control points is zero by construction and proves nothing"
-            found.append(Notice("no-redundancy", text))
+            notices.append(Notice("no-redundancy", text))
         checks = int(points.check.sum())
         if len(points) and checks < ENOUGH_CHECK_POINTS:
-            found.append(few_check_points(checks))
+            notices.append(few_check_points(checks))
         if self.removed:
-            names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
+            names = ", ".join(f"{parameter.name} (t {parameter.t:.1f})" for parameter in self.removed)
             text = f"removed parameters that the points do not justify: {names}"
-            found.append(Notice("parameters-removed", text, parameters=[one.name for one in self.removed]))
-        return tuple(dict.fromkeys(found))
+            notices.append(
+                Notice("parameters-removed", text, parameters=[parameter.name for parameter in self.removed])
+            )
+        return tuple(dict.fromkeys(notices))
 
     def _doubtful(self) -> list[Notice]:
         """Return a notice for each point left out, and each that contradicts the others unless one of all says it."""
@@ -121,7 +123,7 @@ class Adjusted:
             Notice("left-out", f"point {name} was rejected: {reason}", point=name, reason=reason)
             for name, reason in self.fit.rejected
         ]
-        told = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
+        named = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
         return left + [
             Notice(
                 "contradicting-point",
@@ -130,7 +132,7 @@ class Adjusted:
                 role=one.role,
             )
             for one in self.fit.outlying
-            if one.role == "control" or one.id not in told
+            if one.role == "control" or one.id not in named
         ]
 
     def _elsewhere(self) -> list[Notice]:
@@ -278,7 +280,7 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
 def _reference_off(adjusted: Fit) -> Array | None:
     """Return by how much (m, x and y) each measured check point puts the reference off, if they agree that it is."""
     points = adjusted.points
-    measured = points.tests & (points.groups < 0) & ~np.isin(points.ids, [one.id for one in adjusted.outlying])
+    measured = points.tests & (points.groups < 0) & ~np.isin(points.ids, [point.id for point in adjusted.outlying])
     shifts = in_metres(adjusted, adjusted.residuals)[measured]
     shifts = shifts[np.isfinite(shifts).all(axis=1)]
     if len(shifts) < _AGREE:

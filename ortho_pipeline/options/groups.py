@@ -62,9 +62,9 @@ class SceneOptions:
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:
         """Files besides the image that the scene is read from, by what they are."""
-        given = {name: value for name, value in self.sensor_options.items() if _is_file(value)}
+        sensor_files = {name: value for name, value in self.sensor_options.items() if _is_file(value)}
         own = {"RPC": self.rpc, "model": self.model}
-        return {**{role: path for role, path in own.items() if path is not None}, **given}
+        return {**{role: path for role, path in own.items() if path is not None}, **sensor_files}
 
 
 def _is_file(value: object) -> bool:

@@ -100,7 +100,7 @@ _T = TypeVar("_T")
 
 def options_of(group: type) -> dict[str, Option]:
     """Return the option of each field of a group."""
-    return {one.name: get_args(one.type)[1] for one in fields(group)}
+    return {field.name: get_args(field.type)[1] for field in fields(group)}
 
 
 def documented(group: type[_T]) -> type[_T]:
@@ -108,13 +108,13 @@ def documented(group: type[_T]) -> type[_T]:
     lines = []
     for one in fields(group):  # type: ignore[arg-type]
         option: Option = get_args(one.type)[1]
-        said = " ".join(part for part in (option.help, option.unset and f"Default: {option.unset}.") if part)
+        text = " ".join(part for part in (option.help, option.unset and f"Default: {option.unset}.") if part)
         kind = (
             f"{{{', '.join(map(repr, option.choices))}}}"
             if option.choices
             else inspect.formatannotation(get_args(one.type)[0])
         )
-        lines.append(f"{one.name} : {kind}\n    {said}")
+        lines.append(f"{one.name} : {kind}\n    {text}")
     group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
     types = {field.name: get_args(field.type)[0] for field in fields(group)}  # type: ignore[arg-type]
     group.__init__.__annotations__ = {**types, "return": None}
@@ -124,6 +124,11 @@ def documented(group: type[_T]) -> type[_T]:
 
 def _as_called(self: Any) -> str:
     """Return options as they are written: those alone that are not as by default."""
-    usual = {one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)}
-    said = ((name, getattr(self, name)) for name in usual)
-    return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in said if value != usual[name])})"
+    defaults = {
+        field.name: field.default if field.default_factory is MISSING else field.default_factory()
+        for field in fields(self)
+    }
+    values = ((name, getattr(self, name)) for name in defaults)
+    return (
+        f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in values if value != defaults[name])})"
+    )

@@ -188,5 +188,5 @@ class OutputOptions:
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:
         """Rasters that an ortho is made with, apart from the image, by role."""
-        given = {"other ortho": self.fill_from, "grid": self.like}
-        return {role: path for role, path in given.items() if path is not None}
+        rasters = {"other ortho": self.fill_from, "grid": self.like}
+        return {role: path for role, path in rasters.items() if path is not None}

@@ -86,11 +86,11 @@ def gather(
             document["ties"] = tied.to_json()
             text.append(tied.summary())
         if match.reference:
-            found = _matches(opened, match, heights, scenes[0])
-            tables.append(found.table)
-            notices += found.notices
-            document |= found.document
-            text += found.text
+            matches = _matches(opened, match, heights, scenes[0])
+            tables.append(matches.table)
+            notices += matches.notices
+            document |= matches.document
+            text += matches.text
     elif observes(options, surface):
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
         heights = open_surface(surface, scenes[0], under=alone)
@@ -230,19 +230,19 @@ def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOption
     first: InputError | None = None
     for label, scene in scenes.items():
         try:
-            found = match_scene(scene, match, surface, opened)
+            matched = match_scene(scene, match, surface, opened)
         except InputError as error:
             first = first or error
             notices.append(
                 Notice("no-matches", Text("not matched with the reference: ", error.message)).in_image(label)
             )
             continue
-        points = found.matches.points
+        points = matched.matches.points
         tables[label] = replace(
             points, ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT)
         )
-        notices += [notice.in_image(label) for notice in found.notices]
-        document[label] = found.to_json()
+        notices += [notice.in_image(label) for notice in matched.notices]
+        document[label] = matched.to_json()
         text.append(f"{label}: {counted(len(points), 'match', 'matches')} with the reference")
     if not tables and first is not None:
         raise first
@@ -300,11 +300,11 @@ def read_points(
 
 def _sigmas(text: str) -> list[float]:
     """Return what ``XY`` or ``XY,H`` says."""
-    found = numbers_of(text)
-    if len(found) not in (1, 2) or not all(sigma > 0 for sigma in found):
+    sigmas = numbers_of(text)
+    if len(sigmas) not in (1, 2) or not all(sigma > 0 for sigma in sigmas):
         raise InputError(
             f"{text!r} is neither one nor two positive numbers",
             field="points.ground_sigma",
             remedy="give the sigma in plan, or in plan and height, in metres, such as 0.5,1",
         )
-    return found
+    return sigmas

@@ -77,8 +77,8 @@ def match(
     matched = None if adjusted is None else adjusted.matched
     if matched is None:
         matched = match_scene(opened, match, heights, scene)
-    asked = request.asked("scene", "surface", "match")
-    record = provenance(request, opened, heights, resolved.ledger.hashed(), None, asked)
+    settings = request.asked("scene", "surface", "match")
+    record = provenance(request, opened, heights, resolved.ledger.hashed(), None, settings)
     points = matched.matches.points
     # Those of a bundle or a strip serve its other images too, if they say where they were measured.
     said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"
@@ -109,7 +109,7 @@ def _write_page(
     adjusted: Adjusted, surface: Surface | None, record: Mapping[str, Any], files: Mapping[str, Path]
 ) -> None:
     """Write what there is to see of the matches and of the model that they make."""
-    made = reports.build_report(
+    report = reports.build_report(
         scene=adjusted.scene,
         fit=adjusted.fit,
         surface=surface,
@@ -117,6 +117,6 @@ def _write_page(
         matching=adjusted.matching,
         warnings=adjusted.warnings(surface),
     )
-    reports.write_report_json(made, files["report"])
+    reports.write_report_json(report, files["report"])
     matches = None if adjusted.matched is None else adjusted.matched.matches
-    reports.write_report_html(made, files["html"], matches=matches)
+    reports.write_report_html(report, files["html"], matches=matches)

@@ -75,7 +75,7 @@ def settled_options(
     UndecidedCrop
         If nothing that is given decides.
     """
-    found, notices = list(scenes), []
+    settled, notices = list(scenes), []
     for number, (image, options) in enumerate(zip(images, scenes, strict=True)):
         # Few images are crops: they alone are opened once more.
         if options.crop_offset is not None or noted_offset(open_dataset(image, **options.access)) is None:
@@ -89,8 +89,8 @@ def settled_options(
             if decided is None:
                 raise
             notices.append(undecided.settled(*decided).notices[-1].in_image(os.fspath(image)))
-            found[number] = replace(options, crop_offset=undecided.offset if decided[0] else (0.0, 0.0))
-    return found, notices
+            settled[number] = replace(options, crop_offset=undecided.offset if decided[0] else (0.0, 0.0))
+    return settled, notices
 
 
 def _by_points(undecided: UndecidedCrop, points: Points) -> tuple[bool, str] | None:

@@ -138,13 +138,13 @@ class Matched:
             reasons={name: count for name, count in reasons.items() if count},
             levels=tuple(
                 MatchLevel(
-                    factor=one.factor,
-                    radius=one.radius,
-                    chips=one.chips,
-                    agreeing=one.agreeing,
-                    shift_px=(-one.shift[0], -one.shift[1]),
+                    factor=level.factor,
+                    radius=level.radius,
+                    chips=level.chips,
+                    agreeing=level.agreeing,
+                    shift_px=(-level.shift[0], -level.shift[1]),
                 )
-                for one in matches.levels
+                for level in matches.levels
             ),
             shift_px=(shift[0], shift[1]),
             shift_m=float(np.hypot(*shift)) * self.pixel,
@@ -181,17 +181,20 @@ class Matched:
             part = np.clip(self.matches.image[mask] / self.size * side, 0, side - 1).astype(int)
             counts[name] = np.bincount(part[:, 1] * side + part[:, 0], minlength=side**2).reshape(side, side)
         share = float((counts["kept"] > 0).mean())
-        return MatchCoverage.model_validate({"share": share, **{name: one.tolist() for name, one in counts.items()}})
+        return MatchCoverage.model_validate(
+            {"share": share, **{name: count.tolist() for name, count in counts.items()}}
+        )
 
     def summary(self) -> list[tuple[str, str]]:
         """Return what people read of it, as rows of a name and a text."""
         from ortho_pipeline.imaging.matching import REASONS
 
-        said = self.record
-        column, row = said.shift_px
-        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said.reasons.items())
+        record = self.record
+        column, row = record.shift_px
+        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in record.reasons.items())
         levels = "; ".join(
-            f"{one.agreeing} of {counted(one.chips, 'chip')} agree at 1/{one.factor} resolution" for one in said.levels
+            f"{one.agreeing} of {counted(one.chips, 'chip')} agree at 1/{one.factor} resolution"
+            for one in record.levels
         )
         sigma = self.options.reference_sigma
         return [
@@ -200,20 +203,21 @@ class Matched:
                 ", ".join(Path(one).name for one in self.references)
                 + (f", accuracy {metres(sigma)} per axis" if sigma else ", accuracy not stated"),
             ),
-            ("matches", f"{said.kept} of {said.tried} tried{': ' + reasons if reasons else ''}"),
+            ("matches", f"{record.kept} of {record.tried} tried{': ' + reasons if reasons else ''}"),
             (
                 "",
-                f"{said.control} control, {said.check} check (one cell in five); they cover "
-                f"{said.coverage.share:.0%} of the image",
+                f"{record.control} control, {record.check} check (one cell in five); they cover "
+                f"{record.coverage.share:.0%} of the image",
             ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             (
                 "model off",
-                f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), {metres(said.shift_m)}",
+                f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
+                f"{metres(record.shift_m)}",
             ),
             (
                 "accuracy",
-                f"{px(said.sigma_px)} (median of the matches), relative to the reference: {said.components.text()}",
+                f"{px(record.sigma_px)} (median of the matches), relative to the reference: {record.components.text()}",
             ),
         ]
 
@@ -263,7 +267,7 @@ def match_scene(
     )
     with _of_references():
         matches = match(view, references, settings)
-    paths = tuple(one.path for one in references)
+    paths = tuple(reference.path for reference in references)
     notices = [
         *_default_search(search),
         *_made_of_scene(scene, references, matches),
@@ -308,8 +312,8 @@ def open_reference_views(
         )
     with _of_references():
         references = open_references(options.reference, options.reference_bands or (), **opened.access)
-    for one in references:
-        _refuse_scene(scene, one)
+    for reference in references:
+        _refuse_scene(scene, reference)
     rasters = scene.rasters or (scene.path,)
     return SceneView(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
 
@@ -406,18 +410,18 @@ def _bands_apart(matches: Matches) -> list[Notice]:
     if not disagreeing(bands):
         return []
     agree = agreeing(bands)
-    said = ", ".join(
-        f"band {one.band} by {one.shift[0]:+.2f} ± {one.sigma[0]:.2f}, {one.shift[1]:+.2f} ± {one.sigma[1]:.2f}"
-        for one in bands
+    shifts = ", ".join(
+        f"band {band.band} by {band.shift[0]:+.2f} ± {band.sigma[0]:.2f}, {band.shift[1]:+.2f} ± {band.sigma[1]:.2f}"
+        for band in bands
     )
     text = Text(
         "bands of the reference give different positions of the scene, so the result is uncertain by ",
-        f"{spread(bands):.1f} px. Shifts of single bands from the result (column, row, px): {said}. ",
+        f"{spread(bands):.1f} px. Shifts of single bands from the result (column, row, px): {shifts}. ",
         "Choose bands that agree and look like the scene: ",
         Setting("match.reference_bands", ",".join(map(str, agree))),
     )
-    found = [{"band": one.band, "shift_px": list(one.shift), "sigma_px": list(one.sigma)} for one in bands]
-    return [Notice("bands-disagree", text, bands=found, agreeing=list(agree), spread_px=spread(bands))]
+    fields = [{"band": band.band, "shift_px": list(band.shift), "sigma_px": list(band.sigma)} for band in bands]
+    return [Notice("bands-disagree", text, bands=fields, agreeing=list(agree), spread_px=spread(bands))]
 
 
 # -- what a reference is not -----------------------------------------------------------------------------------------
@@ -439,7 +443,14 @@ def _refuse_scene(scene: Scene, reference: Reference) -> None:
 def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Matches) -> list[Notice]:
     """Return a notice if the reference looks as if it were made of the scene."""
     name, alike, agreement = Path(scene.path).name, median_correlation(matches), _agreement(matches)
-    why = next((f"{Path(one.path).name} names {name} as its source" for one in references if _names(one, name)), None)
+    why = next(
+        (
+            f"{Path(reference.path).name} names {name} as its source"
+            for reference in references
+            if _names(reference, name)
+        ),
+        None,
+    )
     if why is None and alike >= _SAME and agreement < _EXACT:
         why = f"scene and reference agree to {px(agreement)} (correlation {alike:.3f}), which two images hardly do"
     if why is None:
@@ -473,12 +484,14 @@ def _agreement(matches: Matches) -> float:
 def median_correlation(matches: Matches) -> float:
     """Return the median correlation of the intensities of scene and target in the chips that were kept."""
     kept = matches.reason == ""
-    one, other = (chips[kept].reshape(int(kept.sum()), -1).astype(float) for chips in (matches.scene, matches.target))
-    seen = np.isfinite(one) & np.isfinite(other)
-    count = np.maximum(seen.sum(axis=1), 1)[:, None]
-    one, other = (
-        np.where(seen, values - np.where(seen, values, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
-        for values in (one, other)
+    scene, target = (
+        chips[kept].reshape(int(kept.sum()), -1).astype(float) for chips in (matches.scene, matches.target)
     )
-    length = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-    return float(np.median((one * other).sum(axis=1) / np.where(length > 0, length, 1.0)))
+    seen = np.isfinite(scene) & np.isfinite(target)
+    count = np.maximum(seen.sum(axis=1), 1)[:, None]
+    scene, target = (
+        np.where(seen, values - np.where(seen, values, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
+        for values in (scene, target)
+    )
+    length = np.linalg.norm(scene, axis=1) * np.linalg.norm(target, axis=1)
+    return float(np.median((scene * target).sum(axis=1) / np.where(length > 0, length, 1.0)))

@@ -81,15 +81,15 @@ class Tied:
             "sigma_px": float(np.median(self.points.sigma_image)),
             "pairs": [
                 {
-                    "images": [names[one.images[0]], names[one.images[1]]],
-                    "ties": len(self.ties.of_pair(*one.images)),
-                    "tried": one.tried,
-                    "matched": one.ties,
-                    "shift_px": [-one.shift[0], -one.shift[1]],
-                    "height_m": None if one.components is None else one.components.height,
-                    "reason": one.reason,
+                    "images": [names[pair.images[0]], names[pair.images[1]]],
+                    "ties": len(self.ties.of_pair(*pair.images)),
+                    "tried": pair.tried,
+                    "matched": pair.ties,
+                    "shift_px": [-pair.shift[0], -pair.shift[1]],
+                    "height_m": None if pair.components is None else pair.components.height,
+                    "reason": pair.reason,
                 }
-                for one in self.ties.pairs
+                for pair in self.ties.pairs
             ],
         }
         document: dict[str, Any] = json_value(found)
@@ -97,12 +97,12 @@ class Tied:
 
     def summary(self) -> str:
         """Return what people read of it."""
-        said = self.to_json()
+        document = self.to_json()
         tracks = ", ".join(
-            f"{number} in {counted(int(count), 'image')}" for count, number in said["tracks_by_images"].items()
+            f"{number} in {counted(int(count), 'image')}" for count, number in document["tracks_by_images"].items()
         )
-        lines = [f"{counted(said['tracks'], 'tie point')}: {tracks}; median sigma {px(said['sigma_px'])}"]
-        for one in said["pairs"]:
+        lines = [f"{counted(document['tracks'], 'tie point')}: {tracks}; median sigma {px(document['sigma_px'])}"]
+        for one in document["pairs"]:
             pair = f"{one['images'][0]} - {one['images'][1]}"
             if one["reason"]:
                 lines.append(f"{pair}: no tie points ({one['reason']})")
@@ -156,14 +156,14 @@ def tie_scenes(
     usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
     stated = typical_sigma(surface)
     sigma = usual if stated is None else stated
-    found = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
-    notices = [*_few(found, tuple(scenes))]
+    ties = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
+    notices = [*_few(ties, tuple(scenes))]
     if stated is None:
         text = Text(
             f"accuracy of the heights not given; assuming {metres(sigma)}. Set it with ", Setting("surface.sigma")
         )
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
-    return Tied(_points(found, tuple(scenes)), found, search, sigma, tuple(notices))
+    return Tied(_points(ties, tuple(scenes)), ties, search, sigma, tuple(notices))
 
 
 def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
@@ -187,7 +187,7 @@ def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
 
 def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
     """Return notices of pairs that were not tied, and of those with few ties."""
-    found = []
+    notices = []
     for one in ties.pairs:
         pair = f"{names[one.images[0]]} and {names[one.images[1]]}"
         number = len(ties.of_pair(*one.images))
@@ -195,8 +195,8 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
             continue
         why = f" ({one.reason})" if one.reason else ""
         text = f"only {counted(number, 'tie point')} between {pair}, which show the same ground{why}"
-        found.append(Notice("few-ties", text, images=[names[image] for image in one.images], count=number))
-    return found
+        notices.append(Notice("few-ties", text, images=[names[image] for image in one.images], count=number))
+    return notices
 
 
 @with_items
@@ -231,14 +231,14 @@ def ties(
             "tie points cannot be written in this format", file=output, field="output", remedy="give a .csv file"
         )
     require_heights(surface)
-    given = scenes_of(images, scene)
-    for image, own in zip(images, given, strict=True):
+    options = scenes_of(images, scene)
+    for image, own in zip(images, options, strict=True):
         inputs.check_paths(files, Request(image, own, surface=surface))
-    given, placed = settled_options(images, given, surface)
-    opened = (inputs.open_scene(image, own) for image, own in zip(images, given, strict=True))
+    options, placed = settled_options(images, options, surface)
+    opened = (inputs.open_scene(image, own) for image, own in zip(images, options, strict=True))
     scenes = dict(zip(names, opened, strict=True))
-    heights = open_surface(surface, given[0], under=scenes.values())
-    tied = tie_scenes(scenes, match, heights, given[0])
+    heights = open_surface(surface, options[0], under=scenes.values())
+    tied = tie_scenes(scenes, match, heights, options[0])
     write_text(output, _csv(tied.points))
     notices = placed + [notice.in_image(name) for name, one in scenes.items() for notice in one.notices]
     return Result(files, {"ties": tied.to_json(), **to_document([*notices, *tied.notices])}, tied.summary())

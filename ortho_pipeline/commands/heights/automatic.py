@@ -78,15 +78,15 @@ def extent_under(scene: Scene) -> Extent:
     levels = np.clip(model.height_range, *SANE_HEIGHTS)
     to_degrees = ground_transform(model.crs, "EPSG:4979")
     ground = np.concatenate([to_degrees(model.image_to_ground(ring, float(level))) for level in levels])
-    found = extent_of(ground[:, :2])
-    if found is None:
+    extent = extent_of(ground[:, :2])
+    if extent is None:
         raise InputError(
             "no pixel of the image border meets the ground: the model belongs to another image",
             file=scene.path,
             field="model",
             remedy="give the metadata of this image",
         )
-    return found
+    return extent
 
 
 def _require_geoid(allow_network: bool) -> None:

@@ -162,7 +162,7 @@ def has_surface(options: SurfaceOptions) -> bool:
         "surface.sigma": options.sigma is not None and options.height is None,
         "surface.source": options.source is not None,
     }
-    for field in (field for field, given in idle.items() if given and options.dem is None):
+    for field in (field for field, is_set in idle.items() if is_set and options.dem is None):
         raise InputError(
             "this option is for a DEM, and none is given",
             field=field,
@@ -173,7 +173,7 @@ def has_surface(options: SurfaceOptions) -> bool:
 
 def sigma_file(options: SurfaceOptions) -> str | os.PathLike[str] | None:
     """Return the raster of standard deviations of heights, None where there is none."""
-    given = options.sigma
-    if given is None or isinstance(given, float | int):
+    sigma = options.sigma
+    if sigma is None or isinstance(sigma, float | int):
         return None
-    return given if isinstance(given, os.PathLike) or math.isnan(number_of(given)) else None
+    return sigma if isinstance(sigma, os.PathLike) or math.isnan(number_of(sigma)) else None

@@ -61,7 +61,7 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
     sight, heights = Sight(placed.model, placed.grid), placed.footprint.heights
     resources = Resources(output.memory, output.threads)
     size = placed.scene.width, placed.scene.height
-    found = angles.write_angles(
+    result = angles.write_angles(
         sight,
         placed.surface,
         size,
@@ -71,7 +71,7 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
         sun=sun,
         resources=resources,
     )
-    layer = AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
+    layer = AnglesLayer(view_zenith_deg=result.view_zenith_deg, sun_deg=None, shadow_share=None)
     write_text(files["angles_style"], angles_style(layer))
     if sun is None:
         del files["shadow"]
@@ -80,5 +80,5 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
         sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources, driver=output.format
     )
     return AnglesLayer(
-        view_zenith_deg=found.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
+        view_zenith_deg=result.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
     )

@@ -103,9 +103,9 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
         "heights": Text("the heights (", Setting("surface.sigma"), ")"),
         "reference": Text("the reference (", Setting("match.reference_sigma"), ")"),
     }
-    said = Text.joined(" and of ", (names[name] for name in unknown))
+    sources = Text.joined(" and of ", (names[name] for name in unknown))
     text = Text(
-        "the accuracy raster does not include the errors of ", said, ", which are unknown; real errors are larger"
+        "the accuracy raster does not include the errors of ", sources, ", which are unknown; real errors are larger"
     )
     return known, [Notice("accuracy-in-part", text, unknown=unknown)]
 
@@ -117,8 +117,8 @@ def stated_accuracy(model: SensorModel) -> float | None:
     if not isinstance(model, RPC):
         return None
     # What is not positive stands for unknown: -1 in the standard, 0 of some programs.
-    given = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
-    return math.hypot(*given) if given else None
+    errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
+    return math.hypot(*errors) if errors else None
 
 
 def _covariance(placed: Placement) -> Array | None:
@@ -130,8 +130,10 @@ def _covariance(placed: Placement) -> Array | None:
         return predictive(fit.covariance, math.inf if fit.sigma0 is None else fit.degrees_of_freedom)
     if before is None or not placed.model.param_names:
         return None
-    found = _of_record(before, placed.model.param_names)
-    return None if found is None else predictive(found, _number(before.get("statistics"), "degrees_of_freedom"))
+    covariance = _of_record(before, placed.model.param_names)
+    return (
+        None if covariance is None else predictive(covariance, _number(before.get("statistics"), "degrees_of_freedom"))
+    )
 
 
 def _of_record(adjusted: Mapping[str, Any], names: tuple[str, ...]) -> Array | None:
@@ -166,12 +168,12 @@ def _reference(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None) -
 
     Its standard deviation (m), and whether it is unknown.
     """
-    said = [one.fields for one in warnings if one.code == "relative-to-reference"]
-    said += [one for one in (before or {}).get("notices", ()) if one.get("code") == "relative-to-reference"]
-    if not said:
+    notices = [notice.fields for notice in warnings if notice.code == "relative-to-reference"]
+    notices += [notice for notice in (before or {}).get("notices", ()) if notice.get("code") == "relative-to-reference"]
+    if not notices:
         return 0.0, False
-    sigma = said[0].get("reference_sigma_m")
-    return 0.0 if said[0].get("in_sigmas") else float(sigma or 0.0), not sigma
+    sigma = notices[0].get("reference_sigma_m")
+    return 0.0 if notices[0].get("in_sigmas") else float(sigma or 0.0), not sigma
 
 
 def _common(placed: Placement) -> float:
@@ -186,18 +188,18 @@ def _common(placed: Placement) -> float:
 
 
 def _assumptions(budget: Budget, surface: Surface) -> list[str]:
-    said = [
+    assumptions = [
         "errors of model, heights and reference are independent",
         "the model is right apart from its parameters",
         "an error is the position of a point in the ortho, at its height, minus its true position",
     ]
     if budget.datum:
-        said.insert(1, f"the height datum is accurate to {metres(budget.datum)}")
+        assumptions.insert(1, f"the height datum is accurate to {metres(budget.datum)}")
     if budget.stated is not None:
-        said.append(f"the model is accurate to {metres(budget.stated)} per axis, as its vendor states")
+        assumptions.append(f"the model is accurate to {metres(budget.stated)} per axis, as its vendor states")
     if isinstance(surface.sigma, float | int):
-        said.append(f"the heights are accurate to {metres(surface.sigma)} everywhere")
-    return said
+        assumptions.append(f"the heights are accurate to {metres(surface.sigma)} everywhere")
+    return assumptions
 
 
 def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | None = None) -> Path | Hiding:
@@ -220,7 +222,7 @@ def write_layers(
 
     budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
     scene, output = placed.scene, placed.request.output
-    found = write_accuracy(
+    result = write_accuracy(
         budget,
         Sight(placed.model, placed.grid),
         placed.surface,
@@ -231,28 +233,28 @@ def write_layers(
         resources=Resources(output.memory, output.threads),
         metadata={"ASSUMPTIONS": "; ".join(known.assumptions), "UNKNOWN": ", ".join(known.unknown) or "nothing"},
     )
-    if not found.known:
+    if not result.known:
         raise InputError(
             "the raster of height accuracy does not overlap the ortho",
             field="surface.sigma",
             remedy="give a raster of this area, or a number",
         )
-    layer = _record(found, known, output.layer_step)
+    layer = _record(result, known, output.layer_step)
     write_text(files["accuracy_style"], accuracy_style(layer))
     return layer
 
 
-def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
-    shares, budget = dict(found.shares), known.budget
+def _record(result: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
+    shares, budget = dict(result.shares), known.budget
     even = shares.pop("even")
     stated = 0.0 if known.adjusted or not budget.stated else budget.stated**2
     part = stated / (stated + budget.reference**2) if even else 0.0
     by = "points" if known.adjusted else "model"
-    common = min(known.common / max(sum(sigma**2 for sigma in found.sigma), 1e-300), shares["model"])
+    common = min(known.common / max(sum(sigma**2 for sigma in result.sigma), 1e-300), shares["model"])
     return AccuracyLayer(
-        ce90_m=found.ce90,
-        range_m=found.quantiles,
-        sigma_m=found.sigma,
+        ce90_m=result.ce90,
+        range_m=result.quantiles,
+        sigma_m=result.sigma,
         shares={
             by: shares["model"] - common + even * part,
             "heights": shares["heights"],
@@ -260,10 +262,10 @@ def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
             "interpolation": shares["interpolation"],
         },
         unknown=known.unknown,
-        known=found.known,
+        known=result.known,
         assumptions=known.assumptions,
-        cell=found.cell * step,
-        cells=tuple(tuple(row) for row in json_value(_rounded(found.cells))),
+        cell=result.cell * step,
+        cells=tuple(tuple(row) for row in json_value(_rounded(result.cells))),
     )
 
 

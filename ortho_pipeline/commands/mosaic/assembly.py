@@ -170,8 +170,8 @@ def assemble(
     return document, attempted(lambda: write_page(document, files["page"], files["mosaic"], owners), files, "page")
 
 
-def _of(found: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]) -> dict[str, Any] | None:
-    return found.get((seam["first"], seam["second"]))
+def _of(seams: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]) -> dict[str, Any] | None:
+    return seams.get((seam["first"], seam["second"]))
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

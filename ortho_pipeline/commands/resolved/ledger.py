@@ -201,9 +201,9 @@ def read_since(before: int) -> dict[str, Any]:
 
 def _as_asked(options: Any) -> dict[str, Any]:
     """Return options as JSON values, without the budget of the machine, on which no result depends."""
-    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    left_out = {"memory", "threads", *(key for key in _IF_GIVEN if given.get(key) is None)}
-    return {key: _text_of(value) for key, value in given.items() if key not in left_out}
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    left_out = {"memory", "threads", *(key for key in _IF_GIVEN if values.get(key) is None)}
+    return {key: _text_of(value) for key, value in values.items() if key not in left_out}
 
 
 def _text_of(value: Any) -> Any:

@@ -66,11 +66,11 @@ def _grid_like(request: Request) -> Grid | None:
     output = request.output
     if output.like is None:
         return None
-    given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
-    if given:
+    conflicts = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
+    if conflicts:
         raise InputError(
-            Text(Setting("output.like"), " sets the grid, which ", Setting(f"output.{given[0]}"), " would change"),
-            field=f"output.{given[0]}",
+            Text(Setting("output.like"), " sets the grid, which ", Setting(f"output.{conflicts[0]}"), " would change"),
+            field=f"output.{conflicts[0]}",
             remedy="leave out one of them",
         )
     with completed(os.fspath(output.like), field="output.like"):

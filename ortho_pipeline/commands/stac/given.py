@@ -36,30 +36,30 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
     def wrapper(*args: _P.args, **named: _P.kwargs) -> _R:
         bound = signature.bind(*args, **named)
         bound.apply_defaults()
-        given = bound.arguments
-        place = next((name for name, value in given.items() if isinstance(value, SceneOptions)), None)
-        scene = _of_first(given) if place is None else cast(SceneOptions, given[place])
-        for name, value in given.items():
+        arguments = bound.arguments
+        place = next((name for name, value in arguments.items() if isinstance(value, SceneOptions)), None)
+        scene = _of_first(arguments) if place is None else cast(SceneOptions, arguments[place])
+        for name, value in arguments.items():
             if name == _IMAGE:
-                given[name], scene = resolved(value, scene)
+                arguments[name], scene = resolved(value, scene)
             elif name == _IMAGES:
-                given[name] = [_one_of_several(image, scene) for image in value]
+                arguments[name] = [_one_of_several(image, scene) for image in value]
             elif name == _DEM and not isinstance(value, SurfaceOptions | None):
-                given[name] = heights_given(value, scene)
+                arguments[name] = heights_given(value, scene)
             else:
-                given[name] = _in_options(value, scene)
+                arguments[name] = _in_options(value, scene)
         if place is not None:
-            given[place] = scene
+            arguments[place] = scene
         if scene.allow_network:
-            ask_beside(*_far(given), allow_network=True)
+            ask_beside(*_far(arguments), allow_network=True)
         return command(*bound.args, **bound.kwargs)
 
     return wrapper
 
 
-def _of_first(given: dict[str, Any]) -> SceneOptions:
+def _of_first(arguments: dict[str, Any]) -> SceneOptions:
     """Return how the first image is opened, where there are options for each: their permissions are the same."""
-    lists = (value for value in given.values() if isinstance(value, list | tuple) and value)
+    lists = (value for value in arguments.values() if isinstance(value, list | tuple) and value)
     return next((value[0] for value in lists if isinstance(value[0], SceneOptions)), SceneOptions())
 
 
@@ -157,10 +157,10 @@ def _points(place: Location, scene: SceneOptions) -> str:
     return item.table(key).href
 
 
-def _far(given: dict[str, Any]) -> list[Any]:
+def _far(arguments: dict[str, Any]) -> list[Any]:
     """Return the files on other machines that a command is about to open."""
-    images = [given.get(_IMAGE), *(given.get(_IMAGES) or ())]
-    for value in given.values():
+    images = [arguments.get(_IMAGE), *(arguments.get(_IMAGES) or ())]
+    for value in arguments.values():
         if isinstance(value, SurfaceOptions):
             images.append(None if value.dem is None or Location(value.dem).is_collection else value.dem)
         elif isinstance(value, MatchOptions):

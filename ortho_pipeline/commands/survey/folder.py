@@ -66,7 +66,7 @@ class FolderSurvey:
 
     def of(self, kind: Kind) -> list[str]:
         """Return the paths of a kind, from the folder."""
-        return [one.path for one in self.found if one.kind == kind]
+        return [file.path for file in self.found if file.kind == kind]
 
     def beside(self, scene: str, kind: Kind) -> list[str]:
         """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
@@ -74,14 +74,14 @@ class FolderSurvey:
         What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
         if it has some.
         """
-        mine, others = Path(scene).stem, {Path(one).stem for one in self.of("scene")} - {Path(scene).stem}
+        mine, others = Path(scene).stem, {Path(name).stem for name in self.of("scene")} - {Path(scene).stem}
         for folder in Path(scene).parents:
-            if folder != Path(scene).parent and any(Path(one).parent == folder for one in self.of("scene")):
+            if folder != Path(scene).parent and any(Path(name).parent == folder for name in self.of("scene")):
                 break
-            here = [one for one in self.of(kind) if Path(one).parent == folder]
-            if named := [one for one in here if Path(one).stem.startswith(mine)]:
+            here = [name for name in self.of(kind) if Path(name).parent == folder]
+            if named := [name for name in here if Path(name).stem.startswith(mine)]:
                 return named
-            if free := [one for one in here if not any(Path(one).stem.startswith(other) for other in others)]:
+            if free := [name for name in here if not any(Path(name).stem.startswith(other) for other in others)]:
                 return free
         return []
 
@@ -108,8 +108,8 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
             file=folder,
             remedy="give the folder of one delivery, or write the pipeline file yourself (docs/run.md)",
         )
-    found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
-    return FolderSurvey(place, tuple(_without_parts(found)))
+    files = [file for path in names if (file := _looked_at(path, place, options)) is not None]
+    return FolderSurvey(place, tuple(_without_parts(files)))
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:
@@ -164,9 +164,9 @@ def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -
     if kind is None or not (is_upright(dataset) or unread(dataset) is None):
         return SurveyedFile(name, "image", f"{size}, no model: {refused.message}")
     crs = dataset.GetSpatialRef()
-    said = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
+    text = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
     datum = crs is None or crs.IsCompound() or crs.GetAxesCount() == 3
-    return SurveyedFile(name, kind, said if kind != "dem" or datum else f"{said}, {NO_DATUM}")
+    return SurveyedFile(name, kind, text if kind != "dem" or datum else f"{text}, {NO_DATUM}")
 
 
 def _points(path: Path, name: str) -> SurveyedFile | None:
@@ -184,13 +184,17 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
     return SurveyedFile(name, "points", ", ".join(roles))
 
 
-def _without_parts(found: list[SurveyedFile]) -> list[SurveyedFile]:
+def _without_parts(files: list[SurveyedFile]) -> list[SurveyedFile]:
     """Leave out what opens as the same image as another file: the metadata beside it."""
-    scenes = {Path(one.path).with_suffix("") for one in found if one.kind == "scene" and not one.path.endswith(".xml")}
+    scenes = {
+        Path(file.path).with_suffix("") for file in files if file.kind == "scene" and not file.path.endswith(".xml")
+    }
     return [
-        one
-        for one in found
-        if not (one.path.lower().endswith(".xml") and (one.kind != "scene" or Path(one.path).with_suffix("") in scenes))
+        file
+        for file in files
+        if not (
+            file.path.lower().endswith(".xml") and (file.kind != "scene" or Path(file.path).with_suffix("") in scenes)
+        )
     ]
 
 

@@ -60,18 +60,18 @@ def init(
             remedy="choose another path",
         )
     write_text(target, text(seen, prefix))
-    skipped = [one for one in seen.found if one.kind == "image"]
+    skipped = [image for image in seen.found if image.kind == "image"]
     lines = [counted(len(seen.of("scene")), "scene")]
     if skipped:
         lines[0] += f", {counted(len(skipped), 'image')} skipped:"
-        lines += [f"  {one.path}: {one.said}" for one in skipped]
+        lines += [f"  {image.path}: {image.said}" for image in skipped]
     file = shlex.quote(str(target))
     if all(seen.beside(name, "dem") for name in seen.of("scene")):
         next_lines = f"  ortho run {file} --dry-run\n  ortho run {file}"
     else:
         next_lines = f"  ortho run {file} --allow-network --dry-run\n  ortho run {file} --allow-network"
     lines += ["Check the file, then run:", next_lines]
-    document = {"scenes": seen.of("scene"), "skipped": {one.path: one.said for one in skipped}}
+    document = {"scenes": seen.of("scene"), "skipped": {image.path: image.said for image in skipped}}
     return Result({"pipeline": target}, document, "\n".join(lines))
 
 
@@ -103,8 +103,8 @@ def text(seen: FolderSurvey, prefix: str = ".") -> str:
     for scene in seen.of("scene"):
         lines.append(f"  - image: {at(scene)}")
         for kind, group, key in _GROUPS:
-            found = seen.beside(scene, kind)
+            files = seen.beside(scene, kind)
             # Of several the first; which one is right only the user knows.
-            lines += [f"    {group}: {{{key}: {at(one)}}}" for one in found[:1]]
-            lines += [f"    # {group}: {{{key}: {at(one)}}}" for one in found[1:3]]
+            lines += [f"    {group}: {{{key}: {at(file)}}}" for file in files[:1]]
+            lines += [f"    # {group}: {{{key}: {at(file)}}}" for file in files[1:3]]
     return "\n".join(lines) + "\n"
