@@ -61,13 +61,13 @@ def _type(option: Option) -> Any:
     number: Any = Annotated[bounded, pydantic.AfterValidator(_usable)]
     low, high = (None if bound is None else int(bound) for bound in (option.above, option.below))
     within: dict[str, Any] = {"ge": low if low is None else low + 1, "le": high if high is None else high - 1}
-    whole: Any = int if low is high is None else Annotated[int, Field(**within)]
+    integer: Any = int if low is high is None else Annotated[int, Field(**within)]
     return {
         "text": str,
         "file": str,
         "number": number,
-        "integers": Annotated[list[whole], Field(min_length=1)],
-        "integer": whole,
+        "integers": Annotated[list[integer], Field(min_length=1)],
+        "integer": integer,
         "files": str | list[str],
         "pair": Annotated[list[number], Field(min_length=2, max_length=2)],
         "box": Annotated[list[number], Field(min_length=4, max_length=4)],
@@ -80,17 +80,17 @@ def _type(option: Option) -> Any:
 
 def _settings(name: str, group: type) -> Any:
     """Return the schema of a group of options; what they mean and may be is stated in `options`."""
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     known = options_of(group)
-    for one in dataclasses.fields(group):
-        option = known[one.name]
+    for field in dataclasses.fields(group):
+        option = known[field.name]
         if not option.in_file:
             continue
-        default: Any = {"keys": {}, "files": []}.get(option.kind, one.default)
+        default: Any = {"keys": {}, "files": []}.get(option.kind, field.default)
         kind: Any = bool if isinstance(default, bool) else _type(option)
         described = Field(default=default, description=_described(option) or None)
-        found[one.name] = (kind | None if default is None else kind, described)
-    return pydantic.create_model(name, __base__=_Strict, __doc__=str(group.__doc__).partition("\n")[0], **found)
+        types[field.name] = (kind | None if default is None else kind, described)
+    return pydantic.create_model(name, __base__=_Strict, __doc__=str(group.__doc__).partition("\n")[0], **types)
 
 
 def _described(option: Option) -> str:
@@ -165,11 +165,11 @@ def merged(*layers: Settings) -> Settings:
         for name in Settings.model_fields.keys() & layer.model_fields_set:
             value, before = getattr(layer, name), groups.get(name)
             if isinstance(value, BaseModel) and isinstance(before, BaseModel):
-                said = {field: getattr(value, field) for field in value.model_fields_set}
-                for field, item in said.items():
+                stated = {field: getattr(value, field) for field in value.model_fields_set}
+                for field, item in stated.items():
                     if isinstance(item, Mapping):
-                        said[field] = {**getattr(before, field), **item}
-                value = before.model_copy(update=said)
+                        stated[field] = {**getattr(before, field), **item}
+                value = before.model_copy(update=stated)
             groups[name] = value
     return Settings.model_construct(**groups)
 
@@ -274,18 +274,18 @@ class _Reader:
         return self._scalar(node, place, kind)
 
     def _mapping(self, node: Any, place: Place) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for key, item in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
             if name is None:
                 raise self._error(key, place, "this key is not a word", _SEE)
             here = (*place, name)
-            if name in found:
+            if name in values:
                 before = self.lines[here]
                 raise self._error(key, here, f"duplicate key, already in line {before}", "leave one out")
             self.lines[here] = key.start_mark.line + 1
-            found[name] = self.value(item, here)
-        return found
+            values[name] = self.value(item, here)
+        return values
 
     def _scalar(self, node: Any, place: Place, kind: str) -> Any:
         text = node.value
@@ -315,27 +315,27 @@ def dotted(place: Place) -> str:
 
 def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path: Any) -> InputError:
     """Return an error of the schema in terms of the file."""
-    found: list[tuple[str, str, str]] = []
-    for one in error.errors():
+    faults: list[tuple[str, str, str]] = []
+    for fault in error.errors():
         # In a union pydantic adds the member that it tried, which stands nowhere in the file.
-        place: Place = tuple(one["loc"])
+        place: Place = tuple(fault["loc"])
         known = place
         while known and known not in lines:
             known = known[:-1]
-        if one["type"] == "missing":
+        if fault["type"] == "missing":
             known, message = place, "missing field"
         else:
-            message = one["msg"].removeprefix("Value error, ")
+            message = fault["msg"].removeprefix("Value error, ")
         remedy = _SEE
-        if one["type"] == "extra_forbidden":
+        if fault["type"] == "extra_forbidden":
             message, remedy = "unknown field", _allowed(place)
         line = lines.get(known, lines.get(known[:-1], 1))
-        found.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
-    found = list(dict.fromkeys(found))
-    field, message, remedy = found[0]
-    rest = [f"{where}: {what}" for where, what, _ in found[1:_SHOWN]]
-    if len(found) > _SHOWN:
-        rest.append(f"and {len(found) - _SHOWN} more")
+        faults.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
+    faults = list(dict.fromkeys(faults))
+    field, message, remedy = faults[0]
+    rest = [f"{where}: {what}" for where, what, _ in faults[1:_SHOWN]]
+    if len(faults) > _SHOWN:
+        rest.append(f"and {len(faults) - _SHOWN} more")
     return InputError("; ".join([message, *rest]), file=path, field=field, remedy=remedy)
 
 

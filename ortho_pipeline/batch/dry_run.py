@@ -24,18 +24,18 @@ def check_scenes(
     planned = config if isinstance(config, Plan) else plan(config)
     checked: list[dict[str, Any]] = []
     for job in planned.chosen(only, shard):
-        asked = job.request
-        one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
+        request = job.request
+        row: dict[str, Any] = {"name": job.name, "image": str(job.image)}
         try:
-            one |= commands.check(
-                asked.image,
-                scene=asked.scene,
-                points=asked.points,
-                surface=asked.surface,
-                match=asked.match,
-                output=asked.output,
+            row |= commands.check(
+                request.image,
+                scene=request.scene,
+                points=request.points,
+                surface=request.surface,
+                match=request.match,
+                output=request.output,
             )
         except OrthoError as error:
-            one["error"] = error_document(error)
-        checked.append(one)
+            row["error"] = error_document(error)
+        checked.append(row)
     return checked

@@ -178,7 +178,7 @@ class InGroups:
                 future.cancel()
 
 
-def _work_through(given: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tuple[float, list[tuple[Any, Any]]]:
+def _work_through(batch: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tuple[float, list[tuple[Any, Any]]]:
     """Do some jobs one after the other, until twice their time is over.
 
     Returns
@@ -188,7 +188,7 @@ def _work_through(given: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tupl
     list
         Of each job that was done its result or its exception.
     """
-    work, jobs = given
+    work, jobs = batch
     begin, done = time.monotonic(), list[tuple[Any, Any]]()
     for job in jobs:
         future = Sequential().submit(work, job)
@@ -302,14 +302,14 @@ def _died(future: Future[Outcome]) -> Future[Outcome]:
     error = future.exception()
     if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
         return future
-    told: Future[Outcome] = Future()
-    told.set_exception(
+    failed: Future[Outcome] = Future()
+    failed.set_exception(
         WorkerDied(
             "the process of this scene was killed",
             remedy=Text("give it more memory, or ", Setting("workers", "1")),
         )
     )
-    return told
+    return failed
 
 
 def dask_executor(scheduler: str) -> Any:

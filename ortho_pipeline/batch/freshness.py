@@ -41,16 +41,16 @@ def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> 
     """
     if not checksums:
         DIGESTS.learn(record.inputs)
-    known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = Ledger.of(job.request).roles
-    read = (*_local_states(job, {**{str(path): role for path, role in found.items()}, **known}), *far_states(job))
+    known = {state.path: state.role for state in record.inputs if os.path.isfile(state.path)}
+    roles = Ledger.of(job.request).roles
+    read = (*_local_states(job, {**{str(path): role for path, role in roles.items()}, **known}), *far_states(job))
     return read if record.key == key_of(read, job.configuration, job.versions) else None
 
 
 def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
     """Return the files that a report was made from; one that has changed in the meantime is an error."""
-    used = {one["path"]: one for one in report["provenance"]["inputs"]}
-    roles = {path: one["role"] for path, one in used.items()}
+    used = {entry["path"]: entry for entry in report["provenance"]["inputs"]}
+    roles = {path: entry["role"] for path, entry in used.items()}
     source = str(report["scene"]["model_source"])
     if os.path.isfile(source):
         roles.setdefault(os.path.abspath(source), "model source")
@@ -80,7 +80,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
     StorageError
         If the store does not answer.
     """
-    found = []
+    states = []
     for address in sorted({Location(path).url for _, path in job.request.files if Location(path).is_far}):
         if not Location(address).is_address:
             continue
@@ -89,8 +89,8 @@ def far_states(job: Job) -> tuple[FileState, ...]:
             size, tag = Objects(folder, allow_network=job.request.scene.allow_network).stated(name)
         except FileNotFoundError as error:
             raise InputError("file not found", file=address, remedy="check the address") from error
-        found.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
-    return tuple(found)
+        states.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
+    return tuple(states)
 
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
@@ -125,8 +125,8 @@ def untouched(record: RunRecord, job: Job, listings: dict[Path, Sequence[str]]) 
 def _files_untouched(record: RunRecord, job: Job, recorded: Sequence[FileState]) -> bool:
     return (
         is_scene(record)
-        and all(one.untouched() for one in record.inputs)
-        and all(one.untouched(job.folder) for one in record.outputs)
+        and all(state.untouched() for state in record.inputs)
+        and all(state.untouched(job.folder) for state in record.outputs)
         and record.key == key_of(recorded, job.configuration, job.versions)
     )
 
@@ -134,13 +134,13 @@ def _files_untouched(record: RunRecord, job: Job, recorded: Sequence[FileState])
 def reads_the_same(record: RunRecord, job: Job) -> bool:
     """Tell whether a scene among other neighbours than before would be made from the same files."""
     try:
-        far = tuple(one for one in record.inputs if one.tag)
-        near = record.replaced(inputs=tuple(one for one in record.inputs if not one.tag))
+        far = tuple(state for state in record.inputs if state.tag)
+        near = record.replaced(inputs=tuple(state for state in record.inputs if not state.tag))
         if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job)):
             return False
         with confined(job.output):
-            found = Ledger.of(job.request).roles
+            roles = Ledger.of(job.request).roles
     except OrthoError:
         return False
-    known = {one.path for one in record.inputs}
-    return set(_with_companions(job, {str(path): role for path, role in found.items()})) <= known
+    known = {state.path for state in record.inputs}
+    return set(_with_companions(job, {str(path): role for path, role in roles.items()})) <= known

@@ -174,7 +174,7 @@ def versions() -> dict[str, Any]:
         **{name: metadata.version(name) for name in packages},
         "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
         "proj": pyproj.proj_version_str,
-        "plugins": sorted(f"{one.plugin} ({one})" for one in host.Host.discover().plugins()),
+        "plugins": sorted(f"{origin.plugin} ({origin})" for origin in host.Host.discover().plugins()),
     }
 
 
@@ -195,11 +195,11 @@ class _Planner:
                 field="output",
                 remedy="choose another output folder, for example out",
             )
-        found: dict[Place, list[tuple[int, Entry]]] = {}
+        entries_of: dict[Place, list[tuple[int, Entry]]] = {}
         for number, entry in enumerate(self.config.scenes):
             for image in self._images(entry, number):
-                found.setdefault(image, []).append((number, entry))
-        jobs = [self._job(image, entries) for image, entries in found.items()]
+                entries_of.setdefault(image, []).append((number, entry))
+        jobs = [self._job(image, entries) for image, entries in entries_of.items()]
         self._check_names(jobs)
         self._check_mosaic(jobs)
         settings = None if self.config.mosaic is None else MosaicOptions(**dict(self.config.mosaic))
@@ -210,7 +210,7 @@ class _Planner:
     def _images(self, entry: Entry, number: int) -> list[Place]:
         if entry.image is not None:
             return [self.places.of(entry.image, f"scenes[{number}].image")]
-        found: dict[Place, None] = {}
+        images: dict[Place, None] = {}
         excluded = {
             image for pattern in _listed(entry.exclude) for image in self._matches(pattern, f"scenes[{number}].exclude")
         }
@@ -225,13 +225,13 @@ class _Planner:
                 )
             for image in matches:
                 place = self.places.inside(str(image), f"scenes[{number}].images") if isinstance(image, Path) else image
-                found[place] = None
-        return list(found)
+                images[place] = None
+        return list(images)
 
     def _matches(self, pattern: str, field: str) -> list[Place]:
         # A pattern with ** would take the orthos of the last run for scenes.
-        found = self.places.matching(pattern, field)
-        return [path for path in found if not (isinstance(path, Path) and path.is_relative_to(self.output))]
+        paths = self.places.matching(pattern, field)
+        return [path for path in paths if not (isinstance(path, Path) and path.is_relative_to(self.output))]
 
     # -- one scene ---------------------------------------------------------------------------------------------------
 
@@ -255,19 +255,19 @@ class _Planner:
         return Job(self._checked_name(name, image, where), request, self.output, versions())
 
     def _scene(self, settings: Settings, image: Place, where: str) -> SceneOptions:
-        given: Any = settings.scene
+        scene: Any = settings.scene
         options = {}
-        for key, value in given.sensor_options.items():
+        for key, value in scene.sensor_options.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             options[key] = self._perhaps_file(text, image, f"{where}.scene.sensor_options.{key}")
-        rpc = given.rpc if given.rpc in ("tag", "sidecar") else self._file(given.rpc, image, f"{where}.scene.rpc")
-        model = self._file(given.model, image, f"{where}.scene.model")
+        rpc = scene.rpc if scene.rpc in ("tag", "sidecar") else self._file(scene.rpc, image, f"{where}.scene.rpc")
+        model = self._file(scene.model, image, f"{where}.scene.model")
         return SceneOptions(
-            sensor=given.sensor,
+            sensor=scene.sensor,
             rpc=rpc,
             model=model,
             sensor_options=options,
-            crop_offset=given.crop_offset,
+            crop_offset=scene.crop_offset,
             roots=() if self.places.far else (str(self.places.root),),
             allow_network=self.places.allow_network,
         )

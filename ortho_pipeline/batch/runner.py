@@ -90,9 +90,9 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         if record is not None:
             RunRecord(name=job.name, key="", status="started", outputs=before).write(job.record)
         result = _rectified(job)
-        made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
-        _remove(job.folder, {one.path for one in before} - {one.path for one in made})
-        before = made
+        outputs = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
+        _remove(job.folder, {state.path for state in before} - {state.path for state in outputs})
+        before = outputs
         if result.failure is not None:
             raise result.failure
         report = result.document["report"]
@@ -102,7 +102,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             key=key_of(read, job.configuration, job.versions),
             status="done",
             inputs=read,
-            outputs=made,
+            outputs=outputs,
             siblings=listing,
             seconds=time.monotonic() - begin,
             facts=_facts(report),
@@ -111,15 +111,15 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         done.write(job.record)
         return Outcome(job.name, "done", done.seconds, paths_of(done, job), done.facts)
     except Exception as error:
-        told = error_document(error)
+        document = error_document(error)
         failed = RunRecord(
-            name=job.name, key="", status="failed", outputs=before, seconds=time.monotonic() - begin, error=told
+            name=job.name, key="", status="failed", outputs=before, seconds=time.monotonic() - begin, error=document
         )
         with contextlib.suppress(OrthoError):
             failed.write(job.record)
         # Without its report an ortho is there, but not finished: the next run makes the scene again.
         kept = paths_of(failed, job) if isinstance(error, ReportError) else {}
-        return Outcome(job.name, "failed", failed.seconds, kept, error=told)
+        return Outcome(job.name, "failed", failed.seconds, kept, error=document)
 
 
 def _rectified(job: Job) -> Result:
@@ -167,7 +167,7 @@ def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: boo
 
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
     """Return outputs of unchanged content with their present dates."""
-    return tuple(one.replaced(mtime_ns=(folder / one.path).stat().st_mtime_ns) for one in outputs)
+    return tuple(state.replaced(mtime_ns=(folder / state.path).stat().st_mtime_ns) for state in outputs)
 
 
 def _remove(folder: Path, names: set[str]) -> None:
@@ -307,11 +307,11 @@ class _Run:
             work = _with_checksums if self.checksums else make_scene
             for job, future in completed(crew, work, changed):
                 self._note(_outcome(job, future), len(jobs))
-            made = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
+            mosaic = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
         except KeyboardInterrupt:
             self.log("run interrupted", finished=len(self.outcomes), scenes=len(jobs))
             raise
-        return self._finish(jobs, made)
+        return self._finish(jobs, mosaic)
 
     def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any]:
         """Make the mosaic of the scenes that there are; what is wrong with it is in the document."""
@@ -345,7 +345,7 @@ class _Run:
         if self.progress:
             self.progress(outcome.text(), len(self.outcomes) / total)
 
-    def _finish(self, jobs: Sequence[Job], made: dict[str, Any] | None) -> BatchResult:
+    def _finish(self, jobs: Sequence[Job], mosaic: dict[str, Any] | None) -> BatchResult:
         ordered = tuple(self.outcomes[job.name] for job in jobs)
         files = {"log": self.log_path}
         items = [Path(outcome.files["stac"]) for outcome in ordered if "stac" in outcome.files]
@@ -354,13 +354,13 @@ class _Run:
             write_catalog(files["catalog"], items, self.planned.path.stem)
         if not self.part:
             files |= {kind: self.planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
-        if made is not None and "file" in made:
+        if mosaic is not None and "file" in mosaic:
             files |= {
-                "mosaic": self.planned.output / made["file"],
+                "mosaic": self.planned.output / mosaic["file"],
                 "seams": self.planned.output / RUN_FILES["seams"],
                 "mosaic page": self.planned.output / RUN_FILES["page"],
             }
-        result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
+        result = BatchResult(ordered, files, time.monotonic() - self.begin, mosaic)
         if not self.part:
             write_json(files["summary"], result.to_json())
             write_run_page(files["index"], self.planned.path.stem, result.to_json()["scenes"])
@@ -422,18 +422,18 @@ class _Mosaic:
             )
             write_json(self.report, document)
             if record is not None:
-                retire({self.output / one.path for one in record.outputs} - set(files.values()))
+                retire({self.output / state.path for state in record.outputs} - set(files.values()))
         if failure is not None:
             return {**document, "status": "done", "error": error_document(failure)}
-        made = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
-        RunRecord(name="mosaic", key=self.key, status="done", inputs=self.inputs, outputs=made).write(self.record)
+        outputs = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
+        RunRecord(name="mosaic", key=self.key, status="done", inputs=self.inputs, outputs=outputs).write(self.record)
         return {**document, "status": "done"}
 
     def _seams(self, pairs: Sequence[Overlap], crew: Crew) -> list[dict[str, Any]]:
         # New processes for a few seams take longer than these.
         crew = Sequential() if isinstance(crew, Processes) and len(pairs) < _MANY_SEAMS else crew
-        found = {id(pair): future.result() for pair, future in completed(crew, measure_seam, pairs)}
-        return [found[id(pair)] for pair in pairs]
+        overlaps = {id(pair): future.result() for pair, future in completed(crew, measure_seam, pairs)}
+        return [overlaps[id(pair)] for pair in pairs]
 
 
 def _with_checksums(job: Job) -> Outcome:

@@ -25,21 +25,21 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
     planned = config if isinstance(config, Plan) else plan(config)
     if store is not None:
         return summary_of(planned, store)
-    begin, found = time.monotonic(), []
+    begin, outcomes = time.monotonic(), []
     listings: dict[Path, Sequence[str]] = {}
     for job in planned.jobs:
         record = RunRecord.at(job.record)
         if record is None or record.status not in ("done", "failed"):
-            found.append(Outcome(job.name, "missing"))
+            outcomes.append(Outcome(job.name, "missing"))
         elif record.status == "failed":
-            found.append(Outcome(job.name, "failed", record.seconds, error=record.error))
+            outcomes.append(Outcome(job.name, "failed", record.seconds, error=record.error))
         elif not untouched(record, job, listings) and not as_recorded(record, job):
             error = InputError("inputs or outputs have changed", file=job.folder, remedy="run it again")
-            found.append(Outcome(job.name, "missing", error=error_document(error)))
+            outcomes.append(Outcome(job.name, "missing", error=error_document(error)))
         else:
-            found.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
+            outcomes.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
     files = {kind: planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
-    result = BatchResult(tuple(found), files, time.monotonic() - begin)
+    result = BatchResult(tuple(outcomes), files, time.monotonic() - begin)
     write_json(files["summary"], result.to_json())
     write_run_page(files["index"], planned.path.stem, result.to_json()["scenes"])
     return result
@@ -47,4 +47,4 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
 
 def paths_of(record: RunRecord, job: Job) -> dict[str, str]:
     """Return the outputs of a scene by what they are."""
-    return {one.role: str(job.folder / one.path) for one in record.outputs}
+    return {state.role: str(job.folder / state.path) for state in record.outputs}

@@ -175,18 +175,18 @@ def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, 
     from ortho_pipeline.batch.results import SCHEMA_VERSION
 
     checked = check_scenes(planned, only, shard)
-    failed = [one for one in checked if "error" in one]
+    failed = [scene for scene in checked if "error" in scene]
     if as_json:
         print_json({"schema_version": SCHEMA_VERSION, "scenes": checked})
     else:
-        said = Counter(text for one in checked for text in one.get("warnings", ()))
-        for one in checked:
-            if "error" in one:
-                say(f"{one['name']}: {_error_text(one['error'])}")
+        counts = Counter(text for scene in checked for text in scene.get("warnings", ()))
+        for scene in checked:
+            if "error" in scene:
+                say(f"{scene['name']}: {_error_text(scene['error'])}")
             else:
-                own = [text for text in one["warnings"] if said[text] == 1]
-                say(checked_text(one["name"], {**one, "warnings": own}))
-        for text, count in said.items():
+                own = [text for text in scene["warnings"] if counts[text] == 1]
+                say(checked_text(scene["name"], {**scene, "warnings": own}))
+        for text, count in counts.items():
             if count > 1:
                 say(f"Warning: {as_typed(text)} ({counted(count, 'scene')})")
         say(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} with errors")

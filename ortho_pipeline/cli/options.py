@@ -72,14 +72,14 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
     names : str
         The fields, in the order of ``--help``; all without.
     """
-    defaults = {one.name: one.default for one in fields(options)}
+    defaults = {field.name: field.default for field in fields(options)}
     known = options_of(options)
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         for name in reversed(names or tuple(known)):
             option = known[name]
-            said = {**_said(option, defaults[name]), "help": _help(option)}
-            command = click.option(*option.flags.split(), f"{group}_{name}", **said)(command)
+            settings = {**_said(option, defaults[name]), "help": _help(option)}
+            command = click.option(*option.flags.split(), f"{group}_{name}", **settings)(command)
         return command
 
     return decorate
@@ -98,13 +98,13 @@ def _said(option: Option, default: Any) -> dict[str, Any]:
     """Return what click is told of an option, besides names and help."""
     if default is False:
         return {"is_flag": True}
-    told: dict[str, Any] = {"metavar": option.metavar, **_typed(option)}
-    if default is MISSING and not told.get("multiple"):
-        told["required"] = True
+    settings: dict[str, Any] = {"metavar": option.metavar, **_typed(option)}
+    if default is MISSING and not settings.get("multiple"):
+        settings["required"] = True
     elif isinstance(default, int | float | str):
         shown = int(default) // 1_000_000 if option.kind == "bytes" else default
-        told |= {"default": shown, "show_default": True}
-    return told
+        settings |= {"default": shown, "show_default": True}
+    return settings
 
 
 def _typed(option: Option) -> dict[str, Any]:
@@ -115,12 +115,12 @@ def _typed(option: Option) -> dict[str, Any]:
     if option.above is not None:
         number = click.FloatRange(option.above, option.below, min_open=True, max_open=option.below is not None)
     low, high = (None if bound is None else int(bound) for bound in (option.above, option.below))
-    whole = click.IntRange(min=low if low is None else low + 1, max=high if high is None else high - 1)
+    integer = click.IntRange(min=low if low is None else low + 1, max=high if high is None else high - 1)
     return {
         "file": {"type": click.Path(dir_okay=False)},
         "number": {"type": number},
-        "integer": {"type": whole},
-        "integers": {"type": _Integers(whole), "callback": _joined, "multiple": True},
+        "integer": {"type": integer},
+        "integers": {"type": _Integers(integer), "callback": _joined, "multiple": True},
         "pair": {"callback": _pair},
         "box": {"type": float, "nargs": 4},
         "one or two": {"type": OneOrTwo()},
@@ -166,15 +166,15 @@ def _files(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> tuple
 
 
 def _keys(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise click.BadParameter(f"{text!r} is not KEY=VALUE")
-        if key in found:
+        if key in values:
             raise click.BadParameter(f"the key {key!r} is given twice")
-        found[key] = value
-    return found
+        values[key] = value
+    return values
 
 
 def _grouped(group: str, options: type, *names: str) -> Decorator:
@@ -182,10 +182,12 @@ def _grouped(group: str, options: type, *names: str) -> Decorator:
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
-        def wrapper(**given: Any) -> Any:
-            values = {key.removeprefix(prefix): given.pop(key) for key in list(given) if key.startswith(prefix)}
+        def wrapper(**arguments: Any) -> Any:
+            values = {key.removeprefix(prefix): arguments.pop(key) for key in list(arguments) if key.startswith(prefix)}
             # Without any, click's empty tuple stands for the default.
-            return command(**given, **{group: options(**{key: value for key, value in values.items() if value != ()})})
+            return command(
+                **arguments, **{group: options(**{key: value for key, value in values.items() if value != ()})}
+            )
 
         return click_options(group, options, *names)(wrapper)
 
@@ -198,22 +200,22 @@ def _of_each(*names: str) -> Decorator:
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
-        def chosen(*, rpcs: Sequence[str], offsets: Sequence[str], scene: SceneOptions, **given: Any) -> Any:
-            return command(scene=_scenes(given["images"], scene, rpcs, offsets), **given)
+        def chosen(*, rpcs: Sequence[str], offsets: Sequence[str], scene: SceneOptions, **arguments: Any) -> Any:
+            return command(scene=_scenes(arguments["images"], scene, rpcs, offsets), **arguments)
 
         @functools.wraps(command)
-        def wrapper(*, scene_rpc: Sequence[str], scene_crop_offset: Sequence[str], **given: Any) -> Any:
-            return grouped(rpcs=scene_rpc, offsets=scene_crop_offset, **given)
+        def wrapper(*, scene_rpc: Sequence[str], scene_crop_offset: Sequence[str], **arguments: Any) -> Any:
+            return grouped(rpcs=scene_rpc, offsets=scene_crop_offset, **arguments)
 
         grouped = _grouped("scene", SceneOptions, *names)(chosen)
-        made: Callable[..., Any] = wrapper
+        decorated: Callable[..., Any] = wrapper
         for field, metavar, text in (
             ("crop_offset", "IMAGE=COL,ROW", _OFFSET_OF_EACH),
             ("rpc", "tag|sidecar|IMAGE=FILE", _RPC_OF_EACH),
         ):
             flag = options_of(SceneOptions)[field].flags
-            made = click.option(flag, f"scene_{field}", multiple=True, metavar=metavar, help=text)(made)
-        return made
+            decorated = click.option(flag, f"scene_{field}", multiple=True, metavar=metavar, help=text)(decorated)
+        return decorated
 
     return decorate
 
@@ -233,7 +235,7 @@ def _scenes(
             if len(images) == 1 and (not equals or os.path.exists(text)):
                 name, value = images[0], text
             elif field == "rpc" and text in ("tag", "sidecar"):
-                scenes = [replace(one, rpc=text) for one in scenes]
+                scenes = [replace(options, rpc=text) for options in scenes]
                 continue
             elif not equals:
                 raise InputError(

@@ -161,20 +161,25 @@ class Megabytes(click.ParamType):  # type: ignore[type-arg]
 
 def _refuse_numbers(ctx: click.Context, params: Sequence[click.Parameter]) -> None:
     """Refuse numbers that computing with goes wrong, whatever option of whatever command they are given to."""
-    for one in params:
-        value = ctx.params.get(str(one.name))
+    for param in params:
+        value = ctx.params.get(str(param.name))
         for number in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(number, int) and not isinstance(one.type, Megabytes) and abs(number) > _WHOLE:
-                raise click.BadParameter(f"{number} is too large; the limit is {_WHOLE}.", ctx, one)
+            if isinstance(number, int) and not isinstance(param.type, Megabytes) and abs(number) > _WHOLE:
+                raise click.BadParameter(f"{number} is too large; the limit is {_WHOLE}.", ctx, param)
             if isinstance(number, float) and not is_usable(number):
                 raise click.BadParameter(
-                    f"{number:g} is not a usable number: too large, too small, or not finite.", ctx, one
+                    f"{number:g} is not a usable number: too large, too small, or not finite.", ctx, param
                 )
 
 
 def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Parameter]) -> list[str]:
     """Return the words with pairs of numbers joined; a word with one dash that is not an option is an error."""
-    known = {name: one for one in params if isinstance(one, click.Option) for name in (*one.opts, *one.secondary_opts)}
+    known = {
+        name: param
+        for param in params
+        if isinstance(param, click.Option)
+        for name in (*param.opts, *param.secondary_opts)
+    }
     words: list[str] = []
     rest = list(args)
     while rest:
@@ -210,8 +215,8 @@ def _unknown(ctx: click.Context, word: str, known: Mapping[str, click.Option]) -
     attached = word[:2] in known and not known[word[:2]].is_flag and not known[word[:2]].count
     close = difflib.get_close_matches(name.lstrip("-").replace("_", "-"), bare, 1, 0.8 if attached else 0.6)
     meant = bare[close[0]] if close else f"{word[:2]} {word[2:]}" if attached else None
-    said = f"; did you mean '{meant}'?" if meant else "."
-    ctx.fail(f"No such option: {word}{said}")
+    hint = f"; did you mean '{meant}'?" if meant else "."
+    ctx.fail(f"No such option: {word}{hint}")
 
 
 def _verbose(ctx: click.Context, _: click.Parameter, count: int) -> None:

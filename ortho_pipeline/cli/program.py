@@ -111,7 +111,7 @@ class _Commands(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands in their groups by what is known of them, without loading any."""
-        groups = {title: {name: said for name, (_, said) in group.items()} for title, group in GROUPS.items()}
+        groups = {title: {name: summary for name, (_, summary) in group.items()} for title, group in GROUPS.items()}
         for name, offer in self.added.offers.items():
             groups.setdefault(offer.group, {})[name] = offer.summary
         for title, group in groups.items():
@@ -177,8 +177,14 @@ def _print_usage_error(command: str, error: click.UsageError) -> None:
         parameter = getattr(error, "param", None)
         field = parameter.opts[0] if parameter is not None else getattr(error, "option_name", None)
         remedy = f"see '{error.ctx.command_path} --help'" if error.ctx is not None else "see 'ortho --help'"
-        told = {"kind": "UsageError", "message": error.format_message(), "file": None, "field": field, "remedy": remedy}
-        print_json({"schema_version": 1, "error": told})
+        document = {
+            "kind": "UsageError",
+            "message": error.format_message(),
+            "file": None,
+            "field": field,
+            "remedy": remedy,
+        }
+        print_json({"schema_version": 1, "error": document})
 
 
 def _fault(error: BaseException) -> OrthoError:

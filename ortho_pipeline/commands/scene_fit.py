@@ -123,16 +123,18 @@ class Adjusted:
             Notice("left-out", f"point {name} was rejected: {reason}", point=name, reason=reason)
             for name, reason in self.fit.rejected
         ]
-        named = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
+        named = {
+            name for notice in self.fit.warnings if notice.code == "checks-apart" for name in notice.fields["points"]
+        }
         return left + [
             Notice(
                 "contradicting-point",
-                f"{one.role} point {one.id} contradicts the others: {one.reason}",
-                point=one.id,
-                role=one.role,
+                f"{notice.role} point {notice.id} contradicts the others: {notice.reason}",
+                point=notice.id,
+                role=notice.role,
             )
-            for one in self.fit.outlying
-            if one.role == "control" or one.id not in named
+            for notice in self.fit.outlying
+            if notice.role == "control" or notice.id not in named
         ]
 
     def _elsewhere(self) -> list[Notice]:

@@ -147,17 +147,17 @@ class Exact:
         columns, rows = (axis.ravel() for axis in np.meshgrid(*side))
         ortho = gdal.GetDriverByName("VRT").Create("", self.grid.width, self.grid.height, 1)
         transformer.georeference(ortho, self.grid)
-        made = gdal.Transformer(transformer.source(image), ortho, list(transformer.options))
-        points, success = made.TransformPoints(1, np.column_stack([columns, rows, 0 * rows]).tolist())
-        found, exact = np.array(points)[:, :2], self.image(columns, rows)
-        found[~(np.array(success, dtype=bool) & np.isfinite(found).all(axis=1))] = np.nan
+        transform = gdal.Transformer(transformer.source(image), ortho, list(transformer.options))
+        points, success = transform.TransformPoints(1, np.column_stack([columns, rows, 0 * rows]).tolist())
+        projected, exact = np.array(points)[:, :2], self.image(columns, rows)
+        projected[~(np.array(success, dtype=bool) & np.isfinite(projected).all(axis=1))] = np.nan
         with np.errstate(invalid="ignore"):
-            seen = [((place >= 0) & (place <= self.size)).all(axis=1) for place in (found, exact)]
+            seen = [((place >= 0) & (place <= self.size)).all(axis=1) for place in (projected, exact)]
         use = seen[0] | seen[1]
         if transformer.method == "RPC":
             # GDAL interpolates beside voids and rims of a DEM, where we have no height.
-            use &= np.isfinite(found).all(axis=1) & np.isfinite(exact).all(axis=1)
-        worst = np.abs(found - exact)[use].max(initial=0.0)
+            use &= np.isfinite(projected).all(axis=1) & np.isfinite(exact).all(axis=1)
+        worst = np.abs(projected - exact)[use].max(initial=0.0)
         return float(worst) if np.isfinite(worst) else np.inf
 
 
@@ -322,9 +322,9 @@ def _write_arrays(exact: Exact, path: Path) -> None:
     """Write the column and row in the image of the centre of every output pixel."""
     width, height = exact.grid.width, exact.grid.height
     options = ["BIGTIFF=IF_SAFER", "INTERLEAVE=BAND"]
-    made = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
+    raster = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
     step = max(1, _PIECE // width)
-    with written(made) as dataset:
+    with written(raster) as dataset:
         for k in (1, 2):
             dataset.GetRasterBand(k).SetNoDataValue(_NO_PLACE)
         for top in range(0, height, step):

@@ -66,9 +66,9 @@ def visible(image: Any, width: float, height: float, unknown: Any, cells: Any, a
                 if cells[b, j, i]:
                     first_row, last_row = min(first_row, j), max(last_row, j + 1)
                     first, last = min(first, i), max(last, i + 1)
-        found = last > 0
-        area[b, 0], area[b, 1] = (first_row if found else 0), last_row
-        area[b, 2], area[b, 3] = (first if found else 0), last
+        seen = last > 0
+        area[b, 0], area[b, 1] = (first_row if seen else 0), last_row
+        area[b, 2], area[b, 3] = (first if seen else 0), last
 
 
 @inlined

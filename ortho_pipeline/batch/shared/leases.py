@@ -101,20 +101,20 @@ class Leases:
         """
         data = lease_document(self._holder, 0)
         try:
-            made = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
+            taken = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
         except Conflict:
             with contextlib.suppress(FileNotFoundError):
                 return self._store.version(name + _LEASE) or ""
             return ""
-        return Lease(self._store, name, made.version, self._holder)
+        return Lease(self._store, name, taken.version, self._holder)
 
     def result(self, name: str) -> RunRecord | None:
         """Return the result of a scene, None where there is none of its name that can be understood."""
         try:
-            found = RunRecord.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
+            record = RunRecord.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
         except (FileNotFoundError, InputError):
             return None
-        return found if found is not None and found.name == name else None
+        return record if record is not None and record.name == name else None
 
     def finished(self) -> frozenset[str]:
         """Return the names of the scenes that have a result."""

@@ -100,7 +100,9 @@ def _made(where: SharedFolder, make: Make, job: Job, lease: Lease) -> Outcome:
                     path.replace(delivery.folder / path.name)
             stored = delivery.stored
             outputs = tuple(
-                one.replaced(mtime_ns=0, tag=stored[one.path].tag) for one in record.outputs if one.path in stored
+                state.replaced(mtime_ns=0, tag=stored[state.path].tag)
+                for state in record.outputs
+                if state.path in stored
             )
             record = record.replaced(outputs=outputs)
             outcome = dataclasses.replace(outcome, files=_files(where, record))
@@ -113,7 +115,7 @@ def _goes_along(path: Path) -> bool:
 
 
 def _files(where: SharedFolder, record: RunRecord) -> dict[str, str]:
-    return {one.role: f"{where.address_of(record.name)}/{one.path}" for one in record.outputs}
+    return {state.role: f"{where.address_of(record.name)}/{state.path}" for state in record.outputs}
 
 
 def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
@@ -124,16 +126,16 @@ def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
     if not is_scene(record):
         return "its record is incomplete"
     store = Objects(where.address_of(job.name), allow_network=where.allow_network)
-    for one in record.outputs:
+    for state in record.outputs:
         try:
             if where.checksums:
-                same = store.read(one.path, one.bytes)[1].sha256 == one.sha256
+                same = store.read(state.path, state.bytes)[1].sha256 == state.sha256
             else:
-                same = store.stated(one.path) == (one.bytes, one.tag)
+                same = store.stated(state.path) == (state.bytes, state.tag)
         except (FileNotFoundError, InputError):
-            return f"{one.path} is missing or has grown"
+            return f"{state.path} is missing or has grown"
         if not same:
-            return f"{one.path} has changed"
+            return f"{state.path} has changed"
     if inputs_as_recorded(record, job, where.checksums) is None:
         return "its inputs, settings or software have changed"
     return ""
@@ -234,9 +236,9 @@ def _collected(
 def summary_of(planned: Plan, where: SharedFolder) -> BatchResult:
     """Collect the results of all workers, and write them beside the scenes as ``run.json``; make nothing."""
     begin = time.monotonic()
-    found = tuple(_collected(where, where.leases(), planned, {}))
+    outcomes = tuple(_collected(where, where.leases(), planned, {}))
     store = Objects(where.address, allow_network=where.allow_network)
     files: dict[str, Any] = {"summary": store.of(_SUMMARY)}
-    result = BatchResult(found, files, time.monotonic() - begin)
+    result = BatchResult(outcomes, files, time.monotonic() - begin)
     store.put(_SUMMARY, json_text(result.to_json()).encode())
     return result

@@ -38,7 +38,7 @@ def verify(ctx: click.Context, as_json: bool) -> None:
 
     document = commands.kept_files(verify=True)
     _print(document, as_json)
-    if any(one["state"] != "sound" for one in document["files"]):
+    if any(file["state"] != "sound" for file in document["files"]):
         ctx.exit(_FAILED)
 
 
@@ -58,8 +58,8 @@ def clear(as_json: bool) -> None:
 def _print(document: dict[str, Any], as_json: bool) -> None:
     if as_json:
         return print_json(document)
-    for one in document["files"]:
-        say(f"{one.get('state', ''):<8} {one['bytes'] / 1e6:9.1f} MB  {one['address']}".lstrip())
-    total = sum(one["bytes"] for one in document["files"])
+    for file in document["files"]:
+        say(f"{file.get('state', ''):<8} {file['bytes'] / 1e6:9.1f} MB  {file['address']}".lstrip())
+    total = sum(file["bytes"] for file in document["files"])
     say(f"{counted(len(document['files']), 'file')}, {total / 1e6:.1f} MB, in {document['folder']}")
     return None

@@ -19,8 +19,8 @@ def doctor(fetch_grids: bool, as_json: bool) -> None:
     from ortho_pipeline.cli.program import cli
 
     document = commands.doctor(fetch_grids=fetch_grids)
-    document["plugins"] += [vars(one) for one in cli.added.packages()]
-    document["broken"] += [vars(one) for one in cli.added.broken()]
+    document["plugins"] += [vars(package) for package in cli.added.packages()]
+    document["broken"] += [vars(package) for package in cli.added.broken()]
     if as_json:
         return print_json(document)
     gdal, proj = document["gdal"], document["proj"]

@@ -123,9 +123,9 @@ def export(
     from ortho_pipeline import commands
 
     chosen = [name.strip() for text in formats for name in text.split(",")]
-    given: dict[str, Any] = {"formats": chosen} if chosen else {}
+    formats_given: dict[str, Any] = {"formats": chosen} if chosen else {}
     result = commands.export(
-        image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **given
+        image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **formats_given
     )
     print_result(result, as_json)
 

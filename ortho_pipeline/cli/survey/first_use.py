@@ -118,9 +118,9 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
     seen = survey(folder, scene)
     if as_json:
         return print_json({**seen.to_json(), "next": next_steps(seen)})
-    wide = max([0, *(len(one.path) for one in seen.found)])
-    for one in seen.found:
-        say(f"{one.kind:<10} {one.path:<{wide}}   {one.said}")
+    wide = max([0, *(len(file.path) for file in seen.found)])
+    for file in seen.found:
+        say(f"{file.kind:<10} {file.path:<{wide}}   {file.said}")
     say("\nNext:" if seen.found else "Next:")
     for line in next_steps(seen):
         say(f"  {line}")
@@ -142,14 +142,14 @@ def next_steps(seen: FolderSurvey) -> list[str]:
             return ["No image has a sensor model. Fit one to the points:", f"  {line}"]
         return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) beside the image."]
     dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
-    said, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
+    notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:
-        said.append(
+        notes.append(
             "No DEM found. '--dem auto --allow-network' downloads the Copernicus DEM under the scene. Or use "
             "'--dem FILE', or '--height M' for flat ground."
         )
-    elif any(one.path == dems[0] and one.said.endswith(NO_DATUM) for one in seen.found):
-        said.append(
+    elif any(entry.path == dems[0] and entry.said.endswith(NO_DATUM) for entry in seen.found):
+        notes.append(
             f"{dems[0]} does not declare its height datum. Add the one that its vendor states: '--dem-vertical egm96', "
             "'--dem-vertical egm2008' or '--dem-vertical ellipsoid'."
         )
@@ -157,14 +157,14 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         words += ["--gcps", at(points[0])]
     elif maps:
         words += ["--reference", at(maps[0])]
-        said.append(f"No control points found. The command below matches them with {maps[0]}.")
+        notes.append(f"No control points found. The command below matches them with {maps[0]}.")
     else:
-        said.append(
+        notes.append(
             "No control points found. The ortho will be as accurate as the delivered model. To improve it, add "
             "measured points ('--gcps FILE') or an ortho of the same place ('--reference ORTHO')."
         )
     if len(scenes) == 1:
-        return [*said, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
+        return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
     file, network = at("pipeline.yaml"), [] if dems else ["--allow-network"]
     lines = [
         shlex.join(words)
@@ -174,7 +174,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
             ["ortho", "run", file, *network],
         )
     ]
-    return [*said, f"Make the orthos of {counted(len(scenes), 'scene')}:", *(f"  {line}" for line in lines)]
+    return [*notes, f"Make the orthos of {counted(len(scenes), 'scene')}:", *(f"  {line}" for line in lines)]
 
 
 @click.command(cls=Command)

@@ -193,14 +193,14 @@ class Matched:
         column, row = record.shift_px
         reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in record.reasons.items())
         levels = "; ".join(
-            f"{one.agreeing} of {counted(one.chips, 'chip')} agree at 1/{one.factor} resolution"
-            for one in record.levels
+            f"{level.agreeing} of {counted(level.chips, 'chip')} agree at 1/{level.factor} resolution"
+            for level in record.levels
         )
         sigma = self.options.reference_sigma
         return [
             (
                 "reference",
-                ", ".join(Path(one).name for one in self.references)
+                ", ".join(Path(level).name for level in self.references)
                 + (f", accuracy {metres(sigma)} per axis" if sigma else ", accuracy not stated"),
             ),
             ("matches", f"{record.kept} of {record.tried} tried{': ' + reasons if reasons else ''}"),

@@ -102,16 +102,16 @@ class Tied:
             f"{number} in {counted(int(count), 'image')}" for count, number in document["tracks_by_images"].items()
         )
         lines = [f"{counted(document['tracks'], 'tie point')}: {tracks}; median sigma {px(document['sigma_px'])}"]
-        for one in document["pairs"]:
-            pair = f"{one['images'][0]} - {one['images'][1]}"
-            if one["reason"]:
-                lines.append(f"{pair}: no tie points ({one['reason']})")
+        for entry in document["pairs"]:
+            pair = f"{entry['images'][0]} - {entry['images'][1]}"
+            if entry["reason"]:
+                lines.append(f"{pair}: no tie points ({entry['reason']})")
                 continue
-            column, row = one["shift_px"]
+            column, row = entry["shift_px"]
             lines.append(
-                f"{pair}: {counted(one['ties'], 'tie point')} ({one['matched']} of {one['tried']} matches between them "
-                f"succeeded); models differ by column {column:+.2f} px, row {row:+.2f} px; heights differ by "
-                f"{metres(one['height_m'])}"
+                f"{pair}: {counted(entry['ties'], 'tie point')} ({entry['matched']} of {entry['tried']} matches between "
+                f"them succeeded); models differ by column {column:+.2f} px, row {row:+.2f} px; heights differ by "
+                f"{metres(entry['height_m'])}"
             )
         return "\n".join(lines)
 
@@ -188,14 +188,14 @@ def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
 def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
     """Return notices of pairs that were not tied, and of those with few ties."""
     notices = []
-    for one in ties.pairs:
-        pair = f"{names[one.images[0]]} and {names[one.images[1]]}"
-        number = len(ties.of_pair(*one.images))
+    for pair in ties.pairs:
+        label = f"{names[pair.images[0]]} and {names[pair.images[1]]}"
+        number = len(ties.of_pair(*pair.images))
         if number >= _FEW:
             continue
-        why = f" ({one.reason})" if one.reason else ""
-        text = f"only {counted(number, 'tie point')} between {pair}, which show the same ground{why}"
-        notices.append(Notice("few-ties", text, images=[names[image] for image in one.images], count=number))
+        why = f" ({pair.reason})" if pair.reason else ""
+        text = f"only {counted(number, 'tie point')} between {label}, which show the same ground{why}"
+        notices.append(Notice("few-ties", text, images=[names[image] for image in pair.images], count=number))
     return notices
 
 

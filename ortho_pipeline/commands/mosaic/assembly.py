@@ -67,8 +67,8 @@ def mosaic(
         _refuse_far(paths)
     files = {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
     _check_paths(paths, files)
-    layers = [_ortho(one, name) for one, name in zip(paths, _names(paths), strict=True)]
-    ledger = Ledger(begun=states([*paths, *(one.accuracy for one in layers if one.accuracy)]))
+    layers = [_ortho(ortho, name) for ortho, name in zip(paths, _names(paths), strict=True)]
+    ledger = Ledger(begun=states([*paths, *(ortho.accuracy for ortho in layers if ortho.accuracy)]))
     with together(path.parent, path.stem):
         document, failure = assemble(layers, files, options, resources=resources)
         write_json(files["seams"], document)

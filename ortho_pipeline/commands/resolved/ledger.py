@@ -95,7 +95,7 @@ class Ledger:
         if surface is not None:
             # Of heights that were found: what led to them, and the files.
             enter("DEM", surface.provenance.get("documents", ()))
-            read = (one for one in surface.files if Path(one) not in found and not Location(one).is_far)
+            read = (cell for cell in surface.files if Path(cell) not in found and not Location(cell).is_far)
             enter("DEM", read, attached=True)
         roles = dict(sorted(found.items(), key=lambda entry: _ORDER.get(entry[1], 1)))
         return cls(roles, {**states(roles), **(begun or {})})
@@ -165,7 +165,7 @@ def provenance(
     surface: Surface | None,
     inputs: list[dict[str, Any]],
     command: str | None,
-    asked: Mapping[str, Any],
+    settings: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return what is needed to make the same result again: files with checksums, options, versions, the command.
 
@@ -184,7 +184,7 @@ def provenance(
         "model_source": scene.model_source,
         "points": None if request.points.gcps is None else _as_asked(request.points),
         "surface": None if surface is None else dict(surface.provenance),
-        "options": {name: _as_asked(value) for name, value in asked.items()},
+        "options": {name: _as_asked(value) for name, value in settings.items()},
         "software": {
             "ortho-pipeline": software_version(),
             "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),

@@ -153,13 +153,13 @@ def _angles(
     metres = sight.metres(*flat, ground)
     east, north = np.einsum("nij,nj->in", metres, lean)
     # A ray goes against the displacement; straight down it comes from nowhere in particular.
-    found = [np.degrees(np.arctan(np.hypot(east, north))), np.degrees(np.arctan2(-east, -north)) % 360.0]
+    angles = [np.degrees(np.arctan(np.hypot(east, north))), np.degrees(np.arctan2(-east, -north)) % 360.0]
     if sun is not None:
-        found.append(_incidence(sight, surface, flat, metres, sun.way))
-    bands = np.stack(found)
+        angles.append(_incidence(sight, surface, flat, metres, sun.way))
+    bands = np.stack(angles)
     with np.errstate(invalid="ignore"):
         bands[:, ~((image >= 0) & (image <= size)).all(axis=1)] = math.nan
-    return bands.reshape(len(found), height, width)
+    return bands.reshape(len(angles), height, width)
 
 
 def _between(sight: Sight, window: tuple[int, int, int, int], middle: float, half: float) -> Array:
@@ -237,7 +237,7 @@ def write_shadows(
     return float(counts[SHADED] / max(counts[LIT] + counts[SHADED], 1))
 
 
-def _classes(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    classes = np.full(found.shape, LIT, dtype=np.uint8)
-    classes[found == HIDDEN], classes[found == VOID] = SHADED, WITHOUT
+def _classes(visibility: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    classes = np.full(visibility.shape, LIT, dtype=np.uint8)
+    classes[visibility == HIDDEN], classes[visibility == VOID] = SHADED, WITHOUT
     return classes

@@ -90,16 +90,16 @@ class Looked:
             Of the tile, before they are written.
         """
         height, width = pixels.shape[1:]
-        found = self.visibility.look(left, top, width, height)
+        visibility = self.visibility.look(left, top, width, height)
         shown: NDArray[np.bool_] = valid[0] if len(valid) == 1 else np.asarray(valid.any(axis=0))
         count = int(np.count_nonzero(shown))
         # Most tiles of most terrain have nothing hidden: every look at all of their pixels is worth saving.
-        hidden = np.asarray((found == HIDDEN) & shown) if found.any() else None
+        hidden = np.asarray((visibility == HIDDEN) & shown) if visibility.any() else None
         with self._lock:
             self._shown += count
             self._hidden += 0 if hidden is None else int(np.count_nonzero(hidden))
         if self.hiding.mask is not None:
-            return _classes(found, shown, hidden), hidden
+            return _classes(visibility, shown, hidden), hidden
         if hidden is not None:
             pixels[:, hidden], valid[:, hidden] = fill, False
         return None, hidden
@@ -147,11 +147,13 @@ def of_classes(driver: str) -> dict[str, str]:
     return {"LEVEL": "1", "PREDICTOR": "NO", "OVERVIEW_RESAMPLING": "NEAREST"}
 
 
-def _classes(found: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+def _classes(
+    visibility: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None
+) -> NDArray[np.uint8]:
     # Two simple passes: the one through an index of booleans takes ten times as long.
     classes = np.left_shift(shown.view(np.uint8), 1)
     np.subtract(OUTSIDE, classes, out=classes)
     if hidden is not None:
         classes[hidden] = BEHIND
-        classes[(found == VOID) & ~shown] = WITHOUT
+        classes[(visibility == VOID) & ~shown] = WITHOUT
     return classes
