@@ -76,7 +76,7 @@ def register(
             raise InputError(
                 "this file is both input and output", file=path, field="folder", remedy="choose another folder"
             )
-    # Bands in an archive are those of the archive.
+    # The source of a band in an archive is the archive.
     read = {Location(path).archive or Path(path): "band" for path in paths}
     ledger = Ledger(read, states([*paths, opened.model_source]))
     with together(folder, files["image"].stem):

@@ -78,7 +78,7 @@ def adjust(
     images : sequence of path
         Of one or many scenes; each is opened with its own sensor.
     folder : path
-        Where all files go; those of images are called by their stems (with folders ahead where stems are the same).
+        Folder of all outputs. Files of images are named by the stems of the images, after folders if stems are equal.
     scene : SceneOptions or sequence of SceneOptions
         How all images are opened, or each.
     models : sequence of path
@@ -97,7 +97,7 @@ def adjust(
     Raises
     ------
     InputError
-        For whatever the user can correct.
+        If an input or an option is wrong.
     """
     labels = labels_of(images)
     files = _files(labels, Path(folder))
@@ -172,7 +172,7 @@ def intersect(
     Raises
     ------
     InputError
-        If there are not as many models as images, and for whatever else the user can correct.
+        If the number of models differs from that of images, or another input is wrong.
     """
     labels = labels_of(images)
     writer = None if output is None else _writer(output)
@@ -271,7 +271,7 @@ def _record(
     surface: SurfaceOptions,
     heights: Surface | None,
 ) -> dict[str, Any]:
-    """Return what is needed to make the same result again."""
+    """Return the record that reproduces the result."""
     ledgers = [
         Ledger.of(Request(image, scene, PointOptions(gcps=file), surface, match), start.scene, heights)
         for image, scene, start in zip(images, scenes, starts.values(), strict=True)

@@ -24,7 +24,7 @@ from ortho_pipeline.points import Points
 
 
 def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Return a name for each image that no other has: its stem, with folders ahead of it where stems are the same.
+    """Return a unique name for each image: its stem, after its folders if stems are equal.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def scenes_of(
     scene: SceneOptions | Sequence[SceneOptions],
     models: Sequence[str | os.PathLike[str]] = (),
 ) -> list[SceneOptions]:
-    """Return how each image is opened: by options of all or of each, and by its saved model if there are such.
+    """Return the options of each image: common or its own, with its saved model if given.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def scenes_of(
 
 
 def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str) -> int:
-    """Return the number of the image that a name means: its stem or its file, with folders ahead where they differ.
+    """Return the index of the image that a name means: its stem or file name, after folders if needed.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str)
 def points_of_images(
     points: BlockPoints, images: Sequence[str | os.PathLike[str]], labels: Sequence[str], *, whole: bool = True
 ) -> tuple[BlockPoints, list[str]]:
-    """Return the points whose rays are in the images, with these called by their labels; and names that are of none.
+    """Return the points with rays in the images, by the labels of these; and names that match no image.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def points_of_images(
 
 
 def _means(name: str, image: str | os.PathLike[str]) -> bool:
-    """Tell whether a name in a points file means an image: its stem, and as many folders as are named, are the same."""
+    """Return whether a name in a points file means an image: its stem and the named folders agree."""
     named = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
     path = [part.lower() for part in Path(os.path.abspath(image)).parts]
     if not named or len(named) > len(path) or named[:-1] != path[len(path) - len(named) : -1]:
@@ -207,7 +207,7 @@ def start_of(
         refuse_swapped(model, table.select(np.isfinite(table.ground[:, :2]).all(axis=1)), opened.height)
         corrected = ImageCorrection.identity(model, correction, (opened.width / 2, opened.height / 2))
         return Start(opened, corrected, own if correction == "none" else f"{own}+{correction}", source)
-    # The priors of a scene are those of its first model.
+    # The priors of a scene belong to its first model.
     return Start(opened, model, own, source, opened.priors if first else {})
 
 

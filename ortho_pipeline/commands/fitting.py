@@ -45,7 +45,7 @@ def fit(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
 ) -> FitResult:
-    """Adjust the model of a scene to its control points and hold it against its check points.
+    """Adjust the model of a scene to its control points and test it at its check points.
 
     Raises
     ------

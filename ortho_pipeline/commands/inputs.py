@@ -20,7 +20,7 @@ from ortho_pipeline.options import PathLike, SceneOptions
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster import source as raster
 
-#: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
+#: Sidecar files that GDAL attaches to an image of this stem, whatever the image itself contains.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
 #: The same, after the whole name of the image.
 ATTACHED = (".aux.xml", ".ovr", ".msk")
@@ -113,7 +113,7 @@ def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model
 
 
 def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_model: bool) -> Scene:
-    """Open an image whose own model is only wanted if there is one.
+    """Open an image that may have no model of its own.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
 
 
 def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
-    """Return a file of an archive or of the network as one that can be read; any other value as it is."""
+    """Return a file in an archive or on the network in the form that GDAL reads; any other value unchanged."""
     text = str(value)
     return located(text, allow_network=allow_network) if text.startswith("/vsi") or "://" in text else value
 
@@ -151,17 +151,17 @@ def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
 
 
 def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = False) -> None:
-    """Refuse to write what is read or through a link, and what changes the model of the source or of the ortho.
+    """Refuse outputs that overwrite an input, follow a link, or change the model of the source or of the ortho.
 
     Parameters
     ----------
     overwrite : bool
-        Accept old side-cars of the ortho, which the caller removes (`old_side_cars`).
+        Accept old sidecars of the ortho, which the caller removes (`old_side_cars`).
 
     Raises
     ------
     InputError
-        With the path that is in the way.
+        With the path in conflict.
     """
     inputs = {Path(path).resolve() for _, path in request.files}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []

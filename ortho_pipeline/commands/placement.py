@@ -17,12 +17,12 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay, scene_pixels
 
-#: An ortho with a smaller part of what its scene covers is worth a warning.
+#: A smaller share of valid pixels within the footprint gives a warning.
 _SPARSE = 0.05
 
 
 class Placement(NamedTuple):
-    """The place of an ortho and all that it is made from: adjusted model, footprint on the surface, and grid."""
+    """The inputs of an ortho: adjusted model, surface, footprint on it, and grid."""
 
     adjusted: Adjusted
     model: SensorModel
@@ -48,7 +48,7 @@ class Placement(NamedTuple):
         return [Notice("sparse-ortho", text, share=part)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return what is known before the first pixel as JSON values."""
+        """Return the results before the first pixel, as JSON values."""
         fit, grid = self.adjusted.fit, self.grid
         return {
             "sensor": self.scene.sensor,
@@ -69,12 +69,12 @@ class Placement(NamedTuple):
 def place_scene(resolved: Resolved) -> Placement:
     """Adjust a scene to its points, lay it on its surface and choose the grid of its ortho.
 
-    No pixel is read, but those that are matched with a reference.
+    It reads no pixels, except for matching with a reference.
 
     Raises
     ------
     InputError
-        For wrong points, a DEM that does not cover the scene, a grid that is none.
+        For wrong points, a DEM that does not cover the scene, or an impossible grid.
     """
     adjusted, output, surface = adjust(resolved), resolved.request.output, resolved.surface
     assert surface is not None, "who places a scene requires heights"
@@ -95,7 +95,7 @@ def place_scene(resolved: Resolved) -> Placement:
 
 
 def open_rasters(scene: Scene, request: Request) -> RasterSource:
-    """Open the rasters of a scene with the bands and in the type that a request says."""
+    """Open the rasters of a scene with the bands and the type of a request."""
     image, output = request.image, request.output
     return RasterSource(
         *(scene.rasters or (image,)),

@@ -61,14 +61,14 @@ class SceneOptions:
 
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:
-        """Files besides the image that the scene is read from, by what they are."""
+        """Files that the scene is read from, apart from the image, by role."""
         sensor_files = {name: value for name, value in self.sensor_options.items() if _is_file(value)}
         own = {"RPC": self.rpc, "model": self.model}
         return {**{role: path for role, path in own.items() if path is not None}, **sensor_files}
 
 
 def _is_file(value: object) -> bool:
-    """Tell whether a text names a file, on disk or as GDAL names those in an archive."""
+    """Return whether a text names a file, on disk or in an archive as GDAL writes it."""
     return isinstance(value, str | os.PathLike) and (os.fspath(value).startswith("/vsi") or os.path.isfile(value))
 
 
@@ -81,7 +81,7 @@ class PointTable(Protocol):
     def source(self) -> str: ...
 
 
-#: Chips are held in memory, and more matches say no more of a model.
+#: Chips are held in memory, and more matches do not improve a model.
 _MOST_MATCHES = 100_000
 VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
 PIXEL_ORIGIN = Option(

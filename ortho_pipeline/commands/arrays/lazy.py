@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.warp.engine import TileMaker
     from ortho_pipeline.warp.job import WarpJob
 
-#: Options of files, and of rasters besides the ortho.
+#: Options of files, and of other rasters than the ortho.
 _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
 
 
@@ -50,7 +50,7 @@ def ortho_array(
     match: MatchOptions = MatchOptions(),
     output: OutputOptions = OutputOptions(),
 ) -> xarray.DataArray:
-    """Return the orthoimage of a scene as an array of which only those blocks are made that are asked for.
+    """Return the orthoimage of a scene as a lazy array: dask computes only the blocks that are used.
 
     The model is adjusted and the scene laid on its surface now; pixels are read and warped by dask, in threads, in
     processes or on a cluster. They are those of the file that `rectify` writes with the same options, bit by bit.
@@ -58,7 +58,7 @@ def ortho_array(
     Parameters
     ----------
     dem : path or SurfaceOptions
-        A DEM that says its height datum, or all that there is to say of heights.
+        A DEM that declares its height datum, or all options of heights.
     chunks : int, optional
         Side of a block in pixels, a multiple of `warp.lattice.BLOCK`.
 

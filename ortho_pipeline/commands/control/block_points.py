@@ -31,13 +31,13 @@ from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
-#: Ground of matches is exact (m): what is not known of it stands in the covariances in the image.
+#: Sigma (m) of the ground of matches: its errors are in the covariances in the image.
 _EXACT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """The points of a block, what people ought to know of them, and of what was matched documents, texts, heights."""
+    """The points of a block and their notices; documents, texts and heights of the matching."""
 
     table: BlockPoints
     notices: list[Notice]
@@ -54,7 +54,7 @@ def gather(
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
 ) -> Gathered:
-    """Return the points of images, called by their labels, from wherever the options say.
+    """Return the points of images, by label, from the sources in the options.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def settled_scenes(
     options: BlockOptions,
     surface: SurfaceOptions = SurfaceOptions(),
 ) -> tuple[list[SceneOptions], list[Notice]]:
-    """Return how images are opened, with the place of crops that their points or the DEM settle, and notices.
+    """Return the options of images, with the offset of crops that points or DEM decide, and notices.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
 
 
 def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
-    """Tell whether the heights of a DEM are observations of the ties."""
+    """Return whether the heights of a DEM are observations of the ties."""
     return surface.dem is not None and options.dem_heights == "on"
 
 
@@ -224,7 +224,7 @@ def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOpti
 
 
 def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOptions) -> Gathered:
-    """Return the matches of each scene with the references; of those that no reference shows there are none."""
+    """Return the matches of each scene with the references; none for scenes outside all references."""
     tables: dict[str, Points] = {}
     notices, document, text = list[Notice](), dict[str, Any](), list[str]()
     first: InputError | None = None
@@ -260,7 +260,7 @@ def read_points(
     *,
     whole: bool = True,
 ) -> tuple[BlockPoints, list[Notice]]:
-    """Return the points of a file in these images, and what people ought to know of them.
+    """Return the points of a file in these images, and notices.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ def read_points(
 
 
 def _sigmas(text: str) -> list[float]:
-    """Return what ``XY`` or ``XY,H`` says."""
+    """Return the sigmas of ``XY`` or ``XY,H``."""
     sigmas = numbers_of(text)
     if len(sigmas) not in (1, 2) or not all(sigma > 0 for sigma in sigmas):
         raise InputError(

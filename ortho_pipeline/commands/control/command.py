@@ -26,7 +26,7 @@ from ortho_pipeline.report import document as reports
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.base import Surface
 
-#: Suffixes of files that say all that is known of a match.
+#: Suffixes of files that hold all properties of a match.
 _SUFFIXES = (".geojson", ".csv", ".tsv")
 
 
@@ -55,7 +55,7 @@ def match(
     Raises
     ------
     InputError
-        For whatever the user can correct; a place that cannot be told is no point.
+        If an input or an option is wrong.
     """
     if not match.reference:
         raise InputError("no reference given", field="match.reference", remedy="give an ortho of the same place")
@@ -80,7 +80,7 @@ def match(
     settings = request.asked("scene", "surface", "match")
     record = provenance(request, opened, heights, resolved.ledger.hashed(), None, settings)
     points = matched.matches.points
-    # Those of a bundle or a strip serve its other images too, if they say where they were measured.
+    # Points of a bundle or strip also serve its other images, if they name the image in which they were measured.
     said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"
     failure = None
     with together(files["points"].parent, files["points"].stem):
@@ -108,7 +108,7 @@ def _page(report: str | os.PathLike[str] | None) -> dict[str, Path]:
 def _write_page(
     adjusted: Adjusted, surface: Surface | None, record: Mapping[str, Any], files: Mapping[str, Path]
 ) -> None:
-    """Write what there is to see of the matches and of the model that they make."""
+    """Write the page of the matches and of the model that is fitted to them."""
     report = reports.build_report(
         scene=adjusted.scene,
         fit=adjusted.fit,

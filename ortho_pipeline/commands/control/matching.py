@@ -1,4 +1,4 @@
-"""Matching as a command does it: the scene and its references opened, how far to search, and what is said of it all."""
+"""Matching in a command: opens the scene and its references, chooses the search radius, and records the result."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
     from ortho_pipeline.imaging.matching import Matches, Reference, SceneView
 
-#: How far a model may be off (m) of which nothing is known, and at most this part of the scene's shorter side.
+#: Search radius (m) for a model of unknown accuracy, and its limit as a share of the scene's shorter side.
 DEFAULT_SEARCH, _PART = 100.0, 0.25
-#: Many times the sigma that a scene states are searched, and never less than so many pixels.
+#: Search radius in sigmas that a scene states, and its lower limit in pixels.
 _SIGMAS, _LEAST = 3.0, 8.0
-#: Degrees by which a pose that only metadata give may be turned.
+#: Largest rotation (degrees) of a pose that only metadata give.
 POSE_DEG = 5.0
-#: A reference that covers less than this of a scene is a notice.
+#: A reference that covers a smaller share of a scene gives a notice.
 _COVERS = 0.5
-#: A reference is probably made of the scene itself where the chips are as alike as that in the median, and the matches
+#: A reference was probably made from the scene itself if the median correlation of chips is this high and the matches
 #: agree to so many pixels: two images of one place have noise, heights and light of their own, and do not.
 _SAME, _EXACT = 0.97, 0.01
 #: Fields of the image in which matches are counted hold about so many that were tried; at most so many per side.
@@ -60,7 +60,7 @@ _PER_FIELD, _FIELDS = 5, 10
 
 @dataclass(frozen=True)
 class Search:
-    """How far the model of a scene may be off, and who says so.
+    """The search radius for a scene, and its source.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Search:
         Metres on the ground.
     source : str
     known : bool
-        Whether the user or the scene says so.
+        Whether the user or the scene states it.
     """
 
     distance: float
@@ -78,7 +78,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """What a scene and its references have in common.
+    """The matches of a scene with its references.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class Matched:
         Size (m) of a pixel on the ground.
     notices : tuple of Notice
     dem_sigma : float, optional
-        What the heights were said to be good for (m).
+        Stated accuracy (m) of the heights.
     """
 
     matches: Matches
@@ -112,13 +112,13 @@ class Matched:
 
     @property
     def shift(self) -> Array:
-        """How far (px) the delivered model is off: measured minus predicted, the median over the matches ``(2,)``."""
+        """Error (px) of the delivered model: measured minus predicted, median over the matches ``(2,)``."""
         shift: Array = -np.median(self.matches.offset[self.kept], axis=0)
         return shift
 
     @functools.cached_property
     def record(self) -> MatchingRecord:
-        """What is published of it; what its points say of a fit is told by `tested_by`."""
+        """The published record; `tested_by` adds the test of a fit by its points."""
         from ortho_pipeline.imaging.matching import REASONS
 
         matches, kept, points = self.matches, self.kept, self.matches.points
@@ -163,7 +163,7 @@ class Matched:
         )
 
     def tested_by(self, fit: Fit) -> MatchingRecord:
-        """Return the record with what matches and measured points say of a fit that they took no part in."""
+        """Return the record with the errors of a fit at matches and measured points that it did not use."""
         checks, matched = fit.points.check, fit.points.groups >= 0
         return self.record.replaced(
             relative=Tested.of(fit, checks & matched), absolute=Tested.of(fit, checks & ~matched)
@@ -186,7 +186,7 @@ class Matched:
         )
 
     def summary(self) -> list[tuple[str, str]]:
-        """Return what people read of it, as rows of a name and a text."""
+        """Return the summary for people, as rows of a name and a text."""
         from ortho_pipeline.imaging.matching import REASONS
 
         record = self.record
@@ -333,7 +333,7 @@ def _of_references() -> Iterator[None]:
 
 
 def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
-    """Return how far (m) the model may be off: as the user says, as the scene says, or a default.
+    """Return the search radius (m): of the user, from the accuracy that the scene states, or a default.
 
     Parameters
     ----------
@@ -354,9 +354,9 @@ def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
 
 
 def rotation_of(scene: Scene, options: MatchOptions) -> float:
-    """Return how far (degrees) the model may be turned: as the user says, or `POSE_DEG` where it is a pose.
+    """Return the largest rotation (degrees) of the model: of the user, or `POSE_DEG` if it is a pose.
 
-    An RPC is made of a pose that was adjusted: it is taken not to be turned.
+    An RPC comes from an adjusted pose, so no rotation is assumed.
     """
     if options.search_rotation is not None:
         return options.search_rotation
@@ -364,7 +364,7 @@ def rotation_of(scene: Scene, options: MatchOptions) -> float:
 
 
 def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
-    """Return the standard deviation (m) of a scene's model and who states it; None where nobody does."""
+    """Return the standard deviation (m) of a scene's model and its source; None if it is not stated."""
     model = scene.model
     if isinstance(model, RPC):
         errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
@@ -372,7 +372,7 @@ def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
             return math.hypot(*errors), "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
     names = model.param_names
     sigma = scene.facts.get("position_sigma_m")
-    # Of what has an orientation it is the position of the sensor, and the attitude errs too.
+    # With an orientation it is the position of the sensor, and the attitude has errors too.
     if not names and isinstance(sigma, int | float) and sigma > 0:
         return float(sigma) * math.sqrt(2), "the position accuracy in the metadata"
     known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
@@ -403,7 +403,7 @@ def _partial(matches: Matches) -> list[Notice]:
 
 
 def _bands_apart(matches: Matches) -> list[Notice]:
-    """Return a notice if single bands of the references put the scene in different places."""
+    """Return a notice if single bands of the references give different positions of the scene."""
     from ortho_pipeline.imaging.band_shifts import agreeing, disagreeing, spread
 
     bands = matches.bands
@@ -424,7 +424,7 @@ def _bands_apart(matches: Matches) -> list[Notice]:
     return [Notice("bands-disagree", text, bands=fields, agreeing=list(agree), spread_px=spread(bands))]
 
 
-# -- what a reference is not -----------------------------------------------------------------------------------------
+# -- the scene as its own reference --------------------------------------------------------------------------------
 
 
 def _refuse_scene(scene: Scene, reference: Reference) -> None:
@@ -441,7 +441,7 @@ def _refuse_scene(scene: Scene, reference: Reference) -> None:
 
 
 def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Matches) -> list[Notice]:
-    """Return a notice if the reference looks as if it were made of the scene."""
+    """Return a notice if the reference was probably made from the scene."""
     name, alike, agreement = Path(scene.path).name, median_correlation(matches), _agreement(matches)
     why = next(
         (
@@ -460,7 +460,7 @@ def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Mat
 
 
 def _names(reference: Reference, image: str) -> bool:
-    """Tell whether a reference says that it was made of an image: in its metadata, or in the report beside it."""
+    """Return whether a reference was made from an image, by its metadata or its report."""
     described = reference.intensity.source.dataset.GetMetadata() or {}
     if any(image in str(text) for text in described.values()):
         return True

@@ -28,9 +28,9 @@ from ortho_pipeline.surface.base import Surface
 
 
 def control_of(resolved: Resolved) -> tuple[Points, Matched | None]:
-    """Return what a scene is adjusted to and held against: points of a file, matches with a reference, or both.
+    """Return the control and check points of a scene: of a file, matches with a reference, or both.
 
-    Points of a file stay themselves beside matches: they check, or control as their file says if the user wants that.
+    With matches, points of a file are check points; if the user wants it, they keep the roles of their file.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
 
 
 def _refuse_idle(match: MatchOptions) -> None:
-    """Refuse what is said of matching where there is no reference.
+    """Refuse options of matching without a reference.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
     name, path = Path(scene.path).name, located(path, allow_network=request.scene.allow_network)
     table = read_table(path, name, pieces)
     points = points_of(table, crs, vertical, origin)
-    # The same rows in the same order: the table says in which image each of them was measured.
+    # The same rows in the same order: the table names the image in which each was measured.
     named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in table.rows])
     for piece in scene.pieces:
         if piece.sees_apart:
@@ -238,7 +238,7 @@ def no_points() -> Points:
 
 
 def with_heights(points: Points, surface: Surface | None) -> Points:
-    """Fill heights that a file does not give from the surface."""
+    """Fill missing heights from the surface."""
     missing = ~np.isfinite(points.ground[:, 2])
     if not missing.any():
         return points

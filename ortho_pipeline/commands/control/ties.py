@@ -43,15 +43,15 @@ if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
     from ortho_pipeline.imaging.ties import Ties
 
-#: How wrong (m) the heights of a DEM may be of which nothing is said, and those of ground that is taken to be flat.
+#: Assumed sigma (m) of the heights of a DEM without a stated accuracy, and of flat ground.
 DEM_SIGMA, FLAT_SIGMA = 10.0, 30.0
-#: Fewer ties than this between two scenes are said.
+#: Fewer ties than this between two scenes give a notice.
 _FEW = 30
 
 
 @dataclass(frozen=True, eq=False)
 class Tied:
-    """Ties between scenes, and what is said of them.
+    """Ties between scenes, with their notices.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Tied:
         return document
 
     def summary(self) -> str:
-        """Return what people read of it."""
+        """Return the summary for people."""
         document = self.to_json()
         tracks = ", ".join(
             f"{number} in {counted(int(count), 'image')}" for count, number in document["tracks_by_images"].items()
@@ -222,7 +222,7 @@ def ties(
     Raises
     ------
     InputError
-        For whatever the user can correct.
+        If an input or an option is wrong.
     """
     names = names_of(images)
     files = {"ties": Path(output)}

@@ -1,4 +1,4 @@
-"""Heights that are found by themselves: where the scenes of a command lie, and the cells under them."""
+"""Automatic heights: the extent of the scenes of a command, and the DEM cells under them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def open_automatic(options: SurfaceOptions, access: SceneOptions, memory: int, s
 
 
 def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
-    """Return where scenes lie: see `extent_under`.
+    """Return the extents of scenes: see `extent_under`.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
 
 
 def extent_under(scene: Scene) -> Extent:
-    """Return where a scene lies, whatever of the heights that its model is meant for the ground has there.
+    """Return the extent of a scene for all heights in the range of its model.
 
     Raises
     ------

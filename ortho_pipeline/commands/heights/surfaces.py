@@ -1,4 +1,4 @@
-"""The DEM or the flat ground that the options of a command say, and how accurate it is."""
+"""The DEM or flat ground of the options of a command, and its accuracy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def open_surface(
     Parameters
     ----------
     under : iterable of Scene
-        What lies on it, where heights are to be found.
+        Scenes on it, for automatic heights.
     memory : int
         Bytes of the whole job.
 
@@ -66,7 +66,7 @@ def open_surface(
 def open_sigma(
     options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
 ) -> float | Surface | None:
-    """Return the standard deviation of heights: a number (m), a raster of such, or None where nobody says.
+    """Return the standard deviation of heights: a number (m), a raster, or None if not stated.
 
     Raises
     ------
@@ -98,12 +98,12 @@ def dem_as_stated(
     memory: int = OutputOptions.memory,
     extents: Sequence[Extent] = (),
 ) -> DemSurface:
-    """Open a DEM; of the options it is those that say how its heights are to be understood.
+    """Open a DEM with the options that interpret its heights.
 
     Parameters
     ----------
     extents : sequence of Extent
-        Where heights are wanted, of a STAC collection.
+        Needed areas of a STAC collection.
     """
     if options.source is not None:
         raise InputError(
@@ -124,7 +124,7 @@ def dem_as_stated(
 
 
 def dem_files(options: SurfaceOptions) -> list[str]:
-    """Return the files of the DEM that the user gave: one, those of a pattern, a collection's document, or none."""
+    """Return the files of the given DEM: one file, the files of a pattern, a collection's document, or none."""
     if options.dem is None or options.dem == AUTO:
         return []
     dem = Location(options.dem)
@@ -148,12 +148,12 @@ def require_heights(options: SurfaceOptions) -> None:
 
 
 def has_surface(options: SurfaceOptions) -> bool:
-    """Tell whether heights are given.
+    """Return whether heights are given.
 
     Raises
     ------
     InputError
-        If something is said of a DEM that is not given.
+        If an option of a DEM is set without a DEM.
     """
     idle = {
         "surface.vertical": options.vertical is not None,

@@ -1,4 +1,4 @@
-"""Angles of view and of the sun beside an ortho."""
+"""Layers of view angles and sun angles of an ortho."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
-    """Return where the sun stands: as the user says, or the metadata; None where nobody says, or it is not asked.
+    """Return the position of the sun, from the user or the metadata; None if unknown or not needed.
 
     Raises
     ------
     InputError
-        If the user gives a sun that does not stand over the horizon, or one that nobody asks for.
+        If the given sun is below the horizon, or angles were not requested.
     """
     if not output.angles:
         if output.sun is not None:

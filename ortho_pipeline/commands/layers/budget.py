@@ -1,4 +1,4 @@
-"""Layers beside an ortho: what is known of its errors, gathered from scene, points, surface and options."""
+"""The error budget of an ortho, from scene, points, surface and options, and its accuracy layer."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _OTHER_GEOID = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """What is known of the errors, and in words what is not and what is assumed.
+    """The error budget, with its unknown parts and its assumptions in words.
 
     `common` is the variance on the ground (m², both axes) that the covariance of the parameters has of the reference.
     """
@@ -53,7 +53,7 @@ class Known:
 
 
 def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
-    """Return what is known of the errors of an ortho, None where nobody asks, and what there is to say about it.
+    """Return the error budget of an ortho (None if not requested) and notices.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def stated_accuracy(model: SensorModel) -> float | None:
         model = model.model if isinstance(model, ImageCorrection) else model.first
     if not isinstance(model, RPC):
         return None
-    # What is not positive stands for unknown: -1 in the standard, 0 of some programs.
+    # Values that are not positive mean unknown: -1 in the standard, 0 of some programs.
     errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
     return math.hypot(*errors) if errors else None
 
@@ -137,7 +137,7 @@ def _covariance(placed: Placement) -> Array | None:
 
 
 def _of_record(adjusted: Mapping[str, Any], names: tuple[str, ...]) -> Array | None:
-    """Return the covariance of parameters that a model file tells of; None where it does not tell of all."""
+    """Return the covariance of parameters in a model file; None if it is incomplete."""
     try:
         parameters = adjusted["parameters"]
         sigmas = np.array([float(parameters[name]["sigma"]) for name in names])
@@ -157,14 +157,14 @@ def _number(statistics: Any, name: str) -> float:
 
 
 def _datum(surface: Surface) -> float:
-    """Return the standard deviation (m) of what the heights of a surface are measured above."""
+    """Return the standard deviation (m) of the height datum of a surface."""
     if not isinstance(surface, DemSurface) or surface.vertical.is_ellipsoid:
         return 0.0
     return _GEOIDS.get(surface.vertical.name, _OTHER_GEOID)
 
 
 def _reference(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None) -> tuple[float, bool]:
-    """Return what a reference that points were matched with may be off by beside what the parameters have of it.
+    """Return the error of the reference of matched points that the parameters do not include.
 
     Its standard deviation (m), and whether it is unknown.
     """
@@ -177,7 +177,7 @@ def _reference(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None) -
 
 
 def _common(placed: Placement) -> float:
-    """Return the variance (m², both axes) in the middle of the scene that control points have in common."""
+    """Return the variance (m², both axes) at the scene centre of errors common to all control points."""
     fit, scene = placed.adjusted.fit, placed.scene
     if fit.common_error is None:
         return 0.0
@@ -203,7 +203,7 @@ def _assumptions(budget: Budget, surface: Surface) -> list[str]:
 
 
 def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | None = None) -> Path | Hiding:
-    """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
+    """Return the path of the ortho; if requested, with the treatment of pixels that terrain hides."""
     if placed.request.output.visibility is None:
         return files["ortho"]
     from ortho_pipeline.warp.quality.hiding import Hiding
@@ -214,7 +214,7 @@ def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | No
 def write_layers(
     placed: Placement, known: Known | None, warped: WarpRecord, files: Mapping[str, Path]
 ) -> AccuracyLayer | None:
-    """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
+    """Write the accuracy raster and its style, if requested, and return its record for the report."""
     if known is None:
         return None
     from ortho_pipeline.warp.quality.accuracy import write_accuracy

@@ -52,9 +52,9 @@ def mosaic(
     Parameters
     ----------
     path : path
-        Of the mosaic; its record and its page lie beside it.
+        Path of the mosaic; its record and page get the same name.
     allow_network : bool
-        Whether orthos and the mosaic may lie at addresses; a VRT may not.
+        Allow addresses for orthos and mosaic; a VRT cannot have one.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def assemble(
 ) -> tuple[dict[str, Any], ReportError | None]:
     """Write a mosaic and its page; return its document (docs/mosaic.md), which the caller writes.
 
-    The error is that of a page that could not be made; it costs no mosaic.
+    The error means that only the page could not be made.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def assemble(
     Raises
     ------
     InputError
-        If what is asked for cannot be said in a VRT, and as the functions of `warp.mosaic`.
+        If a VRT cannot do what the options request, and as the functions of `warp.mosaic`.
     """
     resources, placed = resources or Resources(), lay_out(orthos, options.order)
     for field in ("seamlines", "balance"):
@@ -175,7 +175,7 @@ def _of(seams: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return names of orthos that tell them apart: their stems, with folders where these are alike."""
+    """Return unique names of orthos: their stems, with folders if stems are equal."""
     ending = Path(ENDINGS["ortho"]).stem
     stems = [path.stem.removesuffix(ending) for path in paths]
     if len(set(stems)) < len(stems):
