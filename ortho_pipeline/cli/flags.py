@@ -1,4 +1,4 @@
-"""Names of options in messages: rooms below say `surface.dem`, the command line shows what is typed there, --dem."""
+"""Names of options in messages: other rooms write `surface.dem`, the command line shows the flag, --dem."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.options import GROUPS, BlockOptions, MosaicOptions, options_of
 from ortho_pipeline.options.texts import Setting, Text
 
-#: Those of a scene, and of a mosaic.
+#: Options of a scene and of a mosaic.
 _GROUPS = {**GROUPS, "mosaic": MosaicOptions}
-#: Name of an option in messages -> its flag, where a command has it under that flag.
+#: Name of an option in messages -> its flag, if a command has it.
 FLAGS = {
     f"{group}.{name}": option.flags.split()[0]
     for group, options in (("points", BlockOptions), *_GROUPS.items())

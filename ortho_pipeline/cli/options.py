@@ -95,7 +95,7 @@ def _help(option: Option) -> str | None:
 
 
 def _said(option: Option, default: Any) -> dict[str, Any]:
-    """Return what click is told of an option, besides names and help."""
+    """Return the arguments of `click.option` for an option, without names and help."""
     if default is False:
         return {"is_flag": True}
     settings: dict[str, Any] = {"metavar": option.metavar, **_typed(option)}
@@ -108,7 +108,7 @@ def _said(option: Option, default: Any) -> dict[str, Any]:
 
 
 def _typed(option: Option) -> dict[str, Any]:
-    """Return what reads the value of an option."""
+    """Return the arguments of `click.option` that parse the value."""
     if option.choices:
         return {"type": click.Choice(option.choices, case_sensitive=option.metavar is None)}
     number: Any = float
@@ -184,7 +184,7 @@ def _grouped(group: str, options: type, *names: str) -> Decorator:
         @functools.wraps(command)
         def wrapper(**arguments: Any) -> Any:
             values = {key.removeprefix(prefix): arguments.pop(key) for key in list(arguments) if key.startswith(prefix)}
-            # Without any, click's empty tuple stands for the default.
+            # Without values, click passes an empty tuple, which means the default.
             return command(
                 **arguments, **{group: options(**{key: value for key, value in values.items() if value != ()})}
             )
@@ -196,7 +196,7 @@ def _grouped(group: str, options: type, *names: str) -> Decorator:
 
 
 def _of_each(*names: str) -> Decorator:
-    """Add the options of scenes to a command with `images`; they arrive as those of all, or as a list of each's."""
+    """Add the options of scenes to a command with `images`; it gets common options, or a list with one for each."""
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
@@ -223,7 +223,7 @@ def _of_each(*names: str) -> Decorator:
 def _scenes(
     images: Sequence[str], scene: SceneOptions, rpcs: Sequence[str], offsets: Sequence[str]
 ) -> SceneOptions | list[SceneOptions]:
-    """Return the options of all images, or of each."""
+    """Return common options, or a list with one for each image."""
     if not rpcs and not offsets:
         return scene
     from ortho_pipeline.commands.block_images import image_named
@@ -254,7 +254,7 @@ _RPC_OF_EACH = "Which RPC to use: 'tag' or 'sidecar' for all images, or a file f
 _OFFSET_OF_EACH = "If an image is a crop: position of its first pixel in the full image. May be repeated."
 #: All options of a scene, as `SceneOptions`.
 scene_options = _grouped("scene", SceneOptions)
-#: The same for the images of a block, where a saved model cannot take the place of all.
+#: The same for the images of a block, without a saved model, which belongs to one image.
 sensor_options = _of_each(*_OF_IMAGES)
 #: The same for one image or several.
 scenes_options = _of_each(*_OF_IMAGES, "model")
@@ -289,7 +289,7 @@ dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_ve
 network_option = _grouped("scene", SceneOptions, "allow_network")
 #: All options of the ortho, as `OutputOptions`.
 output_options = _grouped("output", OutputOptions)
-#: The file says which format, and seams are always measured.
+#: The suffix of the file sets the format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 
 dry_run_option = click.option("--dry-run", is_flag=True, help="Check all inputs and show the plan; write nothing.")
@@ -300,7 +300,7 @@ images_argument = click.argument("images", metavar="IMAGE...", nargs=-1, require
 
 
 def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
-    """Return the name of a folder; that of a raster would become a folder by mistake."""
+    """Return the name of a folder; refuse the name of a raster, which is a mistake."""
     stem, ending = os.path.splitext(text)
     if ending.lower() in (".tif", ".tiff", ".vrt", ".jp2") and not os.path.isdir(text):
         raise click.BadParameter(

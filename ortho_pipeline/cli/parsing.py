@@ -1,7 +1,7 @@
 """Commands as people type them: words that are unknown are errors with a suggestion, not values of other options.
 
 click would read ``-overwrite`` as ``-o verwrite`` and write to a folder of that name. Here a word with one dash is
-an option that exists, or an error; `HINTS` knows what to say of those that other tools have.
+an existing option or an error; `HINTS` has replacements for options of other tools.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Command(click.Command):
     Parameters
     ----------
     one : str, optional
-        What is said when several files are given to a command that takes one.
+        Hint of the error for several files, if the command takes one.
     """
 
     def __init__(self, *given: Any, one: str | None = None, **named: Any) -> None:
@@ -87,9 +87,9 @@ class Command(click.Command):
         ]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the words of the command line; what is left over is an error that says what was meant."""
+        """Parse the words of the command line; unexpected words are an error with a hint."""
         words = _checked(ctx, args, self.get_params(ctx))
-        # click would say 'unexpected extra argument' and not what to do.
+        # The error of click has no hint.
         ctx.allow_extra_args = True
         super().parse_args(ctx, words)
         if not ctx.resilient_parsing:
@@ -100,7 +100,7 @@ class Command(click.Command):
         return ctx.args
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; what it refuses names options as they are typed."""
+        """Run the command; its errors name options by their flags."""
         try:
             if ctx.meta.get("quiet") and not ctx.meta.get("json"):
                 with contextlib.redirect_stdout(io.StringIO()):
@@ -160,7 +160,7 @@ class Megabytes(click.ParamType):  # type: ignore[type-arg]
 
 
 def _refuse_numbers(ctx: click.Context, params: Sequence[click.Parameter]) -> None:
-    """Refuse numbers that computing with goes wrong, whatever option of whatever command they are given to."""
+    """Refuse unusable numbers in all options of all commands."""
     for param in params:
         value = ctx.params.get(str(param.name))
         for number in value if isinstance(value, tuple | list) else (value,):
@@ -205,7 +205,7 @@ def _repeated(word: str, known: Mapping[str, click.Option]) -> bool:
 
 
 def _unknown(ctx: click.Context, word: str, known: Mapping[str, click.Option]) -> NoReturn:
-    """Say that there is no such option, and which was probably meant."""
+    """Fail for an unknown option, and suggest a similar one."""
     name, equals, value = word.partition("=")
     if name in HINTS and "-t_srs" in known:
         ctx.fail(f"No such option: {name}; {HINTS[name]}.")

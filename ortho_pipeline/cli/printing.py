@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.records import Rmse, RmseOnGround
     from ortho_pipeline.runtime.process_limits import Progress
 
-#: Exit code of a command that made a part of what was asked for.
+#: Exit code of a command that made only a part of its outputs.
 PARTLY_DONE = 3
 #: More points than this are not all printed, but so many of them.
 _PRINTED, _WORST = 60, 20

@@ -110,7 +110,7 @@ class _Commands(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands in their groups by what is known of them, without loading any."""
+        """List the commands in their groups, without loading any."""
         groups = {title: {name: summary for name, (_, summary) in group.items()} for title, group in GROUPS.items()}
         for name, offer in self.added.offers.items():
             groups.setdefault(offer.group, {})[name] = offer.summary
@@ -152,7 +152,7 @@ class _Commands(click.Group):
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except (Exception, SystemExit) as error:
-            # A library or a plugin that exits by itself would say that all is well.
+            # An exit by a library or a plugin would look like success.
             return self._fail(ctx, _fault(error), FAILED)
 
     def _fail(self, ctx: click.Context, error: OrthoError, code: int) -> None:
@@ -170,7 +170,7 @@ class _Commands(click.Group):
 
 
 def _print_usage_error(command: str, error: click.UsageError) -> None:
-    """Print the document of an error in the command line itself, of which only the words are known."""
+    """Print the document of an error in the command line itself."""
     if "--json" in shlex.split(command):
         from ortho_pipeline.cli.printing import print_json
 
@@ -188,7 +188,7 @@ def _print_usage_error(command: str, error: click.UsageError) -> None:
 
 
 def _fault(error: BaseException) -> OrthoError:
-    """Return an error that nobody foresaw as one that people can report."""
+    """Return an unexpected error as one that users can report."""
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
         remedy="this is a bug in ortho-pipeline; run the command again with --debug and report the traceback",
@@ -220,7 +220,7 @@ def main() -> None:
         try:
             cli(prog_name="ortho", obj=_begin)
         except KeyboardInterrupt:
-            # Before a command has begun; later `_Commands` says so.
+            # Before a command has begun; later `_Commands` prints it.
             say("Interrupted.", err=True)
             raise SystemExit(INTERRUPTED) from None
         except Terminated as ended:

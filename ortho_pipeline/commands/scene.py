@@ -101,7 +101,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
 
 
 def _on_a_map(image: str | os.PathLike[str], options: SceneOptions) -> dict[str, Any] | None:
-    """Return the document of a DEM or an ortho; None of what is, or may be, a scene."""
+    """Return the document of a DEM or an ortho; None for a possible scene."""
     if isinstance(image, Scene) or dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
         return None
     if os.path.isdir(image):
@@ -137,7 +137,7 @@ def write_plots(
     Raises
     ------
     InputError
-        If it is not a report, or PNG is asked for and matplotlib is not installed.
+        If it is not a report, or PNG is requested without matplotlib.
     """
     with completed(report_file, remedy="give an unmodified <stem>_report.json, or make the report again"):
         document = report.read_report(located(report_file, allow_network=allow_network))
@@ -201,9 +201,9 @@ def dem_check(
     points : path
         CSV or GeoJSON with x, y and h.
     crs, vertical : str, optional
-        What they are in, where the file does not say it.
+        CRS and datum of the points, if the file does not state them.
     surface : SurfaceOptions
-        How the heights of the DEM are to be understood.
+        Height datum of the DEM.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
 
 
 def kept_files(*, verify: bool = False) -> dict[str, Any]:
-    """Return the files that are kept of the network: folder, and address, path, bytes and SHA-256 of each.
+    """Return the cached downloads: folder, and address, path, bytes and SHA-256 of each.
 
     With `verify` also their state: sound, damaged, of another size, missing.
     """
@@ -274,6 +274,6 @@ def kept_files(*, verify: bool = False) -> dict[str, Any]:
 
 
 def forget_kept_files() -> dict[str, Any]:
-    """Remove the files that are kept of the network; return how many, and of how many bytes."""
+    """Delete the cached downloads; return their number and bytes."""
     count, size = kept.clear()
     return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": count, "bytes": size}

@@ -35,9 +35,9 @@ from ortho_pipeline.surface.base import Surface
 
 #: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
 _ELSEWHERE = 3.0
-#: Measured points that together say where a reference lies, and by how many sigmas of their mean they have to.
+#: Number of measured points that locate a reference, and significance of their mean in sigmas.
 _AGREE, _SIGMAS = 3, 4.0
-#: How far (in parts of their own extent) beyond the points the DEM is asked for its range of heights.
+#: Margin around the points, as a share of their extent, for the height range of the DEM.
 _MARGIN = 0.25
 
 
@@ -79,11 +79,11 @@ class Adjusted:
 
     @property
     def matching(self) -> MatchingRecord | None:
-        """What was matched, and what its points say of the fit; None where nothing was."""
+        """The matches, with the test of the fit at them; None without matching."""
         return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def warnings(self, surface: Surface | None) -> tuple[Notice, ...]:
-        """Return what people ought to know before they trust the numbers."""
+        """Return the notices to read before the numbers are trusted."""
         scene, adjusted, points = self.scene, self.fit, self.fit.points
         unsuited = [name for name in scene.models if name in scene.unsuited]
         notices = [*scene.notices, *(Notice("unsuited-model", scene.unsuited[name], model=name) for name in unsuited)]
@@ -118,7 +118,7 @@ class Adjusted:
         return tuple(dict.fromkeys(notices))
 
     def _doubtful(self) -> list[Notice]:
-        """Return a notice for each point left out, and each that contradicts the others unless one of all says it."""
+        """Return a notice for each rejected point, and each that contradicts the others without a common notice."""
         left = [
             Notice("left-out", f"point {name} was rejected: {reason}", point=name, reason=reason)
             for name, reason in self.fit.rejected
@@ -138,7 +138,7 @@ class Adjusted:
         ]
 
     def _elsewhere(self) -> list[Notice]:
-        """Return a warning if the points say that the model, as delivered, shows quite another place."""
+        """Return a warning if the delivered model shows another place than the points."""
         bias = self.fit.raw_bias
         if bias is None or self.fit.model_name in {family.name for family in families()}:
             return []
@@ -153,7 +153,7 @@ class Adjusted:
 
 
 def adjustable(request: Request) -> Resolved:
-    """Resolve a request whose model is to be adjusted; where a model family is fitted, the image needs no model.
+    """Resolve a request for an adjustment; to fit a model family, the image needs no model.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def adjustable(request: Request) -> Resolved:
 def adjust(resolved: Resolved) -> Adjusted:
     """Adjust the model of a scene, or fit the family of the options to the points alone.
 
-    Without points nothing is adjusted, and the model is as it was delivered.
+    Without points the delivered model is used.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def adjust(resolved: Resolved) -> Adjusted:
 
 
 def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
-    """Return a notice if control was matched, here or by `ortho match`: it does not say where the reference lies."""
+    """Return a notice if control was matched, here or by `ortho match`: accuracy is then relative."""
     count, control = int((adjusted.points.groups[adjusted.used] >= 0).sum()), int(adjusted.used.sum())
     if not count:
         return []
@@ -280,7 +280,7 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
 
 
 def _reference_off(adjusted: Fit) -> Array | None:
-    """Return by how much (m, x and y) each measured check point puts the reference off, if they agree that it is."""
+    """Return the displacement (m, x and y) of the reference at each check point, if it is significant."""
     points = adjusted.points
     measured = points.tests & (points.groups < 0) & ~np.isin(points.ids, [point.id for point in adjusted.outlying])
     shifts = in_metres(adjusted, adjusted.residuals)[measured]
@@ -292,7 +292,7 @@ def _reference_off(adjusted: Fit) -> Array | None:
 
 
 def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
-    """Return the correction that many matches justify, as `ortho compare` recommends it, and what people read of it.
+    """Return the correction that many matches justify, as `ortho compare` recommends it, and a notice.
 
     Of shift, shift-drift, affine, and the model's own parameters where it has some, the one with the fewest parameters
     whose error is expected to be within 2 % of the smallest over the scene.
@@ -320,7 +320,7 @@ def _corrected(
     scene: Scene, options: PointOptions, is_delivered: bool, points: Points, surface: Surface | None
 ) -> Adjusted:
     if options.correction != OWN:
-        # What adjusts its own parameters may start anywhere.
+        # A model that adjusts its own parameters may start anywhere.
         refuse_swapped(scene.shared_model, points, scene.height)
     points = with_heights(points, surface)
     correction = options.correction
@@ -342,7 +342,7 @@ def _corrected(
 
 
 def _by_own_parameters(scene: Scene) -> Scene:
-    """Return the scene with the first of its models that has parameters in front, such as a pushbroom beside an RPC."""
+    """Return the scene with its first model that has parameters in front, such as a pushbroom before an RPC."""
     chosen = scene.adjustable
     if chosen is None or scene.models[chosen] is scene.model:
         return scene
@@ -369,7 +369,7 @@ def _from_points(scene: Scene, options: PointOptions, points: Points, surface: S
 
 
 def heights_where_wanted(points: Points, surface: Surface | None, *names: str) -> Points:
-    """Fill missing heights from the surface; without one they are an error unless only 2D models are fitted."""
+    """Fill missing heights from the surface; without one they are an error unless all models are 2D."""
     flat = {family.name for family in families() if family.dimensions == 2}
     if surface is None and set(names) <= flat:
         return points
@@ -377,7 +377,7 @@ def heights_where_wanted(points: Points, surface: Surface | None, *names: str) -
 
 
 def heights_around(points: Points, surface: Surface | None) -> tuple[float, float] | None:
-    """Return the lowest and highest terrain about the points (m), None where no surface says."""
+    """Return the lowest and highest terrain around the points (m); None without a surface there."""
     if surface is None or not len(points):
         return None
     plan = np.column_stack([points.ground[:, :2], np.zeros(len(points))])

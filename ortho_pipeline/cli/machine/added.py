@@ -57,7 +57,7 @@ class AddedCommands:
         try:
             command = getattr(importlib.import_module(module), attribute)
         except (Exception, SystemExit) as error:
-            # A package is somebody else's code, and its other requirements may be missing.
+            # A package may fail in any way, and its requirements may be missing.
             raise PluginError(
                 f"{problem} ({described(error, module)})",
                 remedy="install the missing requirement, or report the error to the author of the plugin",

@@ -1,4 +1,4 @@
-"""What is written to the terminal: printable characters, lines of a bounded length, whatever data hold."""
+"""Output for the terminal: only printable characters, and lines of bounded length."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
 
 
 def next_steps(seen: FolderSurvey) -> list[str]:
-    """Return what to do next with what lies in a folder: sentences, and commands that work when they are pasted."""
+    """Return the next steps for the files of a folder: sentences, and commands to paste."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
 
     scenes, images = seen.of("scene"), seen.of("image")

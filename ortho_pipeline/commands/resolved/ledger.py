@@ -43,7 +43,7 @@ _ORDER = {
     "other ortho": 8,
     "grid": 9,
 }
-#: Options that stand in a record only where they were given: without them, files of the same job keep their bytes.
+#: Options that a record holds only if given, so that other records keep their bytes.
 _IF_GIVEN = ("like", "reference_bands", "search_rotation")
 #: Size, time of change and inode of files.
 State = Mapping[str, tuple[int, int, int]]
@@ -68,12 +68,12 @@ class Ledger:
     def of(
         cls, request: Request, scene: Scene | None = None, surface: Surface | None = None, begun: State | None = None
     ) -> Ledger:
-        """Return the files of a request, and those that the scene and the surface say they were read from.
+        """Return the files of a request, and the files that the scene and the surface were read from.
 
         Parameters
         ----------
         begun : mapping, optional
-            The states of the files that the user named, when the work began; those of now without.
+            States of the named files when the work began; without, the current states.
         """
         found: dict[Path, str] = {}
 
@@ -101,7 +101,7 @@ class Ledger:
         return cls(roles, {**states(roles), **(begun or {})})
 
     def joined(self, *others: Ledger) -> Ledger:
-        """Return the files of several ledgers as one; of a file in several, what the first one says."""
+        """Return the files of several ledgers as one; the first ledger of a file decides its role."""
         roles, begun = dict(self.roles), dict(self.begun)
         for other in others:
             for path, role in other.roles.items():
@@ -110,7 +110,7 @@ class Ledger:
         return Ledger(roles, begun)
 
     def require_unchanged(self) -> None:
-        """Refuse a result whose inputs changed meanwhile: its pixels, model and checksums may be of two files.
+        """Refuse a result whose inputs changed during the run, because its parts may come from different versions.
 
         Raises
         ------
@@ -167,7 +167,7 @@ def provenance(
     command: str | None,
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return what is needed to make the same result again: files with checksums, options, versions, the command.
+    """Return the record that reproduces a result: files with checksums, options, versions, the command.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ from ortho_pipeline.surface.footprint import lay
 def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
     """Open the scene of a request, its heights, its points and the raster that gives the grid.
 
-    Points, heights and matches settle whether the model of a crop belongs to it.
+    Points, heights and matches decide whether the model of a crop belongs to it.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
     Raises
     ------
     InputError
-        For whatever cannot be opened, or is not what an option says.
+        If a file cannot be opened or contradicts an option.
     """
     begun = states(path for _, path in request.files)
     scene = open_by_evidence(request, needs_model=needs_model)

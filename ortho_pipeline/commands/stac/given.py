@@ -1,4 +1,4 @@
-"""What a command was given, with the files in place of STAC items, and what lies elsewhere asked for at once."""
+"""Arguments of a command, with files instead of STAC items; remote files are requested at once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TABLE_BYTES = 50_000_000
 
 
 def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Let STAC items stand where a command takes images, DEMs, references and points.
+    """Let a command accept STAC items as images, DEMs, references and points.
 
     The command has a parameter `image` or `images`, and options. An RPC that is an asset of its own becomes the option
     `scene.rpc`, unless another model is given. Files on other machines are asked for together.
@@ -97,7 +97,7 @@ def heights_given(dem: str | os.PathLike[str], scene: SceneOptions) -> Location:
 
 
 def _item_at(value: Any) -> Location | None:
-    """Return the place that a value names, if it may be that of a STAC item."""
+    """Return the location that a value names, if it may be a STAC item."""
     place = Location(value) if isinstance(value, str | os.PathLike) else None
     return place if place is not None and place.is_item else None
 

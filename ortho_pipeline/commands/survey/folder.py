@@ -1,4 +1,4 @@
-"""What lies in a folder: scenes with a model, DEMs, map images, points; and what to do next."""
+"""The contents of a folder: scenes with a model, DEMs, map images, points; and the next steps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ IMAGES = (
     ".xml",
     ".til",
 )
-#: Said of a DEM whose file does not say above what its heights are.
+#: Note on a DEM whose file does not declare its height datum.
 NO_DATUM = "no height datum declared"
 #: Those of them that hold pixels and nothing else: such a file that does not open is damaged.
 _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img")
@@ -50,7 +50,7 @@ _MOST, _DEPTH = 2000, 3
 
 @dataclass(frozen=True)
 class SurveyedFile:
-    """A file, by its path from the folder: what it is taken for, and what there is to say about it."""
+    """A file, by its path from the folder: its kind, and its description."""
 
     path: str
     kind: Kind
@@ -59,7 +59,7 @@ class SurveyedFile:
 
 @dataclass(frozen=True)
 class FolderSurvey:
-    """What lies in a folder."""
+    """The contents of a folder."""
 
     folder: Path
     found: tuple[SurveyedFile, ...]
@@ -91,12 +91,12 @@ class FolderSurvey:
 
 
 def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> FolderSurvey:
-    """Look at the files of a folder and of those in it; outputs of this program are left out.
+    """List the files of a folder and its subfolders, without outputs of this program.
 
     Raises
     ------
     InputError
-        If there is no such folder, or it has more files than can be looked at.
+        If there is no such folder, or it has too many files.
     """
     place = Path(folder)
     if not place.is_dir():
@@ -133,7 +133,7 @@ def _looked_at(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile 
 
 
 def _is_ours(path: Path) -> bool:
-    """Tell whether the report lies beside a file with which this program would have written it."""
+    """Return whether a file has the report that this program would have written with it."""
     ending = next(ending for ending in ENDINGS.values() if path.name.endswith(ending))
     return path.with_name(path.name.removesuffix(ending) + ENDINGS["report"]).exists()
 
@@ -150,7 +150,7 @@ def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
 
 
 def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -> SurveyedFile | None:
-    """Say what an image is that no sensor opens; None for what is no image."""
+    """Describe an image that no sensor opens; None if it is not an image."""
     try:
         dataset = open_dataset(path, **options.access)
     except OrthoError as error:
@@ -173,7 +173,7 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
     try:
         points = read_points(path)
     except OrthoError as error:
-        # Any text may end so; a table that says in its first line what it is gets told what it lacks.
+        # Any text may have this suffix; a table with a valid header is listed with its missing parts.
         return (
             SurveyedFile(name, "points", f"incomplete: {error.message}") if error.field in ("crs", "vertical") else None
         )
@@ -185,7 +185,7 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
 
 
 def _without_parts(files: list[SurveyedFile]) -> list[SurveyedFile]:
-    """Leave out what opens as the same image as another file: the metadata beside it."""
+    """Leave out metadata that open as the same image as another file."""
     scenes = {
         Path(file.path).with_suffix("") for file in files if file.kind == "scene" and not file.path.endswith(".xml")
     }

@@ -1,4 +1,4 @@
-"""The file of a run over the scenes of a folder, with comments that say what each line is for."""
+"""A pipeline file for the scenes of a folder, with comments that explain each line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
 
 NAME = "pipeline.yaml"
-#: What belongs to a scene, and where it stands in the file.
+#: Kinds of files of a scene, with their group and key in the pipeline file.
 _GROUPS: tuple[tuple[Kind, str, str], ...] = (("dem", "surface", "dem"), ("points", "points", "gcps"))
 
 
@@ -26,18 +26,18 @@ def init(
     options: SceneOptions = SceneOptions(),
     overwrite: bool = False,
 ) -> Result:
-    """Write the file of a run over the scenes of a folder.
+    """Write a pipeline file for the scenes of a folder.
 
     Parameters
     ----------
     path : path, optional
-        Where to; ``pipeline.yaml`` in the folder without one. It has to lie in the folder or above it, as the paths in
+        Path of the file; default ``pipeline.yaml`` in the folder. It must be in the folder or above it, as the paths in
         it are written from there.
 
     Raises
     ------
     InputError
-        If there is no scene with a model, the file is there and `overwrite` is not given, or lies elsewhere.
+        If there is no scene with a model, the path is elsewhere, or the file exists and `overwrite` is false.
     """
     seen = survey(folder, options)
     target = Path(folder) / NAME if path is None else Path(path)
@@ -76,10 +76,10 @@ def init(
 
 
 def text(seen: FolderSurvey, prefix: str = ".") -> str:
-    """Return the file: what was found as settings, what was not as comments."""
+    """Return the text of the file: found files as settings, others as comments."""
 
     def at(name: str) -> str:
-        # A JSON text is a YAML text; what begins with * or has a colon stays what it is.
+        # A JSON text is a YAML text; it protects names that begin with * or contain a colon.
         return json.dumps(name if prefix == "." else f"{prefix}/{name}", ensure_ascii=False)
 
     lines = [
