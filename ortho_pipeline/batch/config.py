@@ -94,7 +94,7 @@ def _settings(name: str, group: type) -> Any:
 
 
 def _described(option: Option) -> str:
-    """Return what the schema says of an option: its help, the forms that its value may have, what holds without it."""
+    """Return the description of an option in the schema: help, forms of its value, default."""
     forms = option.metavar if option.metavar and not option.choices and re.search(r"[| ]", option.metavar) else None
     unset = option.unset and f"Default: {option.unset}."
     return " ".join(part for part in (option.help, forms and f"Form: {forms}.", unset) if part)
@@ -159,7 +159,7 @@ def schema() -> dict[str, Any]:
 
 
 def merged(*layers: Settings) -> Settings:
-    """Return the settings of several layers: what a later one says wins field by field, options key by key."""
+    """Return the settings of several layers; later layers override fields, and keys of options."""
     groups: dict[str, Any] = {}
     for layer in layers:
         for name in Settings.model_fields.keys() & layer.model_fields_set:
@@ -200,7 +200,7 @@ _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_Base):
-    """Scalars as YAML 1.2 has them: no 'no' that is false, no date, no 1:30 that is 90."""
+    """Scalars as in YAML 1.2: 'no' is not false, 1:30 is not 90, and there are no dates."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
@@ -262,7 +262,7 @@ class _Reader:
         self.lines: dict[Place, int] = {}
 
     def value(self, node: Any, place: Place) -> Any:
-        """Return the value of a node that stands at `place`."""
+        """Return the value of a node at `place`."""
         self.lines.setdefault(place, node.start_mark.line + 1)
         kind = node.tag.removeprefix("tag:yaml.org,2002:")
         if isinstance(node, yaml.MappingNode) and kind == "map":
@@ -317,7 +317,7 @@ def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path
     """Return an error of the schema in terms of the file."""
     faults: list[tuple[str, str, str]] = []
     for fault in error.errors():
-        # In a union pydantic adds the member that it tried, which stands nowhere in the file.
+        # In a union pydantic adds the member that it tried, which is not in the file.
         place: Place = tuple(fault["loc"])
         known = place
         while known and known not in lines:
@@ -340,7 +340,7 @@ def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path
 
 
 def _allowed(place: Place) -> str:
-    """Return what may stand where an unknown key does, and the one that was probably meant."""
+    """Return the allowed keys in place of an unknown one, or the most similar one."""
     model: Any = Config
     for part in place[:-1]:
         if isinstance(part, int):

@@ -14,12 +14,12 @@ from ortho_pipeline.errors import OrthoError, error_document
 def check_scenes(
     config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
 ) -> list[dict[str, Any]]:
-    """Open what every scene is made from (images, points, DEM and its coverage) and read no pixel.
+    """Open all inputs of every scene (images, points, DEM) and check the coverage; read no pixels.
 
     Returns
     -------
     list of dict
-        Name and image, and what `commands.check` says or ``error``.
+        Name and image, and the result of `commands.check` or ``error``.
     """
     planned = config if isinstance(config, Plan) else plan(config)
     checked: list[dict[str, Any]] = []

@@ -109,7 +109,7 @@ class Processes:
             self.stop()
 
     def stop(self) -> None:
-        """End all processes now; whatever they had not finished is not there."""
+        """End all processes now; unfinished scenes have no outputs."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
         for process in self._spawned:
@@ -124,7 +124,7 @@ class Processes:
 class InGroups:
     """An executor to which short jobs travel together, as many as take a few seconds; fewer towards the end.
 
-    A task of a scheduler costs some milliseconds, whatever it does: messages, bookkeeping, a future.
+    A task of a scheduler costs some milliseconds: messages, bookkeeping, a future.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def _submitted(executor: Executor, work: Callable[[Job], Outcome], job: Job) -> 
 
 
 def _died(future: Future[Outcome]) -> Future[Outcome]:
-    """Return the future, with the death of a worker in words that say what to do."""
+    """Return the future; the death of a worker becomes an error with a remedy."""
     error = future.exception()
     if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
         return future
@@ -343,7 +343,7 @@ def dask_executor(scheduler: str) -> Any:
 def crew_of(
     executor: str | Executor | None, workers: int | None, threads: int | None, scheduler: str | None, jobs: int
 ) -> Iterator[tuple[Crew, int | None]]:
-    """Yield who does the work, and the threads of each scene."""
+    """Yield the executor, and the threads of each scene."""
     if scheduler is not None and executor not in ("dask", None):
         raise InputError(
             "only dask has a scheduler",

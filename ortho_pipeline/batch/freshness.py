@@ -1,4 +1,4 @@
-"""Whether a scene is as its record says: one rule for outputs on disk and in a store.
+"""Whether a scene agrees with its record: one rule for outputs on disk and in object storage.
 
 A record states of every input and output its place, its size and its checksum, or the tag that a store gives it. A
 scene is fresh while all of them are so, and settings and software too.
@@ -20,14 +20,14 @@ from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.stores.objects import Objects
 
-#: Larger files beside an image are not metadata.
+#: Larger files next to an image are not metadata.
 _COMPANION_BYTES = 5_000_000
 #: Checksums that this process has taken.
 DIGESTS = Digests()
 
 
 def is_scene(record: RunRecord) -> bool:
-    """Tell whether a record is that of a finished scene, with all that a summary says of one."""
+    """Return whether a record belongs to a finished scene and has all facts of a summary."""
     return record.status == "done" and bool(record.facts)
 
 
@@ -48,7 +48,7 @@ def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> 
 
 
 def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
-    """Return the files that a report was made from; one that has changed in the meantime is an error."""
+    """Return the files that a report was made from; a changed file is an error."""
     used = {entry["path"]: entry for entry in report["provenance"]["inputs"]}
     roles = {path: entry["role"] for path, entry in used.items()}
     source = str(report["scene"]["model_source"])
@@ -62,7 +62,7 @@ def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
 
 
 def as_recorded(record: RunRecord, job: Job) -> bool:
-    """Tell whether inputs and outputs have the content that the record states, whatever their dates say."""
+    """Return whether inputs and outputs have the recorded content, ignoring timestamps."""
     with confined(job.output):
         try:
             return record.intact(job.folder) and inputs_as_recorded(record, job) is not None
@@ -71,7 +71,7 @@ def as_recorded(record: RunRecord, job: Job) -> bool:
 
 
 def far_states(job: Job) -> tuple[FileState, ...]:
-    """Return size and tag of the inputs that lie in a store, or behind a server that gives tags.
+    """Return size and tag of the inputs in object storage, or on a server with tags.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def folders(job: Job) -> list[str | os.PathLike[str]]:
 
 
 def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
-    """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
+    """Return all files that a scene depends on: files of `roles`, and small companions of the image."""
     known = _with_companions(job, roles)
     return tuple(FileState.of(role, Path(path), DIGESTS) for path, role in sorted(known.items()))
 
@@ -115,7 +115,7 @@ def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
 
 
 def untouched(record: RunRecord, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
-    """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made.
+    """Return whether all files of a scene have the recorded size, date and neighbours.
 
     Of a scene with inputs in a store this is not known here.
     """
@@ -132,7 +132,7 @@ def _files_untouched(record: RunRecord, job: Job, recorded: Sequence[FileState])
 
 
 def reads_the_same(record: RunRecord, job: Job) -> bool:
-    """Tell whether a scene among other neighbours than before would be made from the same files."""
+    """Return whether a scene with changed neighbours would still be made from the same files."""
     try:
         far = tuple(state for state in record.inputs if state.tag)
         near = record.replaced(inputs=tuple(state for state in record.inputs if not state.tag))

@@ -1,4 +1,4 @@
-"""Places that a pipeline file names: paths in its root on this machine, and addresses of other machines."""
+"""Locations in a pipeline file: paths in its root on this machine, and addresses of other machines."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Place: TypeAlias = Path | VsiPath
 
 
 class PipelinePaths:
-    """What names in a pipeline file stand for.
+    """Resolves names in a pipeline file.
 
     Names are relative to the file. Of a file on this machine they stay in its root wherever links lead; a file on
     another one leads to no file of this one.
@@ -31,9 +31,9 @@ class PipelinePaths:
     ----------
     file : path or address
     root : path, optional
-        Folder that every path has to lie in; that of the file without.
+        Folder that contains all paths; by default that of the file.
     allow_network : bool
-        Whether addresses may be named.
+        Allow addresses.
     """
 
     def __init__(self, file: str | os.PathLike[str], root: str | os.PathLike[str] | None, allow_network: bool) -> None:
@@ -44,7 +44,7 @@ class PipelinePaths:
         self.root = self.base.resolve() if root is None else Path(root).resolve()
 
     def inside(self, text: str, field: str) -> Path:
-        """Return an absolute path on this machine, which has to lie in the root wherever its links lead."""
+        """Return an absolute path on this machine, which must be inside the root after resolving links."""
         if "\0" in text or "://" in text or text.startswith("/vsi"):
             raise InputError(
                 f"{text!r} is not the path of a local file", file=self.file, field=field, remedy="give a local file"
@@ -75,7 +75,7 @@ class PipelinePaths:
         return path
 
     def of(self, text: str, field: str) -> Place:
-        """Return the place of a file: a path, or what lies at an address."""
+        """Return the place of a file: a path, or an address."""
         if Location(text).is_address:
             return self._located(text, field)
         return self._located(self._address(text, field), field) if self.far else self.inside(text, field)
@@ -88,7 +88,7 @@ class PipelinePaths:
         return self._address(text, field) if self.far else str(self.inside(text, field))
 
     def matching(self, pattern: str, field: str) -> list[Place]:
-        """Return the files that a pattern stands for, by name."""
+        """Return the files that match a pattern, by name."""
         if len(os.fsencode(pattern)) > _PATTERN_BYTES or pattern.split("/").count("**") > _WALKS:
             # Every ** walks all folders below each that the one before it found.
             raise InputError(
@@ -132,7 +132,7 @@ class PipelinePaths:
         return "/".join([self.address, *(part for part in parts if part not in ("", "."))])
 
     def _listed(self, pattern: str, field: str) -> list[str]:
-        """Return the addresses of the objects that a pattern stands for."""
+        """Return the addresses of the objects that match a pattern."""
         if not glob.has_magic(pattern):
             return [pattern]
         scheme, _, rest = pattern.partition("://")
@@ -156,7 +156,7 @@ class PipelinePaths:
 
 
 def _fits(name: Sequence[str], pattern: Sequence[str]) -> bool:
-    """Tell whether the parts of a name are those that a pattern stands for; ``**`` is any number of folders."""
+    """Return whether the parts of a name match a pattern; ``**`` is any number of folders."""
     if not pattern:
         return not name
     if pattern[0] == "**":

@@ -36,7 +36,7 @@ from ortho_pipeline.surface.dem_mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
 STATE = ".run"
-#: Files of a run beside the folders of the scenes, by what they are.
+#: Files of a run next to the folders of the scenes, by role.
 RUN_FILES = {
     "log": "run.jsonl",
     "summary": "run.json",
@@ -47,7 +47,7 @@ RUN_FILES = {
 }
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
-#: How names of files end that are told from other words in a file on another machine.
+#: Suffixes by which file names differ from other words in a remote pipeline file.
 _SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,8}$")
 
 
@@ -152,10 +152,10 @@ def plan(
     ----------
     path : path or address
     root : path, optional
-        Folder that every path has to lie in; that of the file without. The file's own ``root`` can only narrow it: who
-        wrote the file is not who says what it may read.
+        Folder that contains all paths; by default that of the file. A ``root`` in the file can only narrow it, because
+        the author of the file does not decide what it may read.
     allow_network : bool
-        Whether it may lie at an address, and name addresses.
+        Allow a remote file, and addresses in it.
 
     Raises
     ------
@@ -368,7 +368,7 @@ class _Planner:
     def _check_names(self, jobs: Sequence[Job]) -> None:
         taken: dict[str, Job] = {}
         for job in jobs:
-            # Some file systems do not tell upper from lower case, or one way of writing é from another.
+            # Some file systems ignore case, or different encodings of é.
             key = unicodedata.normalize("NFC", job.name).casefold()
             if key in (*RUN_FILES.values(), "mosaic.vrt", "mosaic.tif"):
                 raise InputError(
@@ -416,7 +416,7 @@ def _within(request: Request, memory: int, threads: int | None, allow_network: b
 
 
 def _exists(path: Path) -> bool:
-    """Tell whether something has this name, a pipe too; a text that can be no name names nothing."""
+    """Return whether anything, even a pipe, has this name; False for impossible names."""
     try:
         return path.exists()
     except (OSError, ValueError):

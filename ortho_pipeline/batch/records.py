@@ -35,9 +35,9 @@ MAX_BYTES = 50_000_000
 
 
 class FileState(Record):
-    """A file at the time of its checksum; `role` says what it is to the scene.
+    """A file at the time of its checksum; `role` is its role in the scene.
 
-    Of an object in a store there is no date. Its `tag` is the one that the store gave this version.
+    An object in a store has no date. Its `tag` identifies the version in the store.
     """
 
     role: str
@@ -56,7 +56,7 @@ class FileState(Record):
         )
 
     def untouched(self, folder: Path | None = None) -> bool:
-        """Tell whether size and time of change are those recorded; `folder` is that of a relative path."""
+        """Return whether size and time of change are as recorded; `folder` is the base of a relative path."""
         if self.tag:
             return False  # only its store can tell
         try:
@@ -66,11 +66,11 @@ class FileState(Record):
         return (stat.st_size, stat.st_mtime_ns) == (self.bytes, self.mtime_ns)
 
     def same(self, folder: Path) -> bool:
-        """Tell whether the file in `folder` has the content recorded."""
+        """Return whether the file in `folder` has the recorded content."""
         return self.untouched(folder) or self.identical(folder)
 
     def identical(self, folder: Path) -> bool:
-        """Tell whether the file in `folder` has the content recorded, whatever its dates say."""
+        """Return whether the file in `folder` has the recorded content, ignoring timestamps."""
         try:
             return (folder / self.path).is_file() and files.sha256(folder / self.path) == self.sha256
         except (OSError, ValueError):
@@ -139,7 +139,7 @@ class RunRecord(Record):
 
     @classmethod
     def parse(cls, data: bytes) -> Self | None:
-        """Return the record of a text that somebody else may have written, None if it cannot be understood."""
+        """Return the record in an untrusted text; None if it is not valid."""
         try:
             document = files.parse_json(data, "record", "run again")
             if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):
@@ -160,7 +160,7 @@ class RunRecord(Record):
         return record if inside and complete else None
 
     def intact(self, folder: Path, checksums: bool = False) -> bool:
-        """Tell whether all outputs are as they were written; with `checksums` by content whatever their dates say."""
+        """Return whether all outputs are unchanged; with `checksums` by content, ignoring timestamps."""
         if checksums:
             return all(state.identical(folder) for state in self.outputs)
         return all(state.same(folder) for state in self.outputs)

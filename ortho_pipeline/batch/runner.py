@@ -1,7 +1,7 @@
-"""Many scenes: each made once, again only when something that it depends on has changed.
+"""Many scenes: each is made once, and again only if an input, a setting or the software has changed.
 
-The work on a scene is `commands.rectify`. A failing scene does not stop the others. Whatever ends a run, the next one
-goes on where it stood, and ends with the same bytes as a run that nothing interrupted.
+The work on a scene is `commands.rectify`. A failed scene does not stop the others. After an interruption the next run
+continues where it stopped, and its outputs have the same bytes as those of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ _MANY_SEAMS = 64
 
 
 def make_scene(job: Job, checksums: bool = False) -> Outcome:
-    """Make a scene unless it is there already; called in a worker, and never raises for what is wrong with a scene.
+    """Make a scene unless it exists; called in a worker. Errors of a scene are in the outcome.
 
     The lock of the scene is held meanwhile: a scene that a scheduler hands out twice is made once.
 
     Parameters
     ----------
     checksums : bool
-        Judge files by their content, whatever their dates say.
+        Compare files by checksum, ignoring timestamps.
     """
     begin = time.monotonic()
     try:
@@ -83,7 +83,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         far = far_states(job)
         good = _still_good(record, job, listing, checksums)
         if good is not None:
-            # A worker of this run may have made it and died before it could say so.
+            # A worker of this run may have made it and died before it reported.
             mine = bool(job.run) and good.run == job.run
             seconds = good.seconds if mine else time.monotonic() - begin
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
@@ -176,7 +176,7 @@ def _remove(folder: Path, names: set[str]) -> None:
 
 
 def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a summary says of a scene."""
+    """Return the facts of a scene for the summary."""
     scene, adjustment = report["scene"], report["adjustment"]
     return {
         "sensor": scene["sensor"],
@@ -314,7 +314,7 @@ class _Run:
         return self._finish(jobs, mosaic)
 
     def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any]:
-        """Make the mosaic of the scenes that there are; what is wrong with it is in the document."""
+        """Make the mosaic of the finished scenes; its document has the error, if any."""
         present = [job for job in jobs if self.outcomes[job.name].status != "failed"]
         try:
             document = _Mosaic(self.planned, present, self.outcomes).make(crew)
@@ -409,7 +409,7 @@ class _Mosaic:
     def make(self, crew: Crew) -> dict[str, Any]:
         record = RunRecord.at(self.record)
         if record is not None and record.key == self.key and record.intact(self.output):
-            # A record may lie: what it vouches for is read as any other file, and made again if it is not a report.
+            # A record may be wrong: its files are read like any other, and made again if they are not reports.
             with contextlib.suppress(InputError):
                 document = read_json(self.report, _REPORT_BYTES, "run again")
                 if isinstance(document, dict):

@@ -1,4 +1,4 @@
-"""What many runs of parts have made, collected."""
+"""The summary of all parts of a run."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ortho_pipeline.report.page.run import write_run_page
 
 
 def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None = None) -> BatchResult:
-    """Collect what the runs of all parts have made, and write the summary; make no scene.
+    """Collect the results of all parts, and write the summary; make no scenes.
 
-    A scene that nobody has finished has the status ``missing``.
+    An unfinished scene has the status ``missing``.
     """
     planned = config if isinstance(config, Plan) else plan(config)
     if store is not None:
@@ -46,5 +46,5 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
 
 
 def paths_of(record: RunRecord, job: Job) -> dict[str, str]:
-    """Return the outputs of a scene by what they are."""
+    """Return the outputs of a scene by role."""
     return {state.role: str(job.folder / state.path) for state in record.outputs}

@@ -51,7 +51,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
     Parameters
     ----------
     path : path or Hiding
-        Where the ortho is written, or that and what is done about pixels that terrain hides.
+        Path of the ortho, or the path with the treatment of pixels that terrain hides.
 
     Raises
     ------

@@ -46,7 +46,7 @@ from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3
-#: Points per side of the ortho at which a transformer is held against the model.
+#: Points per side of the ortho at which a transformer is compared with the model.
 _CHECKS = 150
 #: Points per side that GDAL's polynomial or homography is fitted to.
 _GCP_SIDE = 11
@@ -124,7 +124,7 @@ class Transformer:
 
 @dataclass(frozen=True)
 class Exact:
-    """Where pixels of an ortho lie in the image: exact model, surface, grid, columns and rows of the image."""
+    """Positions of ortho pixels in the image: exact model, surface, grid, columns and rows of the image."""
 
     model: SensorModel
     surface: Surface
@@ -155,7 +155,7 @@ class Exact:
             seen = [((place >= 0) & (place <= self.size)).all(axis=1) for place in (projected, exact)]
         use = seen[0] | seen[1]
         if transformer.method == "RPC":
-            # GDAL interpolates beside voids and rims of a DEM, where we have no height.
+            # GDAL interpolates next to voids and edges of a DEM, where our engine has no height.
             use &= np.isfinite(projected).all(axis=1) & np.isfinite(exact).all(axis=1)
         worst = np.abs(projected - exact)[use].max(initial=0.0)
         return float(worst) if np.isfinite(worst) else np.inf

@@ -1,4 +1,4 @@
-"""What an engine is asked for, and what it answers: a job of the warp, and its outcome."""
+"""The input and the result of an engine: a job of the warp, and its record."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class WarpJob:
     Parameters
     ----------
     surface : Surface
-        The seam of a global DEM beside the grid (`Surface.around`).
+        The seam of a global DEM, moved off the grid (`Surface.around`).
     resampling, dem_interpolation : str
         How pixels and heights are interpolated.
     tolerance : float

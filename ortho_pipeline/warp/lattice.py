@@ -65,7 +65,7 @@ VERIFIED = 24
 _CELL = 32
 #: What stands for the terrain of a block in which every pixel is projected: its heights are in its nodes already.
 _NO_TERRAIN = DemWindow(np.zeros((2, 2)), 0, 0, False)
-#: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.
+#: Source pixels beyond the lattice nodes of a window, for terrain that is higher or lower between the nodes.
 _MARGIN = 4
 
 

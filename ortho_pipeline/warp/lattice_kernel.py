@@ -1,4 +1,4 @@
-"""Compiled bound on the error of the warp's lattices; lattice.py says what it rests on.
+"""Compiled bound on the error of the warp's lattices; lattice.py explains it.
 
 Arrays: `image` ``(blocks, n + 1, n + 1, levels, 2)`` source points of the nodes at each height, `coefficients` of the
 same shape their polynomials in the normalised height, `dem` ``(blocks, n + 1, n + 1, 2)`` DEM points of the nodes,

@@ -1,4 +1,4 @@
-"""Which part of a run a worker of an array of jobs makes, by what its environment says."""
+"""The part of a run for a worker of a job array, from its environment."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from ortho_pipeline.errors import InputError
 
-#: Environment variable: how many workers there are, where the array does not say it.
+#: Environment variable: number of workers, if the array does not give it.
 COUNT = "ORTHO_SHARDS"
 _AWS, _KUBERNETES, _SLURM = "AWS_BATCH_JOB_ARRAY_INDEX", "JOB_COMPLETION_INDEX", "SLURM_ARRAY_TASK_ID"
 _MOST = 1_000_000
@@ -19,7 +19,7 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
     Raises
     ------
     InputError
-        If the environment is of none of these, of several, or does not say how many workers there are.
+        If the environment has none or several of these, or not the number of workers.
     """
     kinds = [name for name in (_AWS, _KUBERNETES, _SLURM) if name in environment]
     if len(kinds) != 1:

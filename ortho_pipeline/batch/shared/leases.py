@@ -18,7 +18,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import json_text
 from ortho_pipeline.stores.objects import Conflict, Objects
 
-#: Seconds after which a lease that nobody renews is another's to take; it is renewed four times in that time.
+#: Seconds after which another worker may take a lease that is not renewed; it is renewed four times in that time.
 PATIENCE = 120.0
 _RENEWALS = 4
 _LEASE, _RESULT = ".lease.json", ".result.json"
@@ -97,7 +97,7 @@ class Leases:
         Parameters
         ----------
         seen : str, optional
-            The version that may be taken over: that of a worker that does not live.
+            The version that may be taken over, of a dead worker.
         """
         data = lease_document(self._holder, 0)
         try:
@@ -121,7 +121,7 @@ class Leases:
         return frozenset(name.removesuffix(_RESULT) for name, _ in self._store.names() if name.endswith(_RESULT))
 
     def forget(self, name: str) -> None:
-        """Remove result and lease of a scene that is to be made again."""
+        """Delete result and lease of a scene, so that it is made again."""
         self._store.delete(name + _RESULT)
         self._store.delete(name + _LEASE)
 

@@ -28,7 +28,7 @@ from ortho_pipeline.stores.delivery import delivered
 from ortho_pipeline.stores.objects import Objects
 
 _SUMMARY = "run.json"
-#: Seconds between two looks at what the others do.
+#: Seconds between two checks of the other workers.
 _LONGEST_NAP = 5.0
 Make = Callable[[Job], Outcome]
 
@@ -119,7 +119,7 @@ def _files(where: SharedFolder, record: RunRecord) -> dict[str, str]:
 
 
 def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
-    """Return in what a scene is not as its record says; empty if it is.
+    """Return how a scene differs from its record; empty if it does not.
 
     Outputs are asked of the store: size and tag, or with `where.checksums` the content.
     """
@@ -142,7 +142,7 @@ def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
 
 
 def outcome_of(where: SharedFolder, record: RunRecord) -> Outcome:
-    """Return the outcome that a record tells: what another worker, or an earlier run, has made is unchanged."""
+    """Return the outcome of a record; a scene of another worker or an earlier run is unchanged."""
     status = "failed" if record.status == "failed" else "unchanged"
     return Outcome(record.name, status, record.seconds, _files(where, record), record.facts, record.error)
 
@@ -207,7 +207,7 @@ def run_shared(
 
 
 def _unfit(where: SharedFolder, leases: Leases, job: Job) -> bool:
-    """Tell whether a result says nothing, or is that of another scene than the one that is asked for now."""
+    """Return whether a result is invalid, or belongs to another version of the scene."""
     there = leases.result(job.name)
     if there is None or there.status not in ("done", "failed"):
         return True

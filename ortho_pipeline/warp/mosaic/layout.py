@@ -1,4 +1,4 @@
-"""Orthos placed on their common grid, and which lies on top."""
+"""Orthos on their common grid, and their order."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Ortho:
-    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known.
+    """An orthoimage of a mosaic; `relief_displacement` per metre of height (m), None if unknown.
 
     `accuracy` is the raster that `layers.accuracy` wrote of it.
     """
@@ -35,7 +35,7 @@ class Ortho:
 
 @dataclass(frozen=True)
 class PlacedOrtho:
-    """An orthoimage and where it lies in the mosaic."""
+    """An orthoimage and its position in the mosaic."""
 
     ortho: Ortho
     grid: Grid
@@ -53,7 +53,7 @@ class Mosaic:
 
 
 def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
-    """Return where orthos lie on their common grid.
+    """Return the positions of orthos on their common grid.
 
     Parameters
     ----------

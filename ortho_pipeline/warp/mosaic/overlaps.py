@@ -48,7 +48,7 @@ def overlaps(placed: Mosaic) -> list[Overlap]:
 
 
 def measure_seam(overlap: Overlap) -> dict[str, Any]:
-    """Measure how far the content of the second ortho of an overlap lies from that of the first, in pixels.
+    """Measure the shift of the second ortho of an overlap from the first, in pixels.
 
     Returns
     -------

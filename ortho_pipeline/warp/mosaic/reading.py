@@ -19,7 +19,7 @@ class Opened:
         self.layer, self.source = layer, RasterSource(layer.ortho.path, memory=memory)
 
     def read(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return pixels and which are valid ``(bands, h, w)`` of a box of the mosaic that lies in the ortho."""
+        """Return pixels and their validity ``(bands, h, w)`` in a box of the mosaic inside the ortho."""
         left, top = box[0] - self.layer.left, box[1] - self.layer.top
         values = self.source.read(left, top, box[2] - box[0], box[3] - box[1])
         good = self.source.read_valid(left, top, values)

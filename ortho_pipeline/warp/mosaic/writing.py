@@ -24,7 +24,7 @@ _WINDOW = 2048
 
 
 def write_vrt(placed: Mosaic, path: Path) -> None:
-    """Write the mosaic as a VRT that refers to the orthos by relative paths; they have to lie below its folder.
+    """Write the mosaic as a VRT that refers to the orthos by relative paths; they must be below its folder.
 
     Raises
     ------

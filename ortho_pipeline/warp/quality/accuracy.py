@@ -63,7 +63,7 @@ _MIXED = 1000
 
 @dataclass(frozen=True)
 class Budget:
-    """What is known of the errors of an ortho, each independent of the others; None is unknown.
+    """The error sources of an ortho, independent of each other; None is unknown.
 
     Parameters
     ----------

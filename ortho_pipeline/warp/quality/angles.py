@@ -1,4 +1,4 @@
-"""Angles of view and of the sun at each place of an ortho, and what lies in shadow.
+"""View angles and sun angles at each place of an ortho, and its shadows.
 
 Azimuths are clockwise from true north, towards sensor and sun, whatever the map; zenith angles are from the ellipsoid's
 normal, and the sun's incidence is from the normal of the terrain over a pixel of the layer. The sun stands at one place
@@ -29,7 +29,7 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask of shadows, by their values; 0 stands for nothing.
+#: Classes of the shadow mask, by their values; 0 is nodata.
 LIT, SHADED, WITHOUT = 1, 2, 4
 #: Side of a tile, of the layer and of the mask, and pixels of the layer between nodes.
 _TILE, _MASK_TILE, _SPACING = 256, 1024, 16
@@ -217,7 +217,7 @@ def write_shadows(
     resources: Resources | None = None,
     driver: str = "COG",
 ) -> float:
-    """Write which pixels of the ortho lie in shadow, their own or that of other terrain; return the share of shadow.
+    """Write the mask of shadowed pixels (own or cast shadow); return the share of shadow.
 
     Byte: 1 in the sun, 2 in shadow, 4 without a height. A line from the pixel to the sun is followed over the surface,
     exactly as lines of sight are (`visibility`).

@@ -20,7 +20,7 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
+#: Classes of the mask, by their values, with their names and colours; 0 is nodata.
 CLASSES = {
     1: ("visible", "#d9e8d0"),
     2: ("hidden", "#b4500b"),
@@ -32,7 +32,7 @@ VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
 
 @dataclass(frozen=True)
 class Hiding:
-    """Where an ortho is written, and what is done about pixels that terrain hides.
+    """The path of an ortho, and the treatment of pixels that terrain hides.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Looked:
 
     @property
     def filled_share(self) -> float | None:
-        """Share of the same pixels that are those of another ortho; None where none is given."""
+        """Share of the same pixels filled from another ortho; None without one."""
         return None if self.hiding.other is None else self._filled / max(self._shown, 1)
 
     def look(
@@ -128,7 +128,7 @@ class Looked:
             self._filled += int(np.count_nonzero(new.any(axis=0)))
 
     def writer(self, driver: str, threads: int) -> Any:
-        """Return the writer of the mask by a driver of GDAL as a context; of nothing where none is wanted."""
+        """Return the writer of the mask by a driver of GDAL as a context; a dummy without a mask."""
         if self.hiding.mask is None:
             return contextlib.nullcontext()
         profile = classes_profile("visibility", CLASSES, {})
@@ -138,7 +138,7 @@ class Looked:
 
 
 def of_classes(driver: str) -> dict[str, str]:
-    """Return the creation options of a raster of classes, which is made of large parts that are all the same.
+    """Return the creation options of a raster of classes, which has large uniform areas.
 
     Runs are counted four times as fast as they are deflated, and everything reads them; COGs have no such compression.
     """
