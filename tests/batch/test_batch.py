@@ -241,7 +241,7 @@ def test_placeholders_and_exclusions(block):
     assert [job.name for job in jobs] == ["raw_s0", "raw_s1"]
     assert jobs[1].request.points.gcps == str(block.folder / "points" / "raw" / "s1.csv")
     block.write(FILE + "    name: '{stem.__class__}{sensor}'\n")
-    with pytest.raises(InputError, match=r"\{sensor\} is not known"):
+    with pytest.raises(InputError, match=r"unknown placeholder \{sensor\}"):
         batch_plan.plan(block.file)
 
 
@@ -489,7 +489,7 @@ def test_a_worker_with_other_software_refuses(block, monkeypatch):
     monkeypatch.setattr(batch, "versions", lambda: {**job.versions, "gdal": "1.0"})
     outcome = batch.make_scene(job)
     assert outcome.status == "failed"
-    assert "gdal 1.0 in place of" in outcome.error["message"]
+    assert "gdal 1.0 instead of" in outcome.error["message"]
 
 
 def test_checksums_see_what_dates_hide(block):

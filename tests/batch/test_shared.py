@@ -456,7 +456,7 @@ def test_a_file_on_this_machine_may_name_addresses_if_that_is_allowed(tiny: Any)
             .replace(f"{public.address}/{tiny.image.name}", f"{public.address}/*.tif")
             .replace("image:", "images:")
         )
-        with pytest.raises(InputError, match="not searched"):
+        with pytest.raises(InputError, match="cannot search a web server"):
             plan(file, allow_network=True)
 
 

@@ -165,7 +165,7 @@ def test_an_old_side_car_that_would_attach_to_the_ortho_is_refused(tiny, tmp_pat
     out.mkdir()
     stale = out / "tiny_ortho_RPC.TXT"
     stale.write_text("LINE_OFF: 1\n")
-    with pytest.raises(InputError, match="side-car") as caught:
+    with pytest.raises(InputError, match="sidecar file") as caught:
         rectify(tiny, out)
     assert caught.value.file == str(stale)
 
