@@ -48,7 +48,7 @@ class _Strict(BaseModel):
 
 def _usable(number: float) -> float:
     if not is_usable(number):
-        raise ValueError(f"{number:g} is not a number to compute with")
+        raise ValueError(f"{number:g} is not a usable number: too large, too small, or not finite")
     return number
 
 
@@ -61,13 +61,13 @@ def _type(option: Option) -> Any:
     number: Any = Annotated[bounded, pydantic.AfterValidator(_usable)]
     low, high = (None if bound is None else int(bound) for bound in (option.above, option.below))
     within: dict[str, Any] = {"ge": low if low is None else low + 1, "le": high if high is None else high - 1}
-    whole: Any = int if low is high is None else Annotated[int, Field(**within)]
+    integer: Any = int if low is high is None else Annotated[int, Field(**within)]
     return {
         "text": str,
         "file": str,
         "number": number,
-        "integers": Annotated[list[whole], Field(min_length=1)],
-        "integer": whole,
+        "integers": Annotated[list[integer], Field(min_length=1)],
+        "integer": integer,
         "files": str | list[str],
         "pair": Annotated[list[number], Field(min_length=2, max_length=2)],
         "box": Annotated[list[number], Field(min_length=4, max_length=4)],
@@ -80,21 +80,21 @@ def _type(option: Option) -> Any:
 
 def _settings(name: str, group: type) -> Any:
     """Return the schema of a group of options; what they mean and may be is stated in `options`."""
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     known = options_of(group)
-    for one in dataclasses.fields(group):
-        option = known[one.name]
+    for field in dataclasses.fields(group):
+        option = known[field.name]
         if not option.in_file:
             continue
-        default: Any = {"keys": {}, "files": []}.get(option.kind, one.default)
+        default: Any = {"keys": {}, "files": []}.get(option.kind, field.default)
         kind: Any = bool if isinstance(default, bool) else _type(option)
         described = Field(default=default, description=_described(option) or None)
-        found[one.name] = (kind | None if default is None else kind, described)
-    return pydantic.create_model(name, __base__=_Strict, __doc__=str(group.__doc__).partition("\n")[0], **found)
+        types[field.name] = (kind | None if default is None else kind, described)
+    return pydantic.create_model(name, __base__=_Strict, __doc__=str(group.__doc__).partition("\n")[0], **types)
 
 
 def _described(option: Option) -> str:
-    """Return what the schema says of an option: its help, the forms that its value may have, what holds without it."""
+    """Return the description of an option in the schema: help, forms of its value, default."""
     forms = option.metavar if option.metavar and not option.choices and re.search(r"[| ]", option.metavar) else None
     unset = option.unset and f"Default: {option.unset}."
     return " ".join(part for part in (option.help, forms and f"Form: {forms}.", unset) if part)
@@ -108,7 +108,7 @@ OutputSettings = _settings("OutputSettings", OutputOptions)
 
 
 class Settings(_Strict):
-    """All that can be said of a scene."""
+    """All settings of a scene."""
 
     scene: SceneSettings = SceneSettings()  # type: ignore[valid-type]
     points: PointSettings = PointSettings()  # type: ignore[valid-type]
@@ -120,17 +120,17 @@ class Settings(_Strict):
 class Entry(Settings):
     """One image, or all that match; a later entry for the same image overrides fields of earlier ones."""
 
-    image: str | None = Field(default=None, description="One image file, by its name as it is.")
-    images: str | list[str] | None = Field(default=None, description="Patterns with * ? [] and **.")
-    exclude: str | list[str] = Field(default=[], description="Patterns of images that are left out.")
+    image: str | None = Field(default=None, description="One image file, without patterns.")
+    images: str | list[str] | None = Field(default=None, description="Patterns of image files, with * ? [] and **.")
+    exclude: str | list[str] = Field(default=[], description="Patterns of images to leave out.")
     name: str | None = Field(
-        default=None, description="Name of the scene; may hold {stem} and {folder}. Default: {stem}."
+        default=None, description="Name of the scene; may contain {stem} and {folder}. Default: {stem}."
     )
 
     @pydantic.model_validator(mode="after")
     def _one_way(self) -> Entry:
         if (self.image is None) == (self.images is None):
-            raise ValueError("an entry has either 'image' (one file) or 'images' (patterns)")
+            raise ValueError("an entry needs either 'image' (one file) or 'images' (patterns)")
         return self
 
 
@@ -146,10 +146,10 @@ class Config(_Strict):
     output: str = Field(default="out", description="Output folder, relative to this file.")
     root: str | None = Field(
         default=None,
-        description="Folder that every path has to lie in, relative to this file; within the file's own, or that of "
-        "the command. Default: that one.",
+        description="Allow only paths inside this folder, relative to this file. It can only narrow the root of the "
+        "command. Default: that root.",
     )
-    defaults: Settings = Field(default=Settings(), description="What holds for all scenes.")
+    defaults: Settings = Field(default=Settings(), description="Settings of all scenes.")
     mosaic: MosaicSettings | None = None  # type: ignore[valid-type]
 
 
@@ -159,17 +159,17 @@ def schema() -> dict[str, Any]:
 
 
 def merged(*layers: Settings) -> Settings:
-    """Return the settings of several layers: what a later one says wins field by field, options key by key."""
+    """Return the settings of several layers; later layers override fields, and keys of options."""
     groups: dict[str, Any] = {}
     for layer in layers:
         for name in Settings.model_fields.keys() & layer.model_fields_set:
             value, before = getattr(layer, name), groups.get(name)
             if isinstance(value, BaseModel) and isinstance(before, BaseModel):
-                said = {field: getattr(value, field) for field in value.model_fields_set}
-                for field, item in said.items():
+                stated = {field: getattr(value, field) for field in value.model_fields_set}
+                for field, item in stated.items():
                     if isinstance(item, Mapping):
-                        said[field] = {**getattr(before, field), **item}
-                value = before.model_copy(update=said)
+                        stated[field] = {**getattr(before, field), **item}
+                value = before.model_copy(update=stated)
             groups[name] = value
     return Settings.model_construct(**groups)
 
@@ -188,7 +188,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     """
     content = read_bounded(path, _MAX_BYTES, remedy="check the path")
     if len(content) > _MAX_BYTES:
-        raise InputError("a pipeline file of more than 5 MB is not read", file=path, remedy="use patterns")
+        raise InputError("the pipeline file is larger than 5 MB", file=path, remedy="name images by patterns")
     document, lines = _parse(content, path)
     try:
         return Config.model_validate(document)
@@ -200,7 +200,7 @@ _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_Base):
-    """Scalars as YAML 1.2 has them: no 'no' that is false, no date, no 1:30 that is 90."""
+    """Scalars as in YAML 1.2: 'no' is not false, 1:30 is not 90, and there are no dates."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
@@ -227,7 +227,7 @@ def _parse(content: bytes, path: str | os.PathLike[str]) -> tuple[Any, dict[Plac
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         # A pattern such as */a.tif without quotes is an alias to YAML.
-        remedy = "put quotes around text that begins with *" if "alphabetic" in problem else _SEE
+        remedy = "quote text that begins with *" if "alphabetic" in problem else _SEE
         field = None if mark is None else f"line {mark.line + 1}"
         raise InputError(f"this is not YAML ({problem})", file=path, field=field, remedy=remedy) from error
     if node is None:
@@ -241,17 +241,17 @@ def _check_events(content: bytes, path: str | os.PathLike[str]) -> None:
     depth = 0
     for count, event in enumerate(yaml.parse(content, _Loader)):
         if count > _MAX_EVENTS:
-            raise InputError("there are too many entries", file=path, remedy="name images by patterns")
+            raise InputError("too many entries", file=path, remedy="name images by patterns")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         line = f"line {event.start_mark.line + 1}" if event.start_mark else None
         if depth > _MAX_DEPTH:
-            raise InputError(f"more than {_MAX_DEPTH} levels are not read", file=path, field=line)
+            raise InputError(f"more than {_MAX_DEPTH} nested levels", file=path, field=line)
         if isinstance(event, yaml.AliasEvent):
-            remedy = "put what scenes share under 'defaults'"
-            raise InputError("aliases are not followed", file=path, field=line, remedy=remedy)
+            remedy = "put common settings under 'defaults'"
+            raise InputError("YAML aliases are not supported", file=path, field=line, remedy=remedy)
 
 
 class _Reader:
@@ -262,7 +262,7 @@ class _Reader:
         self.lines: dict[Place, int] = {}
 
     def value(self, node: Any, place: Place) -> Any:
-        """Return the value of a node that stands at `place`."""
+        """Return the value of a node at `place`."""
         self.lines.setdefault(place, node.start_mark.line + 1)
         kind = node.tag.removeprefix("tag:yaml.org,2002:")
         if isinstance(node, yaml.MappingNode) and kind == "map":
@@ -270,22 +270,22 @@ class _Reader:
         if isinstance(node, yaml.SequenceNode) and kind == "seq":
             return [self.value(item, (*place, i)) for i, item in enumerate(node.value)]
         if kind not in ("str", "int", "float", "bool", "null"):
-            raise self._error(node, place, f"the tag {node.tag!r} is not known", "leave it out")
+            raise self._error(node, place, f"unknown YAML tag {node.tag!r}", "leave it out")
         return self._scalar(node, place, kind)
 
     def _mapping(self, node: Any, place: Place) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for key, item in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
             if name is None:
-                raise self._error(key, place, "a key is a word", _SEE)
+                raise self._error(key, place, "this key is not a word", _SEE)
             here = (*place, name)
-            if name in found:
+            if name in values:
                 before = self.lines[here]
-                raise self._error(key, here, f"this key is given twice (before in line {before})", "leave one out")
+                raise self._error(key, here, f"duplicate key, already in line {before}", "leave one out")
             self.lines[here] = key.start_mark.line + 1
-            found[name] = self.value(item, here)
-        return found
+            values[name] = self.value(item, here)
+        return values
 
     def _scalar(self, node: Any, place: Place, kind: str) -> Any:
         text = node.value
@@ -315,32 +315,32 @@ def dotted(place: Place) -> str:
 
 def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path: Any) -> InputError:
     """Return an error of the schema in terms of the file."""
-    found: list[tuple[str, str, str]] = []
-    for one in error.errors():
-        # In a union pydantic adds the member that it tried, which stands nowhere in the file.
-        place: Place = tuple(one["loc"])
+    faults: list[tuple[str, str, str]] = []
+    for fault in error.errors():
+        # In a union pydantic adds the member that it tried, which is not in the file.
+        place: Place = tuple(fault["loc"])
         known = place
         while known and known not in lines:
             known = known[:-1]
-        if one["type"] == "missing":
-            known, message = place, "this field is missing"
+        if fault["type"] == "missing":
+            known, message = place, "missing field"
         else:
-            message = one["msg"].removeprefix("Value error, ")
+            message = fault["msg"].removeprefix("Value error, ")
         remedy = _SEE
-        if one["type"] == "extra_forbidden":
-            message, remedy = "there is no such field", _allowed(place)
+        if fault["type"] == "extra_forbidden":
+            message, remedy = "unknown field", _allowed(place)
         line = lines.get(known, lines.get(known[:-1], 1))
-        found.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
-    found = list(dict.fromkeys(found))
-    field, message, remedy = found[0]
-    rest = [f"{where}: {what}" for where, what, _ in found[1:_SHOWN]]
-    if len(found) > _SHOWN:
-        rest.append(f"and {len(found) - _SHOWN} more")
+        faults.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
+    faults = list(dict.fromkeys(faults))
+    field, message, remedy = faults[0]
+    rest = [f"{where}: {what}" for where, what, _ in faults[1:_SHOWN]]
+    if len(faults) > _SHOWN:
+        rest.append(f"and {len(faults) - _SHOWN} more")
     return InputError("; ".join([message, *rest]), file=path, field=field, remedy=remedy)
 
 
 def _allowed(place: Place) -> str:
-    """Return what may stand where an unknown key does, and the one that was probably meant."""
+    """Return the allowed keys in place of an unknown one, or the most similar one."""
     model: Any = Config
     for part in place[:-1]:
         if isinstance(part, int):

@@ -1,4 +1,4 @@
-"""A run without pixels: everything that it would be made from is opened, and what stands in its way is said."""
+"""A run without pixels: opens all inputs and reports their errors and warnings."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from ortho_pipeline.errors import OrthoError, error_document
 def check_scenes(
     config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
 ) -> list[dict[str, Any]]:
-    """Open what every scene is made from (images, points, DEM and its coverage) and read no pixel.
+    """Open all inputs of every scene (images, points, DEM) and check the coverage; read no pixels.
 
     Returns
     -------
     list of dict
-        Name and image, and what `commands.check` says or ``error``.
+        Name and image, and the result of `commands.check` or ``error``.
     """
     planned = config if isinstance(config, Plan) else plan(config)
     checked: list[dict[str, Any]] = []
     for job in planned.chosen(only, shard):
-        asked = job.request
-        one: dict[str, Any] = {"name": job.name, "image": str(job.image)}
+        request = job.request
+        row: dict[str, Any] = {"name": job.name, "image": str(job.image)}
         try:
-            one |= commands.check(
-                asked.image,
-                scene=asked.scene,
-                points=asked.points,
-                surface=asked.surface,
-                match=asked.match,
-                output=asked.output,
+            row |= commands.check(
+                request.image,
+                scene=request.scene,
+                points=request.points,
+                surface=request.surface,
+                match=request.match,
+                output=request.output,
             )
         except OrthoError as error:
-            one["error"] = error_document(error)
-        checked.append(one)
+            row["error"] = error_document(error)
+        checked.append(row)
     return checked

@@ -109,7 +109,7 @@ class Processes:
             self.stop()
 
     def stop(self) -> None:
-        """End all processes now; whatever they had not finished is not there."""
+        """End all processes now; unfinished scenes have no outputs."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
         for process in self._spawned:
@@ -124,7 +124,7 @@ class Processes:
 class InGroups:
     """An executor to which short jobs travel together, as many as take a few seconds; fewer towards the end.
 
-    A task of a scheduler costs some milliseconds, whatever it does: messages, bookkeeping, a future.
+    A task of a scheduler costs some milliseconds: messages, bookkeeping, a future.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class InGroups:
                 future.cancel()
 
 
-def _work_through(given: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tuple[float, list[tuple[Any, Any]]]:
+def _work_through(batch: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tuple[float, list[tuple[Any, Any]]]:
     """Do some jobs one after the other, until twice their time is over.
 
     Returns
@@ -188,7 +188,7 @@ def _work_through(given: tuple[Callable[[Job], Outcome], Sequence[Job]]) -> tupl
     list
         Of each job that was done its result or its exception.
     """
-    work, jobs = given
+    work, jobs = batch
     begin, done = time.monotonic(), list[tuple[Any, Any]]()
     for job in jobs:
         future = Sequential().submit(work, job)
@@ -298,18 +298,18 @@ def _submitted(executor: Executor, work: Callable[[Job], Outcome], job: Job) -> 
 
 
 def _died(future: Future[Outcome]) -> Future[Outcome]:
-    """Return the future, with the death of a worker in words that say what to do."""
+    """Return the future; the death of a worker becomes an error with a remedy."""
     error = future.exception()
     if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":
         return future
-    told: Future[Outcome] = Future()
-    told.set_exception(
+    failed: Future[Outcome] = Future()
+    failed.set_exception(
         WorkerDied(
-            "the process that made this scene was killed",
+            "the process of this scene was killed",
             remedy=Text("give it more memory, or ", Setting("workers", "1")),
         )
     )
-    return told
+    return failed
 
 
 def dask_executor(scheduler: str) -> Any:
@@ -324,13 +324,15 @@ def dask_executor(scheduler: str) -> Any:
         from distributed import Client
     except ImportError as error:
         raise InputError(
-            "dask is not installed", field="scheduler", remedy="pip install 'ortho-pipeline[dask]'"
+            "dask is not installed",
+            field="scheduler",
+            remedy="run pip install '.[dask]' in the checkout of ortho-pipeline",
         ) from error
     try:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no dask scheduler answers at {scheduler!r} ({error or type(error).__name__})",
+            f"cannot connect to the dask scheduler at {scheduler!r} ({error or type(error).__name__})",
             field="scheduler",
             remedy="give its address, for example tcp://host:8786",
         ) from error
@@ -341,19 +343,21 @@ def dask_executor(scheduler: str) -> Any:
 def crew_of(
     executor: str | Executor | None, workers: int | None, threads: int | None, scheduler: str | None, jobs: int
 ) -> Iterator[tuple[Crew, int | None]]:
-    """Yield who does the work, and the threads of each scene."""
+    """Yield the executor, and the threads of each scene."""
     if scheduler is not None and executor not in ("dask", None):
         raise InputError(
-            "a scheduler is for dask",
+            "only dask has a scheduler",
             field="scheduler",
-            remedy=Text("leave out ", Setting("executor"), ", or say dask"),
+            remedy=Text("leave out ", Setting("executor"), ", or set it to dask"),
         )
     if isinstance(executor, Executor):
         yield executor, threads or 1
     elif executor == "dask" or scheduler is not None:  # a scheduler alone means dask
         if scheduler is None:
             raise InputError(
-                "dask needs the address of its scheduler", field="scheduler", remedy="for example tcp://host:8786"
+                "dask needs the address of its scheduler",
+                field="scheduler",
+                remedy="give it, for example tcp://host:8786",
             )
         client, pool = dask_executor(scheduler)
         with client:
@@ -366,4 +370,4 @@ def crew_of(
         budget = threads or max(1, processors // count)
         yield Processes(count, budget), budget
     else:
-        raise InputError(f"no executor is called {executor!r}", field="executor", remedy=", ".join(EXECUTORS))
+        raise InputError(f"there is no executor {executor!r}", field="executor", remedy=", ".join(EXECUTORS))

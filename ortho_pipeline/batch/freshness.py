@@ -1,4 +1,4 @@
-"""Whether a scene is as its record says: one rule for outputs on disk and in a store.
+"""Whether a scene agrees with its record: one rule for outputs on disk and in object storage.
 
 A record states of every input and output its place, its size and its checksum, or the tag that a store gives it. A
 scene is fresh while all of them are so, and settings and software too.
@@ -20,14 +20,14 @@ from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.stores.objects import Objects
 
-#: Larger files beside an image are not metadata.
+#: Larger files next to an image are not metadata.
 _COMPANION_BYTES = 5_000_000
 #: Checksums that this process has taken.
 DIGESTS = Digests()
 
 
 def is_scene(record: RunRecord) -> bool:
-    """Tell whether a record is that of a finished scene, with all that a summary says of one."""
+    """Return whether a record belongs to a finished scene and has all facts of a summary."""
     return record.status == "done" and bool(record.facts)
 
 
@@ -41,28 +41,28 @@ def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> 
     """
     if not checksums:
         DIGESTS.learn(record.inputs)
-    known = {one.path: one.role for one in record.inputs if os.path.isfile(one.path)}
-    found = Ledger.of(job.request).roles
-    read = (*_local_states(job, {**{str(path): role for path, role in found.items()}, **known}), *far_states(job))
+    known = {state.path: state.role for state in record.inputs if os.path.isfile(state.path)}
+    roles = Ledger.of(job.request).roles
+    read = (*_local_states(job, {**{str(path): role for path, role in roles.items()}, **known}), *far_states(job))
     return read if record.key == key_of(read, job.configuration, job.versions) else None
 
 
 def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
-    """Return the files that a report was made from; one that has changed in the meantime is an error."""
-    used = {one["path"]: one for one in report["provenance"]["inputs"]}
-    roles = {path: one["role"] for path, one in used.items()}
+    """Return the files that a report was made from; a changed file is an error."""
+    used = {entry["path"]: entry for entry in report["provenance"]["inputs"]}
+    roles = {path: entry["role"] for path, entry in used.items()}
     source = str(report["scene"]["model_source"])
     if os.path.isfile(source):
         roles.setdefault(os.path.abspath(source), "model source")
     states = _local_states(job, roles)
     for state in states:
         if state.path in used and used[state.path]["sha256"] != state.sha256:
-            raise InputError("this file changed while the scene was made", file=state.path, remedy="run again")
+            raise InputError("this file changed during the run", file=state.path, remedy="run again")
     return states
 
 
 def as_recorded(record: RunRecord, job: Job) -> bool:
-    """Tell whether inputs and outputs have the content that the record states, whatever their dates say."""
+    """Return whether inputs and outputs have the recorded content, ignoring timestamps."""
     with confined(job.output):
         try:
             return record.intact(job.folder) and inputs_as_recorded(record, job) is not None
@@ -71,7 +71,7 @@ def as_recorded(record: RunRecord, job: Job) -> bool:
 
 
 def far_states(job: Job) -> tuple[FileState, ...]:
-    """Return size and tag of the inputs that lie in a store, or behind a server that gives tags.
+    """Return size and tag of the inputs in object storage, or on a server with tags.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def far_states(job: Job) -> tuple[FileState, ...]:
     StorageError
         If the store does not answer.
     """
-    found = []
+    states = []
     for address in sorted({Location(path).url for _, path in job.request.files if Location(path).is_far}):
         if not Location(address).is_address:
             continue
@@ -88,9 +88,9 @@ def far_states(job: Job) -> tuple[FileState, ...]:
         try:
             size, tag = Objects(folder, allow_network=job.request.scene.allow_network).stated(name)
         except FileNotFoundError as error:
-            raise InputError("there is no such object", file=address, remedy="check the address") from error
-        found.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
-    return tuple(found)
+            raise InputError("file not found", file=address, remedy="check the address") from error
+        states.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
+    return tuple(states)
 
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
@@ -99,7 +99,7 @@ def folders(job: Job) -> list[str | os.PathLike[str]]:
 
 
 def _local_states(job: Job, roles: Mapping[str, str]) -> tuple[FileState, ...]:
-    """Return all files that a scene depends on: those of `roles`, and small companions of the image."""
+    """Return all files that a scene depends on: files of `roles`, and small companions of the image."""
     known = _with_companions(job, roles)
     return tuple(FileState.of(role, Path(path), DIGESTS) for path, role in sorted(known.items()))
 
@@ -115,7 +115,7 @@ def _with_companions(job: Job, roles: Mapping[str, str]) -> dict[str, str]:
 
 
 def untouched(record: RunRecord, job: Job, listings: dict[Path, Sequence[str]]) -> bool:
-    """Tell whether nothing that a scene depends on has another size, date or neighbour than when it was made.
+    """Return whether all files of a scene have the recorded size, date and neighbours.
 
     Of a scene with inputs in a store this is not known here.
     """
@@ -125,22 +125,22 @@ def untouched(record: RunRecord, job: Job, listings: dict[Path, Sequence[str]]) 
 def _files_untouched(record: RunRecord, job: Job, recorded: Sequence[FileState]) -> bool:
     return (
         is_scene(record)
-        and all(one.untouched() for one in record.inputs)
-        and all(one.untouched(job.folder) for one in record.outputs)
+        and all(state.untouched() for state in record.inputs)
+        and all(state.untouched(job.folder) for state in record.outputs)
         and record.key == key_of(recorded, job.configuration, job.versions)
     )
 
 
 def reads_the_same(record: RunRecord, job: Job) -> bool:
-    """Tell whether a scene among other neighbours than before would be made from the same files."""
+    """Return whether a scene with changed neighbours would still be made from the same files."""
     try:
-        far = tuple(one for one in record.inputs if one.tag)
-        near = record.replaced(inputs=tuple(one for one in record.inputs if not one.tag))
+        far = tuple(state for state in record.inputs if state.tag)
+        near = record.replaced(inputs=tuple(state for state in record.inputs if not state.tag))
         if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job)):
             return False
         with confined(job.output):
-            found = Ledger.of(job.request).roles
+            roles = Ledger.of(job.request).roles
     except OrthoError:
         return False
-    known = {one.path for one in record.inputs}
-    return set(_with_companions(job, {str(path): role for path, role in found.items()})) <= known
+    known = {state.path for state in record.inputs}
+    return set(_with_companions(job, {str(path): role for path, role in roles.items()})) <= known

@@ -1,4 +1,4 @@
-"""Places that a pipeline file names: paths in its root on this machine, and addresses of other machines."""
+"""Locations in a pipeline file: paths in its root on this machine, and addresses of other machines."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Place: TypeAlias = Path | VsiPath
 
 
 class PipelinePaths:
-    """What names in a pipeline file stand for.
+    """Resolves names in a pipeline file.
 
     Names are relative to the file. Of a file on this machine they stay in its root wherever links lead; a file on
     another one leads to no file of this one.
@@ -31,9 +31,9 @@ class PipelinePaths:
     ----------
     file : path or address
     root : path, optional
-        Folder that every path has to lie in; that of the file without.
+        Folder that contains all paths; by default that of the file.
     allow_network : bool
-        Whether addresses may be named.
+        Allow addresses.
     """
 
     def __init__(self, file: str | os.PathLike[str], root: str | os.PathLike[str] | None, allow_network: bool) -> None:
@@ -44,9 +44,11 @@ class PipelinePaths:
         self.root = self.base.resolve() if root is None else Path(root).resolve()
 
     def inside(self, text: str, field: str) -> Path:
-        """Return an absolute path on this machine, which has to lie in the root wherever its links lead."""
+        """Return an absolute path on this machine, which must be inside the root after resolving links."""
         if "\0" in text or "://" in text or text.startswith("/vsi"):
-            raise InputError(f"{text!r} is not a path of a file", file=self.file, field=field, remedy="give a file")
+            raise InputError(
+                f"{text!r} is not the path of a local file", file=self.file, field=field, remedy="give a local file"
+            )
         path = Path(os.path.abspath(self.base / text))
         try:
             resolved = path.resolve()
@@ -55,25 +57,25 @@ class PipelinePaths:
             # Names longer than the file system's, links in a circle, surrogates.
             reason = getattr(error, "strerror", None) or error
             raise InputError(
-                f"{text[:60]!r} is not a path of a file ({reason})",
+                f"{text[:60]!r} is not the path of a file ({reason})",
                 file=self.file,
                 field=field,
-                remedy="check the name, and the links on its way",
+                remedy="check the name and its symbolic links",
             ) from error
         if not resolved.is_relative_to(self.root):
             raise InputError(
-                f"{text} lies outside of the root {self.root}",
+                f"{text} is outside the root folder {self.root}",
                 file=self.file,
                 field=field,
                 remedy=Text(
-                    "move it there, or allow a folder that holds both with ",
+                    "move it there, or allow a common folder with ",
                     Setting("root", str(self._common(path.resolve()))),
                 ),
             )
         return path
 
     def of(self, text: str, field: str) -> Place:
-        """Return the place of a file: a path, or what lies at an address."""
+        """Return the place of a file: a path, or an address."""
         if Location(text).is_address:
             return self._located(text, field)
         return self._located(self._address(text, field), field) if self.far else self.inside(text, field)
@@ -86,14 +88,14 @@ class PipelinePaths:
         return self._address(text, field) if self.far else str(self.inside(text, field))
 
     def matching(self, pattern: str, field: str) -> list[Place]:
-        """Return the files that a pattern stands for, by name."""
+        """Return the files that match a pattern, by name."""
         if len(os.fsencode(pattern)) > _PATTERN_BYTES or pattern.split("/").count("**") > _WALKS:
             # Every ** walks all folders below each that the one before it found.
             raise InputError(
-                f"{pattern[:60]!r} is too long a search",
+                f"{pattern[:60]!r} is too complex a pattern",
                 file=self.file,
                 field=field,
-                remedy=f"at most {_WALKS} times ** and {_PATTERN_BYTES} bytes in a pattern",
+                remedy=f"use at most {_WALKS} times ** and {_PATTERN_BYTES} bytes",
             )
         if Location(pattern).is_address or self.far:
             text = pattern if Location(pattern).is_address else self._address(pattern, field)
@@ -111,7 +113,7 @@ class PipelinePaths:
                 f"network access is off by default, and {address!r} is on another machine",
                 file=self.file,
                 field=field,
-                remedy=Text("allow it with ", Setting("scene.allow_network"), ", or give a file"),
+                remedy=Text("add ", Setting("scene.allow_network"), ", or give a local file"),
             )
         place = located(address, allow_network=self.allow_network)
         assert isinstance(place, VsiPath)
@@ -122,15 +124,15 @@ class PipelinePaths:
         parts = text.split("/")
         if "\0" in text or "://" in text or text.startswith("/") or ".." in parts:
             raise InputError(
-                f"{text[:200]!r} is no file below the folder of the pipeline file",
+                f"{text[:200]!r} is not below the folder of the pipeline file",
                 file=self.file,
                 field=field,
-                remedy="name it from there on, or give its whole address",
+                remedy="give a path relative to that folder, or a full address",
             )
         return "/".join([self.address, *(part for part in parts if part not in ("", "."))])
 
     def _listed(self, pattern: str, field: str) -> list[str]:
-        """Return the addresses of the objects that a pattern stands for."""
+        """Return the addresses of the objects that match a pattern."""
         if not glob.has_magic(pattern):
             return [pattern]
         scheme, _, rest = pattern.partition("://")
@@ -138,10 +140,10 @@ class PipelinePaths:
         fixed = list(itertools.takewhile(lambda part: not glob.has_magic(part), parts))
         if Location(pattern).is_on_web or not fixed:
             raise InputError(
-                "a web server is not searched",
+                "patterns cannot search a web server",
                 file=self.file,
                 field=field,
-                remedy="name the images one by one, or by a pattern in a store (s3, gs, az)",
+                remedy="name the images one by one, or use a pattern in object storage (s3, gs, az)",
             )
         wanted = parts[len(fixed) :]
         folder = f"{scheme}://{'/'.join(fixed)}"
@@ -154,7 +156,7 @@ class PipelinePaths:
 
 
 def _fits(name: Sequence[str], pattern: Sequence[str]) -> bool:
-    """Tell whether the parts of a name are those that a pattern stands for; ``**`` is any number of folders."""
+    """Return whether the parts of a name match a pattern; ``**`` is any number of folders."""
     if not pattern:
         return not name
     if pattern[0] == "**":

@@ -36,7 +36,7 @@ from ortho_pipeline.surface.dem_mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
 STATE = ".run"
-#: Files of a run beside the folders of the scenes, by what they are.
+#: Files of a run next to the folders of the scenes, by role.
 RUN_FILES = {
     "log": "run.jsonl",
     "summary": "run.json",
@@ -47,7 +47,7 @@ RUN_FILES = {
 }
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _NAME_BYTES = 150
-#: How names of files end that are told from other words in a file on another machine.
+#: Suffixes by which file names differ from other words in a remote pipeline file.
 _SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,8}$")
 
 
@@ -128,17 +128,17 @@ class Plan:
         for name in only:
             if name not in known:
                 raise InputError(
-                    f"no scene is called {name!r}",
+                    f"there is no scene {name!r}",
                     file=self.path,
                     field="only",
-                    remedy="'ortho run FILE --list' lists the names",
+                    remedy="see the names with 'ortho run FILE --list'",
                 )
         jobs = tuple(known[name] for name in dict.fromkeys(only)) if only else self.jobs
         if shard is None:
             return jobs
         part, parts = shard
         if not 1 <= part <= parts:
-            raise InputError(f"there is no part {part} of {parts}", field="shard", remedy="for example 1/4")
+            raise InputError(f"there is no part {part} of {parts}", field="shard", remedy="use a part such as 1/4")
         return jobs[part - 1 :: parts]
 
 
@@ -152,10 +152,10 @@ def plan(
     ----------
     path : path or address
     root : path, optional
-        Folder that every path has to lie in; that of the file without. The file's own ``root`` can only narrow it: who
-        wrote the file is not who says what it may read.
+        Folder that contains all paths; by default that of the file. A ``root`` in the file can only narrow it, because
+        the author of the file does not decide what it may read.
     allow_network : bool
-        Whether it may lie at an address, and name addresses.
+        Allow a remote file, and addresses in it.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def versions() -> dict[str, Any]:
         **{name: metadata.version(name) for name in packages},
         "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
         "proj": pyproj.proj_version_str,
-        "plugins": sorted(f"{one.plugin} ({one})" for one in host.Host.discover().plugins()),
+        "plugins": sorted(f"{origin.plugin} ({origin})" for origin in host.Host.discover().plugins()),
     }
 
 
@@ -190,16 +190,16 @@ class _Planner:
     def plan(self) -> Plan:
         if self.output == self.places.base:
             raise InputError(
-                "the outputs would lie among the inputs",
+                "the output folder cannot be the folder of the pipeline file",
                 file=self.path,
                 field="output",
-                remedy="choose a folder of their own, for example out",
+                remedy="choose another output folder, for example out",
             )
-        found: dict[Place, list[tuple[int, Entry]]] = {}
+        entries_of: dict[Place, list[tuple[int, Entry]]] = {}
         for number, entry in enumerate(self.config.scenes):
             for image in self._images(entry, number):
-                found.setdefault(image, []).append((number, entry))
-        jobs = [self._job(image, entries) for image, entries in found.items()]
+                entries_of.setdefault(image, []).append((number, entry))
+        jobs = [self._job(image, entries) for image, entries in entries_of.items()]
         self._check_names(jobs)
         self._check_mosaic(jobs)
         settings = None if self.config.mosaic is None else MosaicOptions(**dict(self.config.mosaic))
@@ -210,7 +210,7 @@ class _Planner:
     def _images(self, entry: Entry, number: int) -> list[Place]:
         if entry.image is not None:
             return [self.places.of(entry.image, f"scenes[{number}].image")]
-        found: dict[Place, None] = {}
+        images: dict[Place, None] = {}
         excluded = {
             image for pattern in _listed(entry.exclude) for image in self._matches(pattern, f"scenes[{number}].exclude")
         }
@@ -218,20 +218,20 @@ class _Planner:
             matches = [image for image in self._matches(pattern, f"scenes[{number}].images") if image not in excluded]
             if not matches:
                 raise InputError(
-                    f"nothing matches {pattern!r}",
+                    f"no file matches {pattern!r}",
                     file=self.path,
                     field=f"scenes[{number}].images",
                     remedy=f"check the pattern, which is relative to {self.places.address or self.places.base}",
                 )
             for image in matches:
                 place = self.places.inside(str(image), f"scenes[{number}].images") if isinstance(image, Path) else image
-                found[place] = None
-        return list(found)
+                images[place] = None
+        return list(images)
 
     def _matches(self, pattern: str, field: str) -> list[Place]:
         # A pattern with ** would take the orthos of the last run for scenes.
-        found = self.places.matching(pattern, field)
-        return [path for path in found if not (isinstance(path, Path) and path.is_relative_to(self.output))]
+        paths = self.places.matching(pattern, field)
+        return [path for path in paths if not (isinstance(path, Path) and path.is_relative_to(self.output))]
 
     # -- one scene ---------------------------------------------------------------------------------------------------
 
@@ -255,19 +255,19 @@ class _Planner:
         return Job(self._checked_name(name, image, where), request, self.output, versions())
 
     def _scene(self, settings: Settings, image: Place, where: str) -> SceneOptions:
-        given: Any = settings.scene
+        scene: Any = settings.scene
         options = {}
-        for key, value in given.sensor_options.items():
+        for key, value in scene.sensor_options.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             options[key] = self._perhaps_file(text, image, f"{where}.scene.sensor_options.{key}")
-        rpc = given.rpc if given.rpc in ("tag", "sidecar") else self._file(given.rpc, image, f"{where}.scene.rpc")
-        model = self._file(given.model, image, f"{where}.scene.model")
+        rpc = scene.rpc if scene.rpc in ("tag", "sidecar") else self._file(scene.rpc, image, f"{where}.scene.rpc")
+        model = self._file(scene.model, image, f"{where}.scene.model")
         return SceneOptions(
-            sensor=given.sensor,
+            sensor=scene.sensor,
             rpc=rpc,
             model=model,
             sensor_options=options,
-            crop_offset=given.crop_offset,
+            crop_offset=scene.crop_offset,
             roots=() if self.places.far else (str(self.places.root),),
             allow_network=self.places.allow_network,
         )
@@ -333,7 +333,7 @@ class _Planner:
             return self.places.name(text, field)
         if _exists(Path(text)):
             raise InputError(
-                f"{text!r} is a file of the current folder, but paths are relative to the pipeline file",
+                f"{text!r} is in the current folder, but paths are relative to the pipeline file",
                 file=self.path,
                 field=field,
                 remedy=f"give its path relative to {self.places.base}",
@@ -345,7 +345,9 @@ class _Planner:
 
         def value(match: re.Match[str]) -> str:
             if match[1] not in values:
-                raise InputError(f"{match[0]} is not known", file=self.path, field=field, remedy="{stem} or {folder}")
+                raise InputError(
+                    f"unknown placeholder {match[0]}", file=self.path, field=field, remedy="use {stem} or {folder}"
+                )
             return values[match[1]]
 
         return _PLACEHOLDER.sub(value, text)
@@ -356,21 +358,21 @@ class _Planner:
         bad = not name or name.startswith(".") or name != name.strip() or len(os.fsencode(name)) > _NAME_BYTES
         if bad or any(letter in "/\\:\0" or not letter.isprintable() for letter in name):
             raise InputError(
-                f"{name!r} is not a name of a folder (for {image.name})",
+                f"{name!r} cannot be a folder name (for {image.name})",
                 file=self.path,
                 field=f"{where}.name",
-                remedy="letters, digits, blanks, dashes; not first a dot",
+                remedy="use letters, digits, blanks and dashes, without a leading dot",
             )
         return name
 
     def _check_names(self, jobs: Sequence[Job]) -> None:
         taken: dict[str, Job] = {}
         for job in jobs:
-            # Some file systems do not tell upper from lower case, or one way of writing é from another.
+            # Some file systems ignore case, or different encodings of é.
             key = unicodedata.normalize("NFC", job.name).casefold()
             if key in (*RUN_FILES.values(), "mosaic.vrt", "mosaic.tif"):
                 raise InputError(
-                    f"{job.name!r} is a file of the run itself",
+                    f"the run writes a file of the name {job.name!r}",
                     file=self.path,
                     field="name",
                     remedy="give the scene another name",
@@ -378,10 +380,10 @@ class _Planner:
             other = taken.setdefault(key, job)
             if other is not job:
                 raise InputError(
-                    f"{other.image} and {job.image} would both be the scene {job.name!r}",
+                    f"{other.image} and {job.image} have the same scene name {job.name!r}",
                     file=self.path,
                     field="scenes.name",
-                    remedy="tell them apart, for example with name: '{folder}_{stem}'",
+                    remedy="give them different names, for example name: '{folder}_{stem}'",
                 )
 
     def _check_mosaic(self, jobs: Sequence[Job]) -> None:
@@ -391,10 +393,10 @@ class _Planner:
             for field in ("crs", "resolution"):
                 if getattr(job.request.output, field) is None:
                     raise InputError(
-                        "the scenes of a mosaic share a grid",
+                        "the scenes of a mosaic need a common grid",
                         file=self.path,
                         field=f"defaults.output.{field}",
-                        remedy="say it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
+                        remedy="set it under defaults: output: (such as crs: EPSG:32635 and resolution: 2.5)",
                     )
 
 
@@ -414,7 +416,7 @@ def _within(request: Request, memory: int, threads: int | None, allow_network: b
 
 
 def _exists(path: Path) -> bool:
-    """Tell whether something has this name, a pipe too; a text that can be no name names nothing."""
+    """Return whether anything, even a pipe, has this name; False for impossible names."""
     try:
         return path.exists()
     except (OSError, ValueError):

@@ -35,9 +35,9 @@ MAX_BYTES = 50_000_000
 
 
 class FileState(Record):
-    """A file at the time of its checksum; `role` says what it is to the scene.
+    """A file at the time of its checksum; `role` is its role in the scene.
 
-    Of an object in a store there is no date. Its `tag` is the one that the store gave this version.
+    An object in a store has no date. Its `tag` identifies the version in the store.
     """
 
     role: str
@@ -56,7 +56,7 @@ class FileState(Record):
         )
 
     def untouched(self, folder: Path | None = None) -> bool:
-        """Tell whether size and time of change are those recorded; `folder` is that of a relative path."""
+        """Return whether size and time of change are as recorded; `folder` is the base of a relative path."""
         if self.tag:
             return False  # only its store can tell
         try:
@@ -66,11 +66,11 @@ class FileState(Record):
         return (stat.st_size, stat.st_mtime_ns) == (self.bytes, self.mtime_ns)
 
     def same(self, folder: Path) -> bool:
-        """Tell whether the file in `folder` has the content recorded."""
+        """Return whether the file in `folder` has the recorded content."""
         return self.untouched(folder) or self.identical(folder)
 
     def identical(self, folder: Path) -> bool:
-        """Tell whether the file in `folder` has the content recorded, whatever its dates say."""
+        """Return whether the file in `folder` has the recorded content, ignoring timestamps."""
         try:
             return (folder / self.path).is_file() and files.sha256(folder / self.path) == self.sha256
         except (OSError, ValueError):
@@ -115,8 +115,8 @@ class RunRecord(Record):
             "document": DOCUMENT,
             "schema_version": SCHEMA_VERSION,
             **vars(self),
-            "inputs": [vars(one) for one in self.inputs],
-            "outputs": [vars(one) for one in self.outputs],
+            "inputs": [vars(state) for state in self.inputs],
+            "outputs": [vars(state) for state in self.outputs],
         }
         # On one line: the encoder of many is written in Python, and takes as long as the rest of the record.
         return json.dumps(document, allow_nan=False) + "\n"
@@ -130,16 +130,16 @@ class RunRecord(Record):
         """Return the record, or None where there is none of this version that can be understood."""
         if not path.is_file():
             return None
-        found = None
+        record = None
         with contextlib.suppress(InputError):
-            found = cls.parse(files.read_bounded(path, MAX_BYTES, remedy="run again"))
-        if found is None:
-            _log.warning("%s: this record cannot be read; what it is of is made again", path)
-        return found
+            record = cls.parse(files.read_bounded(path, MAX_BYTES, remedy="run again"))
+        if record is None:
+            _log.warning("%s: cannot read this record; its outputs are made again", path)
+        return record
 
     @classmethod
     def parse(cls, data: bytes) -> Self | None:
-        """Return the record of a text that somebody else may have written, None if it cannot be understood."""
+        """Return the record in an untrusted text; None if it is not valid."""
         try:
             document = files.parse_json(data, "record", "run again")
             if (document.pop("document"), document.pop("schema_version")) != (DOCUMENT, SCHEMA_VERSION):
@@ -150,20 +150,20 @@ class RunRecord(Record):
                 refuted(record.facts["notices"])  # what a page says of them needs their members
             if record.error is not None:
                 Failure.read(record.error)
-                told = {key: text if text is None else Text.read(text) for key, text in record.error.items()}
-                record = record.replaced(error=told)
+                error = {key: text if text is None else Text.read(text) for key, text in record.error.items()}
+                record = record.replaced(error=error)
         except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None
         # What is outside of the scene's folder is not ours to judge, or to remove.
-        inside = all(Path(one.path).name == one.path and one.path for one in record.outputs)
-        whole = not record.facts or {one.role for one in record.outputs} >= _OUTPUTS
-        return record if inside and whole else None
+        inside = all(Path(state.path).name == state.path and state.path for state in record.outputs)
+        complete = not record.facts or {state.role for state in record.outputs} >= _OUTPUTS
+        return record if inside and complete else None
 
     def intact(self, folder: Path, checksums: bool = False) -> bool:
-        """Tell whether all outputs are as they were written; with `checksums` by content whatever their dates say."""
+        """Return whether all outputs are unchanged; with `checksums` by content, ignoring timestamps."""
         if checksums:
-            return all(one.identical(folder) for one in self.outputs)
-        return all(one.same(folder) for one in self.outputs)
+            return all(state.identical(folder) for state in self.outputs)
+        return all(state.same(folder) for state in self.outputs)
 
 
 class Facts(Record):
@@ -199,7 +199,7 @@ _OUTPUTS = {"ortho", "report", "html"}
 def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versions: Mapping[str, Any]) -> str:
     """Return the SHA-256 of all that the outputs depend on."""
     content = {
-        "inputs": sorted((one.role, one.path, one.sha256 or f"{one.bytes} {one.tag}") for one in inputs),
+        "inputs": sorted((state.role, state.path, state.sha256 or f"{state.bytes} {state.tag}") for state in inputs),
         "configuration": configuration,
         "versions": versions,
     }
@@ -225,7 +225,7 @@ class Digests:
 
     def learn(self, states: Sequence[FileState]) -> None:
         """Take over what a record knows."""
-        self._known.update({(one.path, one.bytes, one.mtime_ns): one.sha256 for one in states})
+        self._known.update({(state.path, state.bytes, state.mtime_ns): state.sha256 for state in states})
 
     def __call__(self, path: str | os.PathLike[str], stop: threading.Event | None = None) -> str:
         stat = os.stat(path)
@@ -264,17 +264,17 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
         with path.open("rb") as file:
             holder = file.read(500).decode(errors="replace").strip() or "another run"
         raise InputError(
-            f"{holder} works in this output folder",
+            f"{holder} is using this output folder",
             file=path.parent.parent,
             field="output",
-            remedy="wait for its end, or choose another output folder",
+            remedy="wait until it ends, or choose another output folder",
         ) from error
     except OSError as error:
         raise InputError(
             f"cannot write here ({error.strerror})",
             file=path.parent,
             field="output",
-            remedy="choose a folder that you may write to, on a file system that has locks",
+            remedy="choose a folder with write permission, on a file system with locks",
         ) from error
     with contextlib.closing(lock):
         if not wait:

@@ -17,7 +17,7 @@ class Outcome:
     Parameters
     ----------
     status : {'done', 'unchanged', 'failed', 'missing'}
-        Missing is what nobody has finished, in a summary of many workers.
+        Missing: not finished by any worker, in a summary of many workers.
     facts : mapping
         JSON values: sensor, model, RMSE, ortho, view.
     error : mapping, optional

@@ -1,7 +1,7 @@
-"""Many scenes: each made once, again only when something that it depends on has changed.
+"""Many scenes: each is made once, and again only if an input, a setting or the software has changed.
 
-The work on a scene is `commands.rectify`. A failing scene does not stop the others. Whatever ends a run, the next one
-goes on where it stood, and ends with the same bytes as a run that nothing interrupted.
+The work on a scene is `commands.rectify`. A failed scene does not stop the others. After an interruption the next run
+continues where it stopped, and its outputs have the same bytes as those of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands.mosaic.assembly import assemble
+from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.locations import Location
@@ -53,14 +54,14 @@ _MANY_SEAMS = 64
 
 
 def make_scene(job: Job, checksums: bool = False) -> Outcome:
-    """Make a scene unless it is there already; called in a worker, and never raises for what is wrong with a scene.
+    """Make a scene unless it exists; called in a worker. Errors of a scene are in the outcome.
 
     The lock of the scene is held meanwhile: a scene that a scheduler hands out twice is made once.
 
     Parameters
     ----------
     checksums : bool
-        Judge files by their content, whatever their dates say.
+        Compare files by checksum, ignoring timestamps.
     """
     begin = time.monotonic()
     try:
@@ -82,52 +83,73 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         far = far_states(job)
         good = _still_good(record, job, listing, checksums)
         if good is not None:
-            # A worker of this run may have made it and died before it could say so.
+            # A worker of this run may have made it and died before it reported.
             mine = bool(job.run) and good.run == job.run
             seconds = good.seconds if mine else time.monotonic() - begin
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
         if record is not None:
             RunRecord(name=job.name, key="", status="started", outputs=before).write(job.record)
-        asked = job.request
-        result = commands.rectify(
-            asked.image, job.folder, scene=asked.scene, points=asked.points, surface=asked.surface, match=asked.match,
-            output=asked.output, name=job.name, digest=DIGESTS,
-        )  # fmt: skip
-        made = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
-        _remove(job.folder, {one.path for one in before} - {one.path for one in made})
-        before = made
+        result = _rectified(job)
+        outputs = tuple(FileState.of(role, path, name=path.name) for role, path in result.files.items())
+        _remove(job.folder, {state.path for state in before} - {state.path for state in outputs})
+        before = outputs
         if result.failure is not None:
             raise result.failure
         report = result.document["report"]
         read = (*as_read(job, report), *far)
         done = RunRecord(
-            name=job.name, key=key_of(read, job.configuration, job.versions), status="done", inputs=read, outputs=made,
-            siblings=listing, seconds=time.monotonic() - begin, facts=_facts(report), run=job.run,
-        )  # fmt: skip
+            name=job.name,
+            key=key_of(read, job.configuration, job.versions),
+            status="done",
+            inputs=read,
+            outputs=outputs,
+            siblings=listing,
+            seconds=time.monotonic() - begin,
+            facts=_facts(report),
+            run=job.run,
+        )
         done.write(job.record)
         return Outcome(job.name, "done", done.seconds, paths_of(done, job), done.facts)
     except Exception as error:
-        told = error_document(error)
+        document = error_document(error)
         failed = RunRecord(
-            name=job.name, key="", status="failed", outputs=before, seconds=time.monotonic() - begin, error=told
+            name=job.name, key="", status="failed", outputs=before, seconds=time.monotonic() - begin, error=document
         )
         with contextlib.suppress(OrthoError):
             failed.write(job.record)
         # Without its report an ortho is there, but not finished: the next run makes the scene again.
         kept = paths_of(failed, job) if isinstance(error, ReportError) else {}
-        return Outcome(job.name, "failed", failed.seconds, kept, error=told)
+        return Outcome(job.name, "failed", failed.seconds, kept, error=document)
+
+
+def _rectified(job: Job) -> Result:
+    request = job.request
+    return commands.rectify(
+        request.image,
+        job.folder,
+        scene=request.scene,
+        points=request.points,
+        surface=request.surface,
+        match=request.match,
+        output=request.output,
+        name=job.name,
+        digest=DIGESTS,
+    )
 
 
 def _check_versions(job: Job) -> None:
     here = versions()
     other = [
-        f"{name} {here[name]} in place of {job.versions.get(name)}"
+        f"{name} {here[name]} instead of {job.versions.get(name)}"
         for name in here
         if here[name] != job.versions.get(name)
     ]
     if other:
-        raise InputError(f"this worker has other software than the run: {'; '.join(other)}", field="scheduler",
-                         remedy="install the same versions everywhere")  # fmt: skip
+        raise InputError(
+            f"this worker has different software versions: {'; '.join(other)}",
+            field="scheduler",
+            remedy="install the same versions everywhere",
+        )
 
 
 def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: bool) -> RunRecord | None:
@@ -145,7 +167,7 @@ def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: boo
 
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
     """Return outputs of unchanged content with their present dates."""
-    return tuple(one.replaced(mtime_ns=(folder / one.path).stat().st_mtime_ns) for one in outputs)
+    return tuple(state.replaced(mtime_ns=(folder / state.path).stat().st_mtime_ns) for state in outputs)
 
 
 def _remove(folder: Path, names: set[str]) -> None:
@@ -154,10 +176,12 @@ def _remove(folder: Path, names: set[str]) -> None:
 
 
 def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a summary says of a scene."""
+    """Return the facts of a scene for the summary."""
     scene, adjustment = report["scene"], report["adjustment"]
     return {
-        "sensor": scene["sensor"], "model": adjustment["model"], "headline": report["headline"],
+        "sensor": scene["sensor"],
+        "model": adjustment["model"],
+        "headline": report["headline"],
         "lean_m_per_m": scene["lean_m_per_m"],
         "rmse_px": {which: rmse and rmse["total"] for which, rmse in adjustment["rmse"].items()},
         "rmse_m": {which: rmse and rmse["total"] for which, rmse in report["rmse_m"].items()},
@@ -165,7 +189,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "ortho": {name: report["ortho"][name] for name in ("crs", "resolution", "size", "valid_share")},
         "warnings": list(report["warnings"]),
         "notices": list(report["notices"]),
-    }  # fmt: skip
+    }
 
 
 # -- all scenes ------------------------------------------------------------------------------------------------------
@@ -216,9 +240,11 @@ def run(
     planned = config if isinstance(config, Plan) else plan(config, allow_network=allow_network)
     if store is None and Location(planned.path).is_far:
         raise InputError(
-            "what a pipeline file of another machine asks for goes to a store", file=planned.path, field="output",
-            remedy="give a folder of objects for the outputs, such as s3://bucket/prefix, or copy the file",
-        )  # fmt: skip
+            "a remote pipeline file needs an output in object storage",
+            file=planned.path,
+            field="output",
+            remedy="give an address for the outputs, such as s3://bucket/prefix, or copy the file to this machine",
+        )
     jobs, part = planned.chosen(only, shard), bool(only) or shard is not None
     if store is not None:
         _refuse_unshared(planned)
@@ -240,9 +266,11 @@ def run(
 def _refuse_unshared(planned: Plan) -> None:
     if planned.mosaic is not None:
         raise InputError(
-            "workers that share a store make no mosaic", file=planned.path, field="mosaic",
-            remedy="take it out of the file, and make it of the orthos with `ortho mosaic` afterwards",
-        )  # fmt: skip
+            "workers that share object storage cannot make a mosaic",
+            file=planned.path,
+            field="mosaic",
+            remedy="remove it from the file, and run `ortho mosaic` on the orthos afterwards",
+        )
 
 
 def _run_id() -> str:
@@ -266,9 +294,7 @@ def list_scenes(config: str | os.PathLike[str] | Plan) -> list[dict[str, Any]]:
 class _Run:
     """One call of `run`: the log, the count, the end."""
 
-    def __init__(
-        self, planned: Plan, part: bool, checksums: bool, progress: Progress | None
-    ) -> None:  # fmt: skip
+    def __init__(self, planned: Plan, part: bool, checksums: bool, progress: Progress | None) -> None:
         self.planned, self.part, self.checksums, self.progress = planned, part, checksums, progress
         self.begin = time.monotonic()
         self.log_path = planned.output / RUN_FILES["log"]
@@ -281,14 +307,14 @@ class _Run:
             work = _with_checksums if self.checksums else make_scene
             for job, future in completed(crew, work, changed):
                 self._note(_outcome(job, future), len(jobs))
-            made = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
+            mosaic = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
         except KeyboardInterrupt:
             self.log("run interrupted", finished=len(self.outcomes), scenes=len(jobs))
             raise
-        return self._finish(jobs, made)
+        return self._finish(jobs, mosaic)
 
     def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any]:
-        """Make the mosaic of the scenes that there are; what is wrong with it is in the document."""
+        """Make the mosaic of the finished scenes; its document has the error, if any."""
         present = [job for job in jobs if self.outcomes[job.name].status != "failed"]
         try:
             document = _Mosaic(self.planned, present, self.outcomes).make(crew)
@@ -319,7 +345,7 @@ class _Run:
         if self.progress:
             self.progress(outcome.text(), len(self.outcomes) / total)
 
-    def _finish(self, jobs: Sequence[Job], made: dict[str, Any] | None) -> BatchResult:
+    def _finish(self, jobs: Sequence[Job], mosaic: dict[str, Any] | None) -> BatchResult:
         ordered = tuple(self.outcomes[job.name] for job in jobs)
         files = {"log": self.log_path}
         items = [Path(outcome.files["stac"]) for outcome in ordered if "stac" in outcome.files]
@@ -328,10 +354,13 @@ class _Run:
             write_catalog(files["catalog"], items, self.planned.path.stem)
         if not self.part:
             files |= {kind: self.planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
-        if made is not None and "file" in made:
-            files |= {"mosaic": self.planned.output / made["file"], "seams": self.planned.output / RUN_FILES["seams"],
-                      "mosaic page": self.planned.output / RUN_FILES["page"]}  # fmt: skip
-        result = BatchResult(ordered, files, time.monotonic() - self.begin, made)
+        if mosaic is not None and "file" in mosaic:
+            files |= {
+                "mosaic": self.planned.output / mosaic["file"],
+                "seams": self.planned.output / RUN_FILES["seams"],
+                "mosaic page": self.planned.output / RUN_FILES["page"],
+            }
+        result = BatchResult(ordered, files, time.monotonic() - self.begin, mosaic)
         if not self.part:
             write_json(files["summary"], result.to_json())
             write_run_page(files["index"], self.planned.path.stem, result.to_json()["scenes"])
@@ -359,11 +388,13 @@ class _Mosaic:
         self.record = planned.output / STATE / "mosaic" / "record.json"
         self.orthos = [
             Ortho(
-                job.name, Path(outcomes[job.name].files["ortho"]), outcomes[job.name].facts["lean_m_per_m"],
+                job.name,
+                Path(outcomes[job.name].files["ortho"]),
+                outcomes[job.name].facts["lean_m_per_m"],
                 _path_of(outcomes[job.name].files.get("accuracy")),
             )
             for job in jobs
-        ]  # fmt: skip
+        ]
         # What the records know of the orthos need not be taken again.
         known = [RunRecord.at(job.record) for job in jobs]
         self.inputs = tuple(
@@ -378,7 +409,7 @@ class _Mosaic:
     def make(self, crew: Crew) -> dict[str, Any]:
         record = RunRecord.at(self.record)
         if record is not None and record.key == self.key and record.intact(self.output):
-            # A record may lie: what it vouches for is read as any other file, and made again if it is not a report.
+            # A record may be wrong: its files are read like any other, and made again if they are not reports.
             with contextlib.suppress(InputError):
                 document = read_json(self.report, _REPORT_BYTES, "run again")
                 if isinstance(document, dict):
@@ -391,18 +422,18 @@ class _Mosaic:
             )
             write_json(self.report, document)
             if record is not None:
-                retire({self.output / one.path for one in record.outputs} - set(files.values()))
+                retire({self.output / state.path for state in record.outputs} - set(files.values()))
         if failure is not None:
             return {**document, "status": "done", "error": error_document(failure)}
-        made = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
-        RunRecord(name="mosaic", key=self.key, status="done", inputs=self.inputs, outputs=made).write(self.record)
+        outputs = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())
+        RunRecord(name="mosaic", key=self.key, status="done", inputs=self.inputs, outputs=outputs).write(self.record)
         return {**document, "status": "done"}
 
     def _seams(self, pairs: Sequence[Overlap], crew: Crew) -> list[dict[str, Any]]:
         # New processes for a few seams take longer than these.
         crew = Sequential() if isinstance(crew, Processes) and len(pairs) < _MANY_SEAMS else crew
-        found = {id(pair): future.result() for pair, future in completed(crew, measure_seam, pairs)}
-        return [found[id(pair)] for pair in pairs]
+        overlaps = {id(pair): future.result() for pair, future in completed(crew, measure_seam, pairs)}
+        return [overlaps[id(pair)] for pair in pairs]
 
 
 def _with_checksums(job: Job) -> Outcome:

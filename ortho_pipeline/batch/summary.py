@@ -1,4 +1,4 @@
-"""What many runs of parts have made, collected."""
+"""The summary of all parts of a run."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from ortho_pipeline.report.page.run import write_run_page
 
 
 def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None = None) -> BatchResult:
-    """Collect what the runs of all parts have made, and write the summary; make no scene.
+    """Collect the results of all parts, and write the summary; make no scenes.
 
-    A scene that nobody has finished has the status ``missing``.
+    An unfinished scene has the status ``missing``.
     """
     planned = config if isinstance(config, Plan) else plan(config)
     if store is not None:
         return summary_of(planned, store)
-    begin, found = time.monotonic(), []
+    begin, outcomes = time.monotonic(), []
     listings: dict[Path, Sequence[str]] = {}
     for job in planned.jobs:
         record = RunRecord.at(job.record)
         if record is None or record.status not in ("done", "failed"):
-            found.append(Outcome(job.name, "missing"))
+            outcomes.append(Outcome(job.name, "missing"))
         elif record.status == "failed":
-            found.append(Outcome(job.name, "failed", record.seconds, error=record.error))
+            outcomes.append(Outcome(job.name, "failed", record.seconds, error=record.error))
         elif not untouched(record, job, listings) and not as_recorded(record, job):
             error = InputError("inputs or outputs have changed", file=job.folder, remedy="run it again")
-            found.append(Outcome(job.name, "missing", error=error_document(error)))
+            outcomes.append(Outcome(job.name, "missing", error=error_document(error)))
         else:
-            found.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
+            outcomes.append(Outcome(job.name, "done", record.seconds, paths_of(record, job), record.facts))
     files = {kind: planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
-    result = BatchResult(tuple(found), files, time.monotonic() - begin)
+    result = BatchResult(tuple(outcomes), files, time.monotonic() - begin)
     write_json(files["summary"], result.to_json())
     write_run_page(files["index"], planned.path.stem, result.to_json()["scenes"])
     return result
 
 
 def paths_of(record: RunRecord, job: Job) -> dict[str, str]:
-    """Return the outputs of a scene by what they are."""
-    return {one.role: str(job.folder / one.path) for one in record.outputs}
+    """Return the outputs of a scene by role."""
+    return {state.role: str(job.folder / state.path) for state in record.outputs}

@@ -37,7 +37,7 @@ class _Shard(click.ParamType):
             return value
         match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
         if not match or not 1 <= int(match[1]) <= int(match[2]):
-            self.fail(f"{value!r} is not a part such as 1/4", param, ctx)
+            self.fail(f"{value!r} is not K/N, such as 1/4", param, ctx)
         return int(match[1]), int(match[2])
 
 
@@ -46,40 +46,42 @@ class _Shard(click.ParamType):
 @click.option(
     "--executor",
     type=click.Choice(EXECUTORS),
-    help="Who does the work  [default: processes; dask with --scheduler]",
+    help="How scenes are distributed.  [default: processes; dask with --scheduler]",
 )
-@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes  [default: all processors]")
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Of each scene  [default: shared out]")
 @click.option(
-    "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Of each scene."
+    "--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: all processors]"
 )
-@click.option("--scheduler", metavar="URL", help="Of dask, such as tcp://host:8786.")
-@click.option("--only", multiple=True, metavar="NAME", help="Only this scene; may be repeated.")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads per scene.  [default: shared out]")
+@click.option(
+    "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Memory per scene."
+)
+@click.option("--scheduler", metavar="URL", help="Address of the dask scheduler, such as tcp://host:8786.")
+@click.option("--only", multiple=True, metavar="NAME", help="Make only this scene. May be repeated.")
 @click.option(
     "--shard",
     type=_Shard(),
     metavar="K/N|auto",
-    help="Only the K-th of N parts; auto: what AWS Batch, Kubernetes or Slurm say in the environment.",
+    help="Make only the K-th of N parts. auto: read both from the environment of AWS Batch, Kubernetes or Slurm.",
 )
 @click.option(
     "--output",
     "-o",
     "address",
     metavar="URL",
-    help="Outputs to a folder of objects (s3, gs, az), which many workers share, in place of that of the file.",
+    help="Write to this folder in object storage (s3, gs, az) instead of the file's output. Many workers can share it.",
 )
-@click.option("--allow-network", is_flag=True, help="Open URLs, write to a store of objects, fetch cells of DEMs.")
-@click.option("--summary", "as_summary", is_flag=True, help="Collect what all parts have made, and make nothing.")
+@click.option("--allow-network", is_flag=True, help="Allow URLs, object storage and the download of DEM cells.")
+@click.option("--summary", "as_summary", is_flag=True, help="Summarise what all parts have made; make nothing.")
 @click.option(
     "--root",
     type=click.Path(file_okay=False),
     metavar="DIR",
-    help="Folder that every path of the file has to lie in  [default: that of the file]",
+    help="Allow only paths inside this folder.  [default: folder of the file]",
 )
 @click.option("--checksums", is_flag=True, help="Compare files by checksum, ignoring timestamps.")
-@click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
+@click.option("--list", "as_list", is_flag=True, help="List the scenes and their state; make nothing.")
 @dry_run_option
-@click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
+@click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the pipeline file; make nothing.")
 @json_option
 def run(
     pipeline_file: str | None,
@@ -131,7 +133,7 @@ def run(
                 else batch.run(planned, memory=memory, progress=advance, store=store, **options)
             )
     except KeyboardInterrupt:
-        say("What is done is kept: run it again to go on.", err=True)
+        say("Finished scenes are kept. Run the same command again to continue.", err=True)
         raise
     if as_json:
         print_json(result.to_json())
@@ -150,7 +152,7 @@ def run(
     type=click.Path(dir_okay=False),
     required=True,
     metavar="FILE",
-    help="The mosaic: .tif (a COG) or .vrt. Its record (.json) and its page (.html) lie beside it.",
+    help="The mosaic: .tif (a COG) or .vrt. Its record (.json) and page (.html) get the same name.",
 )
 @mosaic_options
 @network_option
@@ -168,26 +170,26 @@ def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: S
 
 
 def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
-    """Print what stands in the way of each scene; exit as a run would if that were all."""
+    """Print the errors and warnings of each scene; exit as a run with these errors would."""
     from ortho_pipeline.batch.dry_run import check_scenes
     from ortho_pipeline.batch.results import SCHEMA_VERSION
 
     checked = check_scenes(planned, only, shard)
-    failed = [one for one in checked if "error" in one]
+    failed = [scene for scene in checked if "error" in scene]
     if as_json:
         print_json({"schema_version": SCHEMA_VERSION, "scenes": checked})
     else:
-        said = Counter(text for one in checked for text in one.get("warnings", ()))
-        for one in checked:
-            if "error" in one:
-                say(f"{one['name']}: {_error_text(one['error'])}")
+        counts = Counter(text for scene in checked for text in scene.get("warnings", ()))
+        for scene in checked:
+            if "error" in scene:
+                say(f"{scene['name']}: {_error_text(scene['error'])}")
             else:
-                own = [text for text in one["warnings"] if said[text] == 1]
-                say(checked_text(one["name"], {**one, "warnings": own}))
-        for text, count in said.items():
+                own = [text for text in scene["warnings"] if counts[text] == 1]
+                say(checked_text(scene["name"], {**scene, "warnings": own}))
+        for text, count in counts.items():
             if count > 1:
                 say(f"Warning: {as_typed(text)} ({counted(count, 'scene')})")
-        say(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} not")
+        say(f"{counted(len(checked), 'scene')}: {len(checked) - len(failed)} ready, {len(failed)} with errors")
     if failed:
         click.get_current_context().exit(FAILED if len(failed) == len(checked) else PARTLY_DONE)
 
@@ -238,7 +240,7 @@ def _row(scene: Outcome) -> list[str]:
 
 
 def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
-    """Return what there is to say of a mosaic and its seams."""
+    """Return the summary of a mosaic and its seams."""
     from ortho_pipeline.report.mosaic.document import summary_text
 
     if mosaic.get("error"):

@@ -19,7 +19,11 @@ from ortho_pipeline.cli.printing import print_result, print_warnings
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
 
 _models = click.option(
-    "--models", multiple=True, type=click.Path(), metavar="FILE", help="A saved *_model.json of each image."
+    "--models",
+    multiple=True,
+    type=click.Path(),
+    metavar="FILE",
+    help="Saved *_model.json of an image. Repeat it for each image, in their order.",
 )
 
 
@@ -47,8 +51,7 @@ def adjust(
 
     The images may be a stereo pair or a block. The command writes a model and an RPC of each image, the ground points
     with their sigmas, and one report. Points with ground coordinates are control or check points; the others tie the
-    images together. --models starts from saved models (repeat it, in the order of the images). --ties auto and
-    --reference find points by matching; both need heights.
+    images together. --ties auto and --reference find points by matching; both need heights.
     """
     from ortho_pipeline.commands import block as blocks
 
@@ -62,7 +65,7 @@ def adjust(
 @block_options
 @_models
 @click.option(
-    "--output", "-o", type=click.Path(dir_okay=False), metavar="FILE", help="Ground points: .csv or .geojson."
+    "--output", "-o", type=click.Path(dir_okay=False), metavar="FILE", help="File of ground points: .csv or .geojson."
 )
 @sensor_options
 @json_option
@@ -76,8 +79,7 @@ def intersect(
 ) -> None:
     """Compute ground points from rays in several IMAGEs.
 
-    The points have coordinates with sigmas. --models uses saved models instead of the images' own (repeat it, in the
-    order of the images).
+    The result has the coordinates and their sigmas. --models replaces the images' own models.
     """
     from ortho_pipeline.commands import block as blocks
 

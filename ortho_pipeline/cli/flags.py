@@ -1,4 +1,4 @@
-"""Names of options in messages: rooms below say `surface.dem`, the command line shows what is typed there, --dem."""
+"""Names of options in messages: other rooms write `surface.dem`, the command line shows the flag, --dem."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from dataclasses import replace
 import click
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.options import GROUPS, MosaicOptions, options_of
+from ortho_pipeline.options import GROUPS, BlockOptions, MosaicOptions, options_of
 from ortho_pipeline.options.texts import Setting, Text
 
-#: Those of a scene, and of a mosaic.
+#: Options of a scene and of a mosaic.
 _GROUPS = {**GROUPS, "mosaic": MosaicOptions}
-#: Name of an option in messages -> its flag, where a command has it under that flag.
+#: Name of an option in messages -> its flag, if a command has it.
 FLAGS = {
     f"{group}.{name}": option.flags.split()[0]
-    for group, options in _GROUPS.items()
+    for group, options in (("points", BlockOptions), *_GROUPS.items())
     for name, option in options_of(options).items()
 }
 
@@ -28,17 +28,17 @@ def flags_of(command: click.Command) -> dict[str, str]:
     An option of a group is ``group.field``, any other has the name of its argument. `ortho run` has few of the groups'
     options: the names of the others are the keys of its file.
     """
-    found, plain = {}, set()
-    for one in command.params:
-        group, _, field = str(one.name).partition("_")
-        if not isinstance(one, click.Option):
+    flags, plain = {}, set()
+    for param in command.params:
+        group, _, field = str(param.name).partition("_")
+        if not isinstance(param, click.Option):
             continue
         if group in _GROUPS and field:
-            found[f"{group}.{field}"] = one.opts[0]
+            flags[f"{group}.{field}"] = param.opts[0]
         else:
-            found[str(one.name)] = one.opts[0]
-            plain |= set(one.opts)
-    return {**{name: flag for name, flag in FLAGS.items() if flag in plain}, **found}
+            flags[str(param.name)] = param.opts[0]
+            plain |= set(param.opts)
+    return {**{name: flag for name, flag in FLAGS.items() if flag in plain}, **flags}
 
 
 def with_flags(text: str, flags: Mapping[str, str]) -> str:
@@ -75,7 +75,9 @@ def name_as_typed(error: OrthoError, command: click.Command) -> None:
 
 def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) -> None:
     """Add the command that was typed with each of the options that an error offers, ready to be pasted."""
-    of_each = {f"scene.{one.name[6:]}" for one in command.params if one.multiple and str(one.name).startswith("scene_")}
+    of_each = {
+        f"scene.{param.name[6:]}" for param in command.params if param.multiple and str(param.name).startswith("scene_")
+    }
 
     def of_image(setting: Setting) -> Setting:
         # Of several images, an option names the one that it is of.
@@ -86,6 +88,6 @@ def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) 
     typed = click.get_current_context().meta.get("command")
     if typed is not None and all(name in flags for name in (error.field or "").split(", ")):
         for setting, meaning in error.choices:
-            given = shlex.quote(_value(of_image(setting)))
-            remedy = Text(remedy, f"\n    {typed} {flags[setting.name]} {given}  # {meaning}")
+            value = shlex.quote(_value(of_image(setting)))
+            remedy = Text(remedy, f"\n    {typed} {flags[setting.name]} {value}  # {meaning}")
     error.remedy = remedy

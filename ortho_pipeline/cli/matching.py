@@ -24,13 +24,18 @@ from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 @matching_options
 @surface_options
 @click.option(
-    "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="Points: .geojson or .csv."
+    "--output",
+    "-o",
+    type=click.Path(dir_okay=False),
+    required=True,
+    metavar="FILE",
+    help="File of points: .geojson or .csv.",
 )
 @click.option(
     "--report",
     type=click.Path(dir_okay=False),
     metavar="FILE.html",
-    help="Page to look at the matches: chips, map, residuals; its numbers beside it as .json.",
+    help="Page that shows the matches: chips, map, residuals. A .json of the same name has the numbers.",
 )
 @scene_options
 @json_option
@@ -45,8 +50,8 @@ def match(
 ) -> None:
     """Find control points of IMAGE in an orthoimage.
 
-    One match in five is reserved as a check point. The points carry covariances; give them to 'ortho fit', 'rectify',
-    'compare' or 'export' with --gcps. These commands also match by themselves, with --reference.
+    One match in five is reserved as a check point. The file has the covariances of the points. Give it to 'ortho fit',
+    'rectify', 'compare' or 'export' with --gcps. With --reference these commands match by themselves.
     """
     from ortho_pipeline.commands.control import command
 
@@ -60,7 +65,9 @@ def match(
 @images_argument
 @tie_options
 @surface_options
-@click.option("--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="Ties: .csv.")
+@click.option(
+    "--output", "-o", type=click.Path(dir_okay=False), required=True, metavar="FILE", help="File of tie points: .csv."
+)
 @sensor_options
 @json_option
 def ties(
@@ -73,9 +80,9 @@ def ties(
 ) -> None:
     """Find tie points between overlapping IMAGEs.
 
-    A tie point is a place that two or more images show; it carries covariances. Heights bring the images into one
-    geometry and may be wrong: state their accuracy with --dem-sigma. Give the ties to 'ortho adjust' with --points, or
-    let it find them itself with --ties auto.
+    A tie point is a place that two or more images show; the file has its covariances. Heights only bring the images
+    into one geometry. They may be wrong: state their accuracy with --dem-sigma. Give the ties to 'ortho adjust' with
+    --points. 'ortho adjust --ties auto' finds them itself.
     """
     from ortho_pipeline.commands.control import ties as command
 

@@ -53,7 +53,7 @@ class _Nodata(click.ParamType):  # type: ignore[type-arg]
         except ValueError:
             self.fail(f"{value!r} is not a number (or nan).", param, ctx)
         if math.isinf(number):
-            self.fail("infinity is not a value for nodata.", param, ctx)
+            self.fail("nodata cannot be infinite.", param, ctx)
         return "nan" if math.isnan(number) else number
 
 
@@ -72,14 +72,14 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
     names : str
         The fields, in the order of ``--help``; all without.
     """
-    defaults = {one.name: one.default for one in fields(options)}
+    defaults = {field.name: field.default for field in fields(options)}
     known = options_of(options)
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         for name in reversed(names or tuple(known)):
             option = known[name]
-            said = {**_said(option, defaults[name]), "help": _help(option)}
-            command = click.option(*option.flags.split(), f"{group}_{name}", **said)(command)
+            settings = {**_said(option, defaults[name]), "help": _help(option)}
+            command = click.option(*option.flags.split(), f"{group}_{name}", **settings)(command)
         return command
 
     return decorate
@@ -88,39 +88,39 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
 def _help(option: Option) -> str | None:
     text = with_flags(option.help, FLAGS)
     if option.kind in ("integers", "files", "folders", "keys"):
-        text = f"{text.removesuffix('.')}; may be repeated."
+        text = f"{text} May be repeated."
     if option.unset:
-        text = f"{text.removesuffix('.')}  [default: {option.unset}]".strip()
+        text = f"{text}  [default: {option.unset}]"
     return text or None
 
 
 def _said(option: Option, default: Any) -> dict[str, Any]:
-    """Return what click is told of an option, besides names and help."""
+    """Return the arguments of `click.option` for an option, without names and help."""
     if default is False:
         return {"is_flag": True}
-    told: dict[str, Any] = {"metavar": option.metavar, **_typed(option)}
-    if default is MISSING and not told.get("multiple"):
-        told["required"] = True
+    settings: dict[str, Any] = {"metavar": option.metavar, **_typed(option)}
+    if default is MISSING and not settings.get("multiple"):
+        settings["required"] = True
     elif isinstance(default, int | float | str):
         shown = int(default) // 1_000_000 if option.kind == "bytes" else default
-        told |= {"default": shown, "show_default": True}
-    return told
+        settings |= {"default": shown, "show_default": True}
+    return settings
 
 
 def _typed(option: Option) -> dict[str, Any]:
-    """Return what reads the value of an option."""
+    """Return the arguments of `click.option` that parse the value."""
     if option.choices:
         return {"type": click.Choice(option.choices, case_sensitive=option.metavar is None)}
     number: Any = float
     if option.above is not None:
         number = click.FloatRange(option.above, option.below, min_open=True, max_open=option.below is not None)
     low, high = (None if bound is None else int(bound) for bound in (option.above, option.below))
-    whole = click.IntRange(min=low if low is None else low + 1, max=high if high is None else high - 1)
+    integer = click.IntRange(min=low if low is None else low + 1, max=high if high is None else high - 1)
     return {
         "file": {"type": click.Path(dir_okay=False)},
         "number": {"type": number},
-        "integer": {"type": whole},
-        "integers": {"type": _Integers(whole), "callback": _joined, "multiple": True},
+        "integer": {"type": integer},
+        "integers": {"type": _Integers(integer), "callback": _joined, "multiple": True},
         "pair": {"callback": _pair},
         "box": {"type": float, "nargs": 4},
         "one or two": {"type": OneOrTwo()},
@@ -166,15 +166,15 @@ def _files(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> tuple
 
 
 def _keys(_: click.Context, __: click.Parameter, texts: Sequence[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise click.BadParameter(f"{text!r} is not KEY=VALUE")
-        if key in found:
-            raise click.BadParameter("one key is given twice")
-        found[key] = value
-    return found
+        if key in values:
+            raise click.BadParameter(f"the key {key!r} is given twice")
+        values[key] = value
+    return values
 
 
 def _grouped(group: str, options: type, *names: str) -> Decorator:
@@ -182,10 +182,12 @@ def _grouped(group: str, options: type, *names: str) -> Decorator:
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
-        def wrapper(**given: Any) -> Any:
-            values = {key.removeprefix(prefix): given.pop(key) for key in list(given) if key.startswith(prefix)}
-            # Without any, click's empty tuple stands for the default.
-            return command(**given, **{group: options(**{key: value for key, value in values.items() if value != ()})})
+        def wrapper(**arguments: Any) -> Any:
+            values = {key.removeprefix(prefix): arguments.pop(key) for key in list(arguments) if key.startswith(prefix)}
+            # Without values, click passes an empty tuple, which means the default.
+            return command(
+                **arguments, **{group: options(**{key: value for key, value in values.items() if value != ()})}
+            )
 
         return click_options(group, options, *names)(wrapper)
 
@@ -194,26 +196,26 @@ def _grouped(group: str, options: type, *names: str) -> Decorator:
 
 
 def _of_each(*names: str) -> Decorator:
-    """Add the options of scenes to a command with `images`; they arrive as those of all, or as a list of each's."""
+    """Add the options of scenes to a command with `images`; it gets common options, or a list with one for each."""
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
-        def chosen(*, rpcs: Sequence[str], offsets: Sequence[str], scene: SceneOptions, **given: Any) -> Any:
-            return command(scene=_scenes(given["images"], scene, rpcs, offsets), **given)
+        def chosen(*, rpcs: Sequence[str], offsets: Sequence[str], scene: SceneOptions, **arguments: Any) -> Any:
+            return command(scene=_scenes(arguments["images"], scene, rpcs, offsets), **arguments)
 
         @functools.wraps(command)
-        def wrapper(*, scene_rpc: Sequence[str], scene_crop_offset: Sequence[str], **given: Any) -> Any:
-            return grouped(rpcs=scene_rpc, offsets=scene_crop_offset, **given)
+        def wrapper(*, scene_rpc: Sequence[str], scene_crop_offset: Sequence[str], **arguments: Any) -> Any:
+            return grouped(rpcs=scene_rpc, offsets=scene_crop_offset, **arguments)
 
         grouped = _grouped("scene", SceneOptions, *names)(chosen)
-        made: Callable[..., Any] = wrapper
+        decorated: Callable[..., Any] = wrapper
         for field, metavar, text in (
             ("crop_offset", "IMAGE=COL,ROW", _OFFSET_OF_EACH),
             ("rpc", "tag|sidecar|IMAGE=FILE", _RPC_OF_EACH),
         ):
             flag = options_of(SceneOptions)[field].flags
-            made = click.option(flag, f"scene_{field}", multiple=True, metavar=metavar, help=text)(made)
-        return made
+            decorated = click.option(flag, f"scene_{field}", multiple=True, metavar=metavar, help=text)(decorated)
+        return decorated
 
     return decorate
 
@@ -221,7 +223,7 @@ def _of_each(*names: str) -> Decorator:
 def _scenes(
     images: Sequence[str], scene: SceneOptions, rpcs: Sequence[str], offsets: Sequence[str]
 ) -> SceneOptions | list[SceneOptions]:
-    """Return the options of all images, or of each."""
+    """Return common options, or a list with one for each image."""
     if not rpcs and not offsets:
         return scene
     from ortho_pipeline.commands.block_images import image_named
@@ -233,11 +235,11 @@ def _scenes(
             if len(images) == 1 and (not equals or os.path.exists(text)):
                 name, value = images[0], text
             elif field == "rpc" and text in ("tag", "sidecar"):
-                scenes = [replace(one, rpc=text) for one in scenes]
+                scenes = [replace(options, rpc=text) for options in scenes]
                 continue
             elif not equals:
                 raise InputError(
-                    f"{text} is said of one image, and there are {len(images)}",
+                    f"it is not clear to which of the {len(images)} images {text} belongs",
                     field=f"scene.{field}",
                     remedy=Text("name the image: ", Setting(f"scene.{field}", f"{Path(images[0]).name}={text}")),
                 )
@@ -248,11 +250,11 @@ def _scenes(
 
 
 _OF_IMAGES = ("sensor", "sensor_options", "allow_network", "roots")
-_RPC_OF_EACH = "Which RPC: 'tag' or 'sidecar' of all images, or a file of one; may be repeated."
-_OFFSET_OF_EACH = "First pixel of an image in the one that its model belongs to, where it is a crop; may be repeated."
+_RPC_OF_EACH = "Which RPC to use: 'tag' or 'sidecar' for all images, or a file for one. May be repeated."
+_OFFSET_OF_EACH = "If an image is a crop: position of its first pixel in the full image. May be repeated."
 #: All options of a scene, as `SceneOptions`.
 scene_options = _grouped("scene", SceneOptions)
-#: The same for the images of a block, where a saved model cannot take the place of all.
+#: The same for the images of a block, without a saved model, which belongs to one image.
 sensor_options = _of_each(*_OF_IMAGES)
 #: The same for one image or several.
 scenes_options = _of_each(*_OF_IMAGES, "model")
@@ -261,9 +263,19 @@ point_options = _grouped("points", PointOptions)
 block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "vertical", "pixel_origin", "check", "model")
 #: The rest of that group, which is taken by its decorator too.
 adjustment_options = click_options(
-    "points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold", "dem_heights", "dem_bias",
-    "dem_correlation", "dem_shift_sigma", "join_limit",
-)  # fmt: skip
+    "points",
+    BlockOptions,
+    "ties",
+    "correction",
+    "ground_sigma",
+    "model_crs",
+    "hold",
+    "dem_heights",
+    "dem_bias",
+    "dem_correlation",
+    "dem_shift_sigma",
+    "join_limit",
+)
 #: All options of heights, as `SurfaceOptions`.
 surface_options = _grouped("surface", SurfaceOptions)
 #: All options of matching with a reference, as `MatchOptions`.
@@ -277,12 +289,10 @@ dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_ve
 network_option = _grouped("scene", SceneOptions, "allow_network")
 #: All options of the ortho, as `OutputOptions`.
 output_options = _grouped("output", OutputOptions)
-#: The file says which format, and seams are always measured.
+#: The suffix of the file sets the format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 
-dry_run_option = click.option(
-    "--dry-run", is_flag=True, help="Open and check everything, say what would be made, and make nothing."
-)
+dry_run_option = click.option("--dry-run", is_flag=True, help="Check all inputs and show the plan; write nothing.")
 #: The argument IMAGE.
 image_argument = click.argument("image", type=click.Path())
 #: One or several images.
@@ -290,10 +300,12 @@ images_argument = click.argument("images", metavar="IMAGE...", nargs=-1, require
 
 
 def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
-    """Return the name of a folder; that of a raster would become a folder by mistake."""
+    """Return the name of a folder; refuse the name of a raster, which is a mistake."""
     stem, ending = os.path.splitext(text)
     if ending.lower() in (".tif", ".tiff", ".vrt", ".jp2") and not os.path.isdir(text):
-        raise click.BadParameter(f"{text!r} names a file, and outputs go to a folder; did you mean '-o {stem}'?")
+        raise click.BadParameter(
+            f"Outputs need a folder, but {text!r} is the name of a file; did you mean '-o {stem}'?"
+        )
     return text
 
 

@@ -1,7 +1,7 @@
 """Commands as people type them: words that are unknown are errors with a suggestion, not values of other options.
 
 click would read ``-overwrite`` as ``-o verwrite`` and write to a folder of that name. Here a word with one dash is
-an option that exists, or an error; `HINTS` knows what to say of those that other tools have.
+an existing option or an error; `HINTS` has replacements for options of other tools.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 #: The largest whole number that an option takes: libraries count in 32 bits.
 _WHOLE = 2**31 - 1
-#: What is said of gdalwarp's options that have no counterpart under their name.
+#: What to use instead of gdalwarp's options that do not exist here.
 HINTS: Mapping[str, str] = {
-    "-s_srs": "the model says where the image lies: leave it out",
-    "-rpc": "the model that the image has is used by itself; '--rpc FILE' chooses another",
-    "-tps": "'--fit-model NAME' fits a model to points ('ortho models' lists them)",
-    "-order": "'--fit-model poly2d2' fits a polynomial of second order ('ortho models' lists all)",
-    "-geoloc": "'ortho sensors' lists how images are placed",
-    "-to": "'--dem FILE' and '--dem-vertical DATUM' take the place of RPC_DEM, '--height M' that of RPC_HEIGHT",
-    "-et": "'--tolerance PX' bounds the geometric error",
-    "-ts": "give the size of a pixel with '-tr X Y' and the extent with '-te'",
-    "-multi": "'--threads N' says how many threads work; all processors do by default",
-    "-wo": "'--threads N' and '--memory MB' bound the work",
+    "-s_srs": "leave it out; the sensor model gives the position of the image",
+    "-rpc": "leave it out; the RPC of the image is used by default, and '--rpc FILE' chooses another",
+    "-tps": "use '--fit-model NAME' to fit a model to points ('ortho models' lists them)",
+    "-order": "use '--fit-model poly2d2' for a polynomial of second order ('ortho models' lists all)",
+    "-geoloc": "geolocation arrays are not read; 'ortho sensors' lists the supported products",
+    "-to": "use '--dem FILE' and '--dem-vertical DATUM' for RPC_DEM, '--height M' for RPC_HEIGHT",
+    "-et": "use '--tolerance PX' to limit the geometric error",
+    "-ts": "use '-tr X Y' for the pixel size and '-te' for the extent",
+    "-multi": "leave it out; all processors are used by default, and '--threads N' limits them",
+    "-wo": "use '--threads N' and '--memory MB'",
     "-srcnodata": "set it in the image: gdal_translate -a_nodata VALUE",
-    "-dstalpha": "the ortho says by nodata, a mask or the image's own alpha band which pixels are valid",
+    "-dstalpha": "leave it out; nodata, a mask or the image's own alpha band marks the valid pixels",
     "-cutline": "cut the finished ortho: gdalwarp -cutline",
     "-crop_to_cutline": "cut the finished ortho: gdalwarp -cutline",
-    "-ovr": "pixels are always read at full resolution; '-r average' is for orthos that are coarser than the image",
+    "-ovr": "leave it out; pixels are always read at full resolution; for a coarser ortho use '-r average'",
 }
 
 
@@ -53,7 +53,7 @@ class Command(click.Command):
     Parameters
     ----------
     one : str, optional
-        What is said when several files are given to a command that takes one.
+        Hint of the error for several files, if the command takes one.
     """
 
     def __init__(self, *given: Any, one: str | None = None, **named: Any) -> None:
@@ -87,20 +87,20 @@ class Command(click.Command):
         ]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the words of the command line; what is left over is an error that says what was meant."""
+        """Parse the words of the command line; unexpected words are an error with a hint."""
         words = _checked(ctx, args, self.get_params(ctx))
-        # click would say 'unexpected extra argument' and not what to do.
+        # The error of click has no hint.
         ctx.allow_extra_args = True
         super().parse_args(ctx, words)
         if not ctx.resilient_parsing:
             _refuse_numbers(ctx, self.get_params(ctx))
         if ctx.args and not ctx.resilient_parsing:
             shown = " ".join(ctx.args[:3]) + (" ..." if len(ctx.args) > 3 else "")
-            ctx.fail(f"'{ctx.info_name}' does not take {shown!r} too." + (f" {self.one}" if self.one else ""))
+            ctx.fail(f"Unexpected argument {shown!r} for '{ctx.info_name}'." + (f" {self.one}" if self.one else ""))
         return ctx.args
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; what it refuses names options as they are typed."""
+        """Run the command; its errors name options by their flags."""
         try:
             if ctx.meta.get("quiet") and not ctx.meta.get("json"):
                 with contextlib.redirect_stdout(io.StringIO()):
@@ -134,7 +134,7 @@ class OneOrTwo(click.ParamType):  # type: ignore[type-arg]
             return value
         parts = value.split(",")
         if len(parts) > 2 or not all(_NUMBER.fullmatch(part) and float(part) > 0 for part in parts):
-            self.fail(f"{value!r} is not one positive number or two.", param, ctx)
+            self.fail(f"{value!r} is neither one positive number nor two.", param, ctx)
         numbers = tuple(float(part) for part in parts)
         return numbers[0] if len(numbers) == 1 else numbers
 
@@ -153,26 +153,33 @@ class Megabytes(click.ParamType):  # type: ignore[type-arg]
         unit = {"MB": 1_000_000, "GB": 1_000_000_000, "": 1 if number >= 1_000_000 else 1_000_000}
         size = number * unit[(match[2] or "").upper()]
         if size < 16_000_000:
-            self.fail(f"{value!r} is less than 16 MB.", param, ctx)
+            self.fail(f"{value!r} is too little; at least 16 MB are needed.", param, ctx)
         if size >= 2**60:
-            self.fail(f"{value!r} is more than a machine has.", param, ctx)
+            self.fail(f"{value!r} is more memory than any machine has.", param, ctx)
         return size
 
 
 def _refuse_numbers(ctx: click.Context, params: Sequence[click.Parameter]) -> None:
-    """Refuse numbers that computing with goes wrong, whatever option of whatever command they are given to."""
-    for one in params:
-        value = ctx.params.get(str(one.name))
+    """Refuse unusable numbers in all options of all commands."""
+    for param in params:
+        value = ctx.params.get(str(param.name))
         for number in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(number, int) and not isinstance(one.type, Megabytes) and abs(number) > _WHOLE:
-                raise click.BadParameter(f"{number} is beyond {_WHOLE}.", ctx, one)
+            if isinstance(number, int) and not isinstance(param.type, Megabytes) and abs(number) > _WHOLE:
+                raise click.BadParameter(f"{number} is too large; the limit is {_WHOLE}.", ctx, param)
             if isinstance(number, float) and not is_usable(number):
-                raise click.BadParameter(f"{number:g} is not a number to compute with.", ctx, one)
+                raise click.BadParameter(
+                    f"{number:g} is not a usable number: too large, too small, or not finite.", ctx, param
+                )
 
 
 def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Parameter]) -> list[str]:
     """Return the words with pairs of numbers joined; a word with one dash that is not an option is an error."""
-    known = {name: one for one in params if isinstance(one, click.Option) for name in (*one.opts, *one.secondary_opts)}
+    known = {
+        name: param
+        for param in params
+        if isinstance(param, click.Option)
+        for name in (*param.opts, *param.secondary_opts)
+    }
     words: list[str] = []
     rest = list(args)
     while rest:
@@ -198,7 +205,7 @@ def _repeated(word: str, known: Mapping[str, click.Option]) -> bool:
 
 
 def _unknown(ctx: click.Context, word: str, known: Mapping[str, click.Option]) -> NoReturn:
-    """Say that there is no such option, and which was probably meant."""
+    """Fail for an unknown option, and suggest a similar one."""
     name, equals, value = word.partition("=")
     if name in HINTS and "-t_srs" in known:
         ctx.fail(f"No such option: {name}; {HINTS[name]}.")
@@ -208,8 +215,8 @@ def _unknown(ctx: click.Context, word: str, known: Mapping[str, click.Option]) -
     attached = word[:2] in known and not known[word[:2]].is_flag and not known[word[:2]].count
     close = difflib.get_close_matches(name.lstrip("-").replace("_", "-"), bare, 1, 0.8 if attached else 0.6)
     meant = bare[close[0]] if close else f"{word[:2]} {word[2:]}" if attached else None
-    said = f"; did you mean '{meant}'?" if meant else "."
-    ctx.fail(f"No such option: {word}{said}")
+    hint = f"; did you mean '{meant}'?" if meant else "."
+    ctx.fail(f"No such option: {word}{hint}")
 
 
 def _verbose(ctx: click.Context, _: click.Parameter, count: int) -> None:

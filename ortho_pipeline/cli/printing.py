@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.records import Rmse, RmseOnGround
     from ortho_pipeline.runtime.process_limits import Progress
 
-#: Exit code of a command that made a part of what was asked for.
+#: Exit code of a command that made only a part of its outputs.
 PARTLY_DONE = 3
 #: More points than this are not all printed, but so many of them.
 _PRINTED, _WORST = 60, 20
@@ -57,7 +57,7 @@ def print_result(result: Result, as_json: bool) -> None:
 
 
 def checked_text(name: str, checked: Mapping[str, Any]) -> str:
-    """Return what a dry run found out about a scene (`commands.check`)."""
+    """Return the result of a dry run of a scene (`commands.check`)."""
     points, grid = checked["points"], checked["grid"]
     parts = [
         f"{checked['sensor']}, {checked['model']}",
@@ -150,15 +150,15 @@ def _print_parameters(document: Mapping[str, Any]) -> None:
 def view_text(view: Mapping[str, Any] | None) -> str:
     """Return the direction of view and the size of a pixel along and across it."""
     if view is None:
-        return "the middle of the image does not meet the ground"
+        return "unknown: the centre of the image does not meet the ground"
     azimuth = view["sensor_azimuth_deg"]
     place = (
         "straight down"
         if azimuth is None
-        else (f"{view['incidence_deg']:.1f} deg off the vertical, sensor in azimuth {azimuth:.0f} deg")
+        else (f"{view['incidence_deg']:.1f} deg off vertical, sensor at azimuth {azimuth:.0f} deg")
     )
     along, across = view["pixel_m"]["along_view"], view["pixel_m"]["across_view"]
-    return f"{place}; a pixel is {along:.3g} m along the view, {across:.3g} m across"
+    return f"{place}; pixel size {along:.3g} m along the view, {across:.3g} m across"
 
 
 @contextlib.contextmanager

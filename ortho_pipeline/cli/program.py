@@ -110,8 +110,8 @@ class _Commands(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands in their groups by what is known of them, without loading any."""
-        groups = {title: {name: said for name, (_, said) in group.items()} for title, group in GROUPS.items()}
+        """List the commands in their groups, without loading any."""
+        groups = {title: {name: summary for name, (_, summary) in group.items()} for title, group in GROUPS.items()}
         for name, offer in self.added.offers.items():
             groups.setdefault(offer.group, {})[name] = offer.summary
         for title, group in groups.items():
@@ -143,7 +143,7 @@ class _Commands(click.Group):
             missing = _without_gdal()
             return self._fail(ctx, missing or _fault(error), CORRECTABLE if missing else FAILED)
         except MemoryError as error:
-            short = OrthoError("there is not enough memory", remedy="give less work at once (--memory MB, --threads 1)")
+            short = OrthoError("not enough memory", remedy="reduce --memory, and use --threads 1")
             short.__cause__ = error
             return self._fail(ctx, short, FAILED)
         except click.UsageError as error:
@@ -152,7 +152,7 @@ class _Commands(click.Group):
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except (Exception, SystemExit) as error:
-            # A library or a plugin that exits by itself would say that all is well.
+            # An exit by a library or a plugin would look like success.
             return self._fail(ctx, _fault(error), FAILED)
 
     def _fail(self, ctx: click.Context, error: OrthoError, code: int) -> None:
@@ -170,22 +170,28 @@ class _Commands(click.Group):
 
 
 def _print_usage_error(command: str, error: click.UsageError) -> None:
-    """Print the document of an error in the command line itself, of which only the words are known."""
+    """Print the document of an error in the command line itself."""
     if "--json" in shlex.split(command):
         from ortho_pipeline.cli.printing import print_json
 
         parameter = getattr(error, "param", None)
         field = parameter.opts[0] if parameter is not None else getattr(error, "option_name", None)
         remedy = f"see '{error.ctx.command_path} --help'" if error.ctx is not None else "see 'ortho --help'"
-        told = {"kind": "UsageError", "message": error.format_message(), "file": None, "field": field, "remedy": remedy}
-        print_json({"schema_version": 1, "error": told})
+        document = {
+            "kind": "UsageError",
+            "message": error.format_message(),
+            "file": None,
+            "field": field,
+            "remedy": remedy,
+        }
+        print_json({"schema_version": 1, "error": document})
 
 
 def _fault(error: BaseException) -> OrthoError:
-    """Return an error that nobody foresaw as one that people can report."""
+    """Return an unexpected error as one that users can report."""
     fault = OrthoError(
         f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
-        remedy="this is a fault of ortho-pipeline: run it again with --debug and report the traceback",
+        remedy="this is a bug in ortho-pipeline; run the command again with --debug and report the traceback",
     )
     fault.__cause__ = error
     return fault
@@ -197,8 +203,8 @@ def _without_gdal() -> InputError | None:
         importlib.import_module("osgeo.gdal_array")
     except ImportError as problem:
         missing = InputError(
-            f"GDAL's Python bindings cannot be loaded ({problem})",
-            remedy='pip install "ortho-pipeline[wheel]", or build those of your GDAL library (docs/install.md)',
+            f"cannot load the Python bindings of GDAL ({problem})",
+            remedy="run 'make setup' in the checkout of ortho-pipeline (docs/install.md)",
         )
         missing.__cause__ = problem
         return missing
@@ -214,7 +220,7 @@ def main() -> None:
         try:
             cli(prog_name="ortho", obj=_begin)
         except KeyboardInterrupt:
-            # Before a command has begun; later `_Commands` says so.
+            # Before a command has begun; later `_Commands` prints it.
             say("Interrupted.", err=True)
             raise SystemExit(INTERRUPTED) from None
         except Terminated as ended:

@@ -1,4 +1,4 @@
-"""Signals: a command that is asked to end does so as after an exception, whatever it is doing at that moment."""
+"""Signals end a command as an exception would, at any moment."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-#: Seconds after which an end that was lost is asked for again.
+#: Seconds until a lost signal is raised again.
 _AGAIN = 0.01
 
 
@@ -24,7 +24,7 @@ class Terminated(BaseException):
 def ended_by_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block by `Terminated`, as SIGINT does by `KeyboardInterrupt`.
 
-    Python drops an exception that a signal raises within a destructor, prints it, and goes on; here it comes again.
+    Python prints and drops an exception that a signal raises in a destructor; here it is raised again.
     After the block a signal ends the process at once, without a traceback of the interpreter that shuts down: the
     outputs have their names.
     """
@@ -49,7 +49,7 @@ def _end(number: int, _: Any) -> None:
 
 
 def _ask_again(lost: Any) -> None:
-    """Raise the exception of a signal a moment later once more; say what else a destructor cannot raise."""
+    """Raise the lost exception of a signal again a moment later; print other errors of destructors."""
     error = lost.exc_value
     if not isinstance(error, KeyboardInterrupt | Terminated):
         from ortho_pipeline.runtime.process_limits import is_told_already

@@ -62,8 +62,8 @@ def register(
     chosen = paths[0] if reference is None else place(located(reference, allow_network=scene.allow_network))
     names = [path.stem for path in paths]
     if chosen not in paths or len(set(names)) != len(names):
-        wrong = "the reference is not among the images" if chosen not in paths else "two images have one name"
-        raise InputError(wrong, file=chosen, field="reference", remedy="name each band once, the reference too")
+        wrong = "the reference is not one of the images" if chosen not in paths else "two images have the same name"
+        raise InputError(wrong, file=chosen, field="reference", remedy="list each band once, including the reference")
     opened = inputs.open_image(chosen, scene, needs_model=False)
     files = {"image": Path(folder) / f"{chosen.stem}_bands.tif", "table": Path(folder) / f"{chosen.stem}_bands.json"}
     beside = _metadata_beside(opened, files["image"])
@@ -72,11 +72,11 @@ def register(
     elif opened.models:
         files["model"] = Path(folder) / f"{chosen.stem}_bands_model.json"
     for path in map(allowed, files.values()):
-        if path.resolve() in {one.resolve() for one in (*paths, place(opened.model_source))}:
+        if path.resolve() in {file.resolve() for file in (*paths, place(opened.model_source))}:
             raise InputError(
-                "this path would be read and written", file=path, field="folder", remedy="choose another folder"
+                "this file is both input and output", file=path, field="folder", remedy="choose another folder"
             )
-    # Bands in an archive are those of the archive.
+    # The source of a band in an archive is the archive.
     read = {Location(path).archive or Path(path): "band" for path in paths}
     ledger = Ledger(read, states([*paths, opened.model_source]))
     with together(folder, files["image"].stem):
@@ -110,13 +110,13 @@ def _document(
         "sensor": scene.sensor,
         "reference": reference.stem,
         "bands": names,
-        "registrations": [one.row() for one in done],
+        "registrations": [registration.row() for registration in done],
         "inputs": read,
     }
 
 
 def _text(reference: Path, done: tuple[Registration, ...]) -> str:
-    rows = [one.row() for one in done]
+    rows = [registration.row() for registration in done]
     wide = max(len(row["band"]) for row in rows)
     lines = [
         f"{counted(len(rows) + 1, 'band')} in the geometry of {reference.name}; residuals of tie points in pixels:"

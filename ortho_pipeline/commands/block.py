@@ -78,7 +78,7 @@ def adjust(
     images : sequence of path
         Of one or many scenes; each is opened with its own sensor.
     folder : path
-        Where all files go; those of images are called by their stems (with folders ahead where stems are the same).
+        Folder of all outputs. Files of images are named by the stems of the images, after folders if stems are equal.
     scene : SceneOptions or sequence of SceneOptions
         How all images are opened, or each.
     models : sequence of path
@@ -97,7 +97,7 @@ def adjust(
     Raises
     ------
     InputError
-        For whatever the user can correct.
+        If an input or an option is wrong.
     """
     labels = labels_of(images)
     files = _files(labels, Path(folder))
@@ -129,10 +129,10 @@ def adjust(
             exported[label] = rpc.export_rpc(_plain(fit.models[label]))
             notes += [notice.in_image(label) for notice in exported[label].warnings]
         except InputError as error:
-            notes.append(Notice("no-rpc", Text("no RPC is written (", error.message, ")")).in_image(label))
+            notes.append(Notice("no-rpc", Text("no RPC written: ", error.message)).in_image(label))
             del files[f"{label} rpc"]
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
-    made = block_report.build_report(
+    report = block_report.build_report(
         fit=fit,
         starts=starts,
         exported=exported,
@@ -142,10 +142,10 @@ def adjust(
     )
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
-        _write(files, made, fit, starts, exported, record)
-        failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
-    text = Text.joined("\n", [*gathered.text, block_report.summary_text(made)])
-    return Result(files, {"report": made.to_json(), **gathered.document}, text, failure)
+        _write(files, report, fit, starts, exported, record)
+        failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
+    text = Text.joined("\n", [*gathered.text, block_report.summary_text(report)])
+    return Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
 
 
 @with_items
@@ -172,7 +172,7 @@ def intersect(
     Raises
     ------
     InputError
-        If there are not as many models as images, and for whatever else the user can correct.
+        If the number of models differs from that of images, or another input is wrong.
     """
     labels = labels_of(images)
     writer = None if output is None else _writer(output)
@@ -194,15 +194,17 @@ def intersect(
             label: _own(inputs.open_scene(image, own), points.model)
             for label, image, own in zip(labels, images, scenes, strict=True)
         }
-    found = intersect_rays(chosen, table)
-    rows = _ground_rows(table, found.ground, found.sigmas, _apart(table, found.ground), found.angles_deg)
+    intersection = intersect_rays(chosen, table)
+    rows = _ground_rows(
+        table, intersection.ground, intersection.sigmas, _apart(table, intersection.ground), intersection.angles_deg
+    )
     if writer is not None and output is not None:
         write_text(output, writer(rows))
     document = {
         "points": rows,
-        "sigma0": found.sigma0,
-        **to_document([*notes, *_left_open(found)]),
-        "median_residual_px": _median_residual(found),
+        "sigma0": intersection.sigma0,
+        **to_document([*notes, *_left_open(intersection)]),
+        "median_residual_px": _median_residual(intersection),
     }
     return Result(files, document, _intersection_text(document))
 
@@ -269,24 +271,24 @@ def _record(
     surface: SurfaceOptions,
     heights: Surface | None,
 ) -> dict[str, Any]:
-    """Return what is needed to make the same result again."""
+    """Return the record that reproduces the result."""
     ledgers = [
-        Ledger.of(Request(image, scene, PointOptions(gcps=given), surface, match), start.scene, heights)
+        Ledger.of(Request(image, scene, PointOptions(gcps=file), surface, match), start.scene, heights)
         for image, scene, start in zip(images, scenes, starts.values(), strict=True)
-        for given in (options.points, options.gcps)
+        for file in (options.points, options.gcps)
     ]
     first = next(iter(starts.values())).scene
     matched = options.ties is not None or bool(match.reference)
-    asked = ({"match": match} if matched else {}) | ({"surface": surface} if matched or heights is not None else {})
-    whole = provenance(
+    settings = ({"match": match} if matched else {}) | ({"surface": surface} if matched or heights is not None else {})
+    record = provenance(
         Request(images[0]),
         first,
         None,
         ledgers[0].joined(*ledgers[1:]).hashed(),
         command,
-        {"block": options, "scene": replace(scenes[0], model=None), **asked},
+        {"block": options, "scene": replace(scenes[0], model=None), **settings},
     )
-    return {key: whole[key] for key in ("command", "inputs", "options", "software")}
+    return {key: record[key] for key in ("command", "inputs", "options", "software")}
 
 
 # -- what came out ---------------------------------------------------------------------------------------------------
@@ -299,28 +301,30 @@ def _plain(model: SensorModel) -> SensorModel:
 
 def _warnings(fit: BlockFit, starts: Mapping[str, Start]) -> list[Notice]:
     points = fit.points
-    found = [notice.in_image(label) for label, start in starts.items() for notice in start.scene.notices]
-    found += fit.warnings
-    for one in fit.rejected[:50]:
-        where = f" in {one.image}" if one.image else (" (its ground)" if one.what == "ground" else "")
-        text = f"point {one.point}{where} was left out: {one.reason}"
-        found.append(Notice("left-out", text, point=one.point, reason=one.reason))
+    notices = [notice.in_image(label) for label, start in starts.items() for notice in start.scene.notices]
+    notices += fit.warnings
+    for rejected in fit.rejected[:50]:
+        where = f" in {rejected.image}" if rejected.image else (" (its ground)" if rejected.what == "ground" else "")
+        text = f"point {rejected.point}{where} was rejected: {rejected.reason}"
+        notices.append(Notice("left-out", text, point=rejected.point, reason=rejected.reason))
     if (more := len(fit.rejected) - 50) > 0:
-        text = f"and {counted(more, 'more gross error')}, all of them in the report"
-        found.append(Notice("more-left-out", text, count=more))
+        text = f"{counted(more, 'more gross error')}; the report lists all"
+        notices.append(Notice("more-left-out", text, count=more))
     sizes = np.array([(start.scene.width, start.scene.height) for start in starts.values()])[points.image]
     outside = ((points.measured < 0) | (points.measured > sizes)).any(axis=1)
     if outside.any():
         names = list(dict.fromkeys(points.ids[i] for i in points.point[outside][:10]))
         number = int(outside.sum())
-        text = f"{counted(number, 'measurement')} outside of their images (used all the same): {', '.join(names)}"
-        found.append(Notice("outside-of-image", text, count=number, points=names))
+        text = (
+            f"{counted(number, 'measurement is', 'measurements are')} outside the image, but used: {', '.join(names)}"
+        )
+        notices.append(Notice("outside-of-image", text, count=number, points=names))
     if fit.parameters and fit.redundancy == 0:
-        found.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and say nothing"))
+        notices.append(Notice("no-redundancy", "no redundancy: residuals are zero by construction and prove nothing"))
     checks = max((rms.n for rms in _check_rms(fit) if rms), default=0)
     if points.control.any() and checks < ENOUGH_CHECK_POINTS:
-        found.append(few_check_points(checks))
-    return list(dict.fromkeys(found))
+        notices.append(few_check_points(checks))
+    return list(dict.fromkeys(notices))
 
 
 def _check_rms(fit: BlockFit) -> list[ObjectRms | Rmse | None]:
@@ -329,18 +333,18 @@ def _check_rms(fit: BlockFit) -> list[ObjectRms | Rmse | None]:
 
 def _pictures(starts: Mapping[str, Start], options: SceneOptions) -> dict[str, bytes]:
     """Return small pictures of the first images, of those that are read at once: a page can do without."""
-    found = {}
+    pictures = {}
     for label, start in list(starts.items())[:PICTURES]:
         if start.scene.width * start.scene.height > _PICTURED:
             continue
         with contextlib.suppress(OrthoError):
-            found[label] = preview_png(start.scene.path, side=SIDE, allow_network=False, roots=options.roots)
-    return found
+            pictures[label] = preview_png(start.scene.path, side=SIDE, allow_network=False, roots=options.roots)
+    return pictures
 
 
 def _write(
     files: Mapping[str, Path],
-    made: BlockReport,
+    report: BlockReport,
     fit: BlockFit,
     starts: Mapping[str, Start],
     exported: Mapping[str, rpc.RpcExport],
@@ -351,7 +355,7 @@ def _write(
     write_text(files["points-csv"], _csv(rows))
     for label, start in starts.items():
         scene = start.scene
-        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **made.adjustment.images[label].to_json()}
+        adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **report.adjustment.images[label].to_json()}
         saved = SavedModel(
             _plain(fit.models[label]),
             scene.sensor,
@@ -364,9 +368,9 @@ def _write(
             rpc.write_rpc_txt(exported[label].rpc, files[f"{label} rpc"])
 
 
-def _write_report(files: Mapping[str, Path], made: BlockReport, pictures: Mapping[str, bytes]) -> None:
-    write_json(files["report"], made.to_json(), ascii_only=False)
-    write_text(files["html"], block_report.page(made, pictures))
+def _write_report(files: Mapping[str, Path], report: BlockReport, pictures: Mapping[str, bytes]) -> None:
+    write_json(files["report"], report.to_json(), ascii_only=False)
+    write_text(files["html"], block_report.page(report, pictures))
 
 
 def _ground_rows(
@@ -395,7 +399,7 @@ def _writer(path: str | os.PathLike[str]) -> Any:
     suffix = Path(path).suffix.lower()
     if suffix not in writers:
         raise InputError(
-            "ground points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}"
+            "ground points cannot be written in this format", file=path, remedy=f"one of {', '.join(writers)}"
         )
     return writers[suffix]
 
@@ -442,20 +446,20 @@ def _apart(points: BlockPoints, ground: Array) -> Array:
     return frame.apart(known, frame.of_geodetic(ground))
 
 
-def _median_residual(found: Intersection) -> float | None:
-    lengths = np.hypot(*found.residuals.T)
+def _median_residual(intersection: Intersection) -> float | None:
+    lengths = np.hypot(*intersection.residuals.T)
     lengths = lengths[np.isfinite(lengths)]
     return float(np.median(lengths)) if len(lengths) else None
 
 
-def _left_open(found: Intersection) -> list[Notice]:
-    open_ = ~np.isfinite(found.ground).all(axis=1)
+def _left_open(intersection: Intersection) -> list[Notice]:
+    open_ = ~np.isfinite(intersection.ground).all(axis=1)
     if not open_.any():
         return []
-    names = np.array(found.points.ids)[open_][:10].tolist()
+    names = np.array(intersection.points.ids)[open_][:10].tolist()
     text = (
         f"{counted(int(open_.sum()), 'point has', 'points have')} no intersection (one ray, parallel rays, or "
-        f"outside of the models): {', '.join(names)}"
+        f"outside the models): {', '.join(names)}"
     )
     return [Notice("no-intersection", text, count=int(open_.sum()), points=names)]
 

@@ -24,7 +24,7 @@ from ortho_pipeline.points import Points
 
 
 def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
-    """Return a name for each image that no other has: its stem, with folders ahead of it where stems are the same.
+    """Return a unique name for each image: its stem, after its folders if stems are equal.
 
     Raises
     ------
@@ -34,12 +34,12 @@ def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
     paths = [Path(os.path.abspath(image)) for image in images]
     for number, path in enumerate(paths):
         if path in paths[:number]:
-            raise InputError("this image is given twice", file=images[number], remedy="give each image once")
+            raise InputError("this image is listed twice", file=images[number], remedy="list each image once")
     parts = [(*path.parent.parts[1:], path.stem) for path in paths]
     labels = ["_".join(part[-1:]) for part in parts]
     for depth in range(2, max(map(len, parts), default=1) + 1):
         labels = [
-            "_".join(part[-depth:]) if [one.lower() for one in labels].count(label.lower()) > 1 else label
+            "_".join(part[-depth:]) if [other.lower() for other in labels].count(label.lower()) > 1 else label
             for part, label in zip(parts, labels, strict=True)
         ]
     # The last resort: stems that differ by suffix alone (a.tif, a.jp2).
@@ -56,7 +56,7 @@ def scenes_of(
     scene: SceneOptions | Sequence[SceneOptions],
     models: Sequence[str | os.PathLike[str]] = (),
 ) -> list[SceneOptions]:
-    """Return how each image is opened: by options of all or of each, and by its saved model if there are such.
+    """Return the options of each image: common or its own, with its saved model if given.
 
     Raises
     ------
@@ -64,9 +64,9 @@ def scenes_of(
         If there are not as many as images.
     """
     scenes = [scene] * len(images) if isinstance(scene, SceneOptions) else list(scene)
-    for field, given in (("scene", scenes), ("models", models)):
-        if given and len(given) != len(images):
-            what = counted(len(given), field.removesuffix("s"))
+    for field, values in (("scene", scenes), ("models", models)):
+        if values and len(values) != len(images):
+            what = counted(len(values), field.removesuffix("s"))
             raise InputError(
                 f"{what} for {counted(len(images), 'image')}",
                 field=field,
@@ -74,11 +74,11 @@ def scenes_of(
                 if field == "models"
                 else "give one for each image, in their order",
             )
-    return [replace(one, model=model) for one, model in zip(scenes, models, strict=True)] if models else scenes
+    return [replace(options, model=model) for options, model in zip(scenes, models, strict=True)] if models else scenes
 
 
 def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str) -> int:
-    """Return the number of the image that a name means: its stem or its file, with folders ahead where they differ.
+    """Return the index of the image that a name means: its stem or file name, after folders if needed.
 
     Raises
     ------
@@ -89,9 +89,9 @@ def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str)
     if len(meant) != 1:
         which = " or ".join(os.fspath(images[number]) for number in meant)
         raise InputError(
-            f"{name!r} could mean {which}" if meant else f"no image is called {name!r}",
+            f"{name!r} is ambiguous: {which}" if meant else f"there is no image {name!r}",
             field=field,
-            remedy=f"name one of {', '.join(labels_of(images))}",
+            remedy=f"use one of {', '.join(labels_of(images))}",
         )
     return meant[0]
 
@@ -99,7 +99,7 @@ def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str)
 def points_of_images(
     points: BlockPoints, images: Sequence[str | os.PathLike[str]], labels: Sequence[str], *, whole: bool = True
 ) -> tuple[BlockPoints, list[str]]:
-    """Return the points whose rays are in the images, with these called by their labels; and names that are of none.
+    """Return the points with rays in the images, by the labels of these; and names that match no image.
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def points_of_images(
         meant = [k for k, image in enumerate(images) if _means(name, image)]
         if len(meant) > 1:
             raise InputError(
-                f"the name {name!r} could mean {' or '.join(os.fspath(images[k]) for k in meant)}",
+                f"the name {name!r} is ambiguous: {' or '.join(os.fspath(images[k]) for k in meant)}",
                 file=points.source,
                 field="image",
-                remedy="write the folder in the points file too, such as aft/BAND.tif",
+                remedy="add the folder to the name in the points file, such as aft/BAND.tif",
             )
         if meant:
             owner[number] = meant[0]
@@ -129,10 +129,10 @@ def points_of_images(
     without = [os.fspath(image) for k, image in enumerate(images) if k not in owner.values()]
     if without and (whole or not owner):
         raise InputError(
-            f"no point was measured in {without[0]}; there are points of {', '.join(points.images[:5])}",
+            f"no point belongs to {without[0]}; the file has points of {', '.join(points.images[:5])}",
             file=points.source,
             field="image",
-            remedy="use the names of the images in the points file",
+            remedy="correct the image names in the points file",
         )
     of_images = points.of_rays(np.isin(points.image, list(owner)))
     kept = replace(
@@ -144,12 +144,12 @@ def points_of_images(
 
 
 def _means(name: str, image: str | os.PathLike[str]) -> bool:
-    """Tell whether a name in a points file means an image: its stem, and as many folders as are named, are the same."""
-    said = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
+    """Return whether a name in a points file means an image: its stem and the named folders agree."""
+    named = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
     path = [part.lower() for part in Path(os.path.abspath(image)).parts]
-    if not said or len(said) > len(path) or said[:-1] != path[len(path) - len(said) : -1]:
+    if not named or len(named) > len(path) or named[:-1] != path[len(path) - len(named) : -1]:
         return False
-    return said[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(said[-1]).stem == PurePath(path[-1]).stem
+    return named[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(named[-1]).stem == PurePath(path[-1]).stem
 
 
 def start_of(
@@ -180,26 +180,26 @@ def start_of(
         return _family_start(opened, str(name), options, table, heights)
     if options.model_crs is not None:
         raise InputError(
-            Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"),
+            Text(Setting("points.model_crs"), " is only for fitted models"),
             field="points.model_crs",
-            remedy=Text("give ", Setting("points.model"), f" with one of {', '.join(sorted(named))}"),
+            remedy=Text("leave it out, or set ", Setting("points.model"), f" to one of {', '.join(sorted(named))}"),
         )
     if name is not None and name not in opened.models:
         raise InputError(
             f"this image has no model {name!r}",
             file=image,
             field="points.model",
-            remedy=f"its models are {', '.join(opened.models)}; models fitted to points are {', '.join(sorted(named))}",
+            remedy=f"use {', '.join(opened.models)}, or a model fitted to points: {', '.join(sorted(named))}",
         )
     own = name if name is not None else next(iter(opened.models))
     model = opened.models[own]
     correction = options.correction or (OWN if model.param_names else "shift")
     if correction == OWN and not model.param_names:
         raise InputError(
-            f"the model {own!r} has no parameters of its own to adjust",
+            f"the model {own!r} has no adjustable parameters",
             file=image,
             field="points.correction",
-            remedy="take shift, shift-drift or affine",
+            remedy="use shift, shift-drift or affine",
         )
     first = own == next(iter(opened.models))
     source = opened.model_source if first else f"metadata of {Path(opened.path).name}"
@@ -207,7 +207,7 @@ def start_of(
         refuse_swapped(model, table.select(np.isfinite(table.ground[:, :2]).all(axis=1)), opened.height)
         corrected = ImageCorrection.identity(model, correction, (opened.width / 2, opened.height / 2))
         return Start(opened, corrected, own if correction == "none" else f"{own}+{correction}", source)
-    # The priors of a scene are those of its first model.
+    # The priors of a scene belong to its first model.
     return Start(opened, model, own, source, opened.priors if first else {})
 
 
@@ -216,7 +216,7 @@ def _family_start(
 ) -> Start:
     if options.correction not in (None, OWN):
         raise InputError(
-            f"the model {name!r} is fitted as a whole",
+            f"the model {name!r} is fitted to the points and takes no correction",
             field="points.correction",
             remedy=Text("leave out ", Setting("points.correction")),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from ortho_pipeline.commands.control.points import control_of, refuse_contradict
 from ortho_pipeline.commands.placement import open_rasters
 from ortho_pipeline.commands.resolved.ledger import provenance
 from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
@@ -29,6 +31,7 @@ from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.models import families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 
@@ -42,7 +45,7 @@ def fit(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
 ) -> FitResult:
-    """Adjust the model of a scene to its control points and hold it against its check points.
+    """Adjust the model of a scene to its control points and test it at its check points.
 
     Raises
     ------
@@ -53,9 +56,13 @@ def fit(
     _require_points(request)
     adjusted = adjust(resolved := adjustable(request))
     return FitResult(
-        adjusted.scene, adjusted.fit, adjusted.warnings(resolved.surface), adjusted.removed, points.near,
+        adjusted.scene,
+        adjusted.fit,
+        adjusted.warnings(resolved.surface),
+        adjusted.removed,
+        points.near,
         adjusted.matched,
-    )  # fmt: skip
+    )
 
 
 @with_items
@@ -89,30 +96,16 @@ def compare(
     """
     request = Request(image, scene, points, surface, match)
     _require_points(request)
-    if points.correction is not None or points.fit_model is not None:
-        raise InputError(Text("compare takes its models from ", Setting("models")),
-                         remedy=Text("for example ", Setting("models", "all")),
-                         field="points.fit_model" if points.correction is None else "points.correction")  # fmt: skip
-    if points.params is not None or points.prune:
-        raise InputError(
-            "compare fits whole models",
-            field="points.params" if points.params else "points.prune",
-            remedy="take ortho fit",
-        )
+    _refuse_options_of_fit(points)
     refuse_contradictions(points, match)
     resolved = resolve(request, needs_model=False)
     opened, heights = resolved.scene, resolved.surface
     own = opened.model if opened.models else None
     names = comparing.choose_models(models, own)
-    given, matched = control_of(resolved)
+    measured, matched = control_of(resolved)
     if own is not None:
-        refuse_swapped(own, given, opened.height)
-    given = heights_where_wanted(given, heights, *names)
-    compared = comparing.compare(
-        given, names, own=own, priors=opened.priors, size=(opened.width, opened.height), crs=points.model_crs,
-        heights=heights_around(given, heights), unsuited=opened.unsuited, ridge=ridge_of(points.ridge),
-        significance=points.significance,
-    )  # fmt: skip
+        refuse_swapped(own, measured, opened.height)
+    compared = _compared(resolved, heights_where_wanted(measured, heights, *names), names)
     best = compared.best
     if matched is not None:
         relative = () if best is None or best.fit is None else relative_to_reference(best.fit, match)
@@ -127,22 +120,62 @@ def compare(
     if best.model in {family.name for family in families()}:
         opened = replace(opened, models={best.model: chosen.model}, model_source="control points")
     adjusted = Adjusted(opened, chosen, matched=matched)
-    asked = request.asked("scene", "surface", "match")
-    record = provenance(request, opened, heights, resolved.ledger.hashed(), command, asked)
-    made = report.build_report(
-        scene=opened, fit=chosen, surface=heights, comparison=compared, near=points.near,
-        provenance=record, warnings=adjusted.warnings(heights), matching=adjusted.matching,
-    )  # fmt: skip
-    write_report(made, chosen, files, matched, open_rasters(opened, request))
+    settings = request.asked("scene", "surface", "match")
+    record = provenance(request, opened, heights, resolved.ledger.hashed(), command, settings)
+    document = report.build_report(
+        scene=opened,
+        fit=chosen,
+        surface=heights,
+        comparison=compared,
+        near=points.near,
+        provenance=record,
+        warnings=adjusted.warnings(heights),
+        matching=adjusted.matching,
+    )
+    write_report(document, chosen, files, matched, open_rasters(opened, request))
     return CompareResult(resolved.scene, compared, matched, files)
+
+
+def _compared(resolved: Resolved, measured: Points, names: Sequence[str]) -> comparing.ComparisonRecord:
+    scene, options = resolved.scene, resolved.request.points
+    return comparing.compare(
+        measured,
+        names,
+        own=scene.model if scene.models else None,
+        priors=scene.priors,
+        size=(scene.width, scene.height),
+        crs=options.model_crs,
+        heights=heights_around(measured, resolved.surface),
+        unsuited=scene.unsuited,
+        ridge=ridge_of(options.ridge),
+        significance=options.significance,
+    )
+
+
+def _refuse_options_of_fit(points: PointOptions) -> None:
+    if points.correction is not None or points.fit_model is not None:
+        raise InputError(
+            Text("ortho compare chooses its models with ", Setting("models")),
+            remedy=Text("leave this option out; for example use ", Setting("models", "all")),
+            field="points.fit_model" if points.correction is None else "points.correction",
+        )
+    if points.params is not None or points.prune:
+        raise InputError(
+            "ortho compare always fits all parameters of a model",
+            field="points.params" if points.params else "points.prune",
+            remedy="use ortho fit",
+        )
 
 
 def _require_points(request: Request) -> None:
     if not request.has_control:
         raise InputError(
-            "there are no points to fit to", field="points.gcps",
+            "no control points given",
+            field="points.gcps",
             remedy=Text(
-                "give a file of points with ", Setting("points.gcps"), ", or an orthoimage to match with (",
-                Setting("match.reference"), ")"
+                "give a file of points with ",
+                Setting("points.gcps"),
+                ", or an ortho to match with ",
+                Setting("match.reference"),
             ),
-        )  # fmt: skip
+        )

@@ -16,11 +16,11 @@ from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import allowed
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options import PathLike, SceneOptions
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster import source as raster
 
-#: Side-cars that GDAL would attach to an image of this stem, whatever the image itself says.
+#: Sidecar files that GDAL attaches to an image of this stem, whatever the image itself contains.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
 #: The same, after the whole name of the image.
 ATTACHED = (".aux.xml", ".ovr", ".msk")
@@ -43,56 +43,77 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
     if isinstance(image, Scene):
         if dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
             raise InputError(
-                "this scene is open already", file=image, field="scene", remedy="give its path, or open it so"
-            )  # fmt: skip
+                "options cannot change a scene that is already open",
+                file=image,
+                field="scene",
+                remedy="give its path, or open it with these options",
+            )
         return image
     if options.model is None:
-        given: dict[str, Any] = dict(options.sensor_options)
+        sensor_options: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
-            if "rpc" in given:
-                raise InputError("the RPC is chosen twice", field="scene.rpc",
-                                 remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")))  # fmt: skip
-            given["rpc"] = options.rpc
-        given = {name: _perhaps_elsewhere(value, options.allow_network) for name, value in given.items()}
-        return host.open_scene(image, options.sensor, given, crop_offset=options.crop_offset, **options.access)
+            if "rpc" in sensor_options:
+                raise InputError(
+                    "two options choose the RPC",
+                    field="scene.rpc",
+                    remedy=Text("leave out ", Setting("scene.sensor_options", "...", "rpc")),
+                )
+            sensor_options["rpc"] = options.rpc
+        sensor_options = {
+            name: _perhaps_elsewhere(value, options.allow_network) for name, value in sensor_options.items()
+        }
+        return host.open_scene(image, options.sensor, sensor_options, crop_offset=options.crop_offset, **options.access)
+    return _with_model_file(image, options, options.model)
+
+
+def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model: PathLike) -> Scene:
+    """Open an image with the model of a model file, which takes the place of its own."""
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
         raise InputError(
-            "a model file takes the place of the image's model", field="scene.model",
+            "a model file replaces the image's model, so options of that model have no effect",
+            field="scene.model",
             remedy=Text(
-                "leave out ", Setting("scene.rpc"), ", ", Setting("scene.sensor"), " and ",
-                Setting("scene.sensor_options")
+                "leave out ",
+                Setting("scene.rpc"),
+                ", ",
+                Setting("scene.sensor"),
+                " and ",
+                Setting("scene.sensor_options"),
             ),
-        )  # fmt: skip
+        )
     dataset = raster.open_dataset(image, **options.access)
     host.Host.discover()  # model families of plugins, which the file may name
-    saved = read_model_file(located(options.model, allow_network=options.allow_network))
+    saved = read_model_file(located(model, allow_network=options.allow_network))
     size = dataset.RasterXSize, dataset.RasterYSize
     offset = options.crop_offset
     if offset is None and saved.size != size:
         offset = crop.noted_offset(dataset)
     if saved.size is not None and not crop.fits(size, saved.size, offset):
         raise InputError(
-            f"this model is of an image of {saved.size[0]} x {saved.size[1]} pixels, {Path(image).name} has "
+            f"this model belongs to an image of {saved.size[0]} x {saved.size[1]} pixels; {Path(image).name} has "
             f"{size[0]} x {size[1]}",
-            file=options.model,
+            file=model,
             field="size",
             remedy=Text(
-                "give the model file of this image, or ",
+                "give the model file of this image; if it is a crop, give its position with ",
                 Setting("scene.crop_offset", "COL,ROW"),
-                " if it is a crop of that one",
             ),
         )
     scene = Scene(
-        sensor=saved.sensor or "model file", path=image, width=size[0], height=size[1],
-        models={saved.model.kind: saved.model}, model_source=str(options.model),
+        sensor=saved.sensor or "model file",
+        path=image,
+        width=size[0],
+        height=size[1],
+        models={saved.model.kind: saved.model},
+        model_source=str(model),
         facts={"delivered_model_source": saved.model_source} if saved.model_source else {},
         adjusted=saved.adjusted,
-    )  # fmt: skip
+    )
     return scene if offset is None else crop.placed(scene, dataset, offset)
 
 
 def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_model: bool) -> Scene:
-    """Open an image whose own model is only wanted if there is one.
+    """Open an image that may have no model of its own.
 
     Parameters
     ----------
@@ -104,8 +125,10 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     Scene
         Without models and of the sensor "points only" where no sensor recognises the image.
     """
-    asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
-    if needs_model or asked:
+    has_options = isinstance(image, Scene) or bool(
+        options.model or options.rpc or options.sensor or options.sensor_options
+    )
+    if needs_model or has_options:
         return open_scene(image, options)
     plugins = host.Host.discover()
     dataset = plugins.open_image(image, **options.access)
@@ -119,7 +142,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
 
 
 def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
-    """Return a file of an archive or of the network as one that can be read; any other value as it is."""
+    """Return a file in an archive or on the network in the form that GDAL reads; any other value unchanged."""
     text = str(value)
     return located(text, allow_network=allow_network) if text.startswith("/vsi") or "://" in text else value
 
@@ -128,40 +151,43 @@ def _perhaps_elsewhere(value: Any, allow_network: bool) -> Any:
 
 
 def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = False) -> None:
-    """Refuse to write what is read or through a link, and what changes the model of the source or of the ortho.
+    """Refuse outputs that overwrite an input, follow a link, or change the model of the source or of the ortho.
 
     Parameters
     ----------
     overwrite : bool
-        Accept old side-cars of the ortho, which the caller removes (`old_side_cars`).
+        Accept old sidecars of the ortho, which the caller removes (`old_side_cars`).
 
     Raises
     ------
     InputError
-        With the path that is in the way.
+        With the path in conflict.
     """
     inputs = {Path(path).resolve() for _, path in request.files}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
     for path in (*map(allowed, files.values()), *removed):
         if path.resolve() in inputs:
             raise InputError(
-                "this path would be read and written", file=path, field="folder", remedy="choose another output folder"
+                "this file is both input and output", file=path, field="folder", remedy="choose another output folder"
             )
     folder = next(iter(files.values())).parent
     attaching = any(str(path).endswith(SIDE_CARS) for path in files.values())
     if attaching and folder.resolve() == Path(request.image).resolve().parent:
         raise InputError(
-            "the RPC files written here would attach to the source image and change its model", file=folder,
-            field="folder", remedy="choose an output folder of its own",
-        )  # fmt: skip
+            "RPC files in this folder would attach to the source image and change its model",
+            file=folder,
+            field="folder",
+            remedy="choose a different output folder",
+        )
     if "ortho" in files and not overwrite:
         # Statistics, overviews and masks go with an ortho that is replaced; a model is nothing that an ortho has.
         for stale in old_side_cars(files["ortho"]):
             if stale.name.endswith(SIDE_CARS) or not files["ortho"].exists():
                 raise InputError(
-                    "an old side-car lies here that GDAL would attach to the ortho", file=stale,
-                    remedy=Text("remove it (", Setting("overwrite"), " does), or choose another output folder"),
-                )  # fmt: skip
+                    "GDAL would attach this old sidecar file to the ortho",
+                    file=stale,
+                    remedy=Text("delete it, use ", Setting("overwrite"), ", or choose another output folder"),
+                )
 
 
 def old_side_cars(ortho: Path) -> list[Path]:

@@ -17,12 +17,12 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay, scene_pixels
 
-#: An ortho with a smaller part of what its scene covers is worth a warning.
+#: A smaller share of valid pixels within the footprint gives a warning.
 _SPARSE = 0.05
 
 
 class Placement(NamedTuple):
-    """The place of an ortho and all that it is made from: adjusted model, footprint on the surface, and grid."""
+    """The inputs of an ortho: adjusted model, surface, footprint on it, and grid."""
 
     adjusted: Adjusted
     model: SensorModel
@@ -42,19 +42,19 @@ class Placement(NamedTuple):
         if part >= _SPARSE:
             return []
         text = (
-            f"only {part:.2%} of the pixels that the scene covers have a value: check the heights, and the nodata "
-            "value and the mask of the image"
+            f"only {part:.2%} of the pixels inside the footprint have a value. Check the heights, and the nodata value "
+            "and mask of the image"
         )
         return [Notice("sparse-ortho", text, share=part)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return what is known before the first pixel as JSON values."""
+        """Return the results before the first pixel, as JSON values."""
         fit, grid = self.adjusted.fit, self.grid
         return {
             "sensor": self.scene.sensor,
             "model": fit.model_name,
             "points": {"control": int(fit.points.control.sum()), "check": int(fit.points.check.sum())},
-            "rmse_px": {which: one and one["total"] for which, one in fit.rmses.given().items()},
+            "rmse_px": {which: rmse and rmse["total"] for which, rmse in fit.rmses.given().items()},
             "coverage": self.footprint.coverage,
             "grid": {
                 "crs": crs_text(grid.crs),
@@ -69,33 +69,33 @@ class Placement(NamedTuple):
 def place_scene(resolved: Resolved) -> Placement:
     """Adjust a scene to its points, lay it on its surface and choose the grid of its ortho.
 
-    No pixel is read, but those that are matched with a reference.
+    It reads no pixels, except for matching with a reference.
 
     Raises
     ------
     InputError
-        For wrong points, a DEM that does not cover the scene, a grid that is none.
+        For wrong points, a DEM that does not cover the scene, or an impossible grid.
     """
     adjusted, output, surface = adjust(resolved), resolved.request.output, resolved.surface
     assert surface is not None, "who places a scene requires heights"
     model, size = adjusted.model, (adjusted.scene.width, adjusted.scene.height)
     with completed(adjusted.scene.model_source, of="model"):
-        found = lay(model, surface, *size)
-        found.require_coverage()
-        model = found.fitted(model)
+        footprint = lay(model, surface, *size)
+        footprint.require_coverage()
+        model = footprint.fitted(model)
         grid = resolved.grid
         if grid is None:
             with of_option("output.crs"):
                 crs = map_crs(output.crs) if output.crs else None
             grid = choose_grid(
-                model, found, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
+                model, footprint, size, crs=crs, resolution=output.resolution, extent=output.extent, align=output.align
             )
-        scene_pixels(model, found, grid)
-    return Placement(adjusted, model, found.surface, found, grid, resolved.request)
+        scene_pixels(model, footprint, grid)
+    return Placement(adjusted, model, footprint.surface, footprint, grid, resolved.request)
 
 
 def open_rasters(scene: Scene, request: Request) -> RasterSource:
-    """Open the rasters of a scene with the bands and in the type that a request says."""
+    """Open the rasters of a scene with the bands and the type of a request."""
     image, output = request.image, request.output
     return RasterSource(
         *(scene.rasters or (image,)),

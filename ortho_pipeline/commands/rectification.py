@@ -78,24 +78,23 @@ def rectify(
 ) -> Result:
     """Make the orthoimage of a scene, its adjusted model in every format, and the accuracy report.
 
-    `image` may be a scene that is open, `points` a table that is read already, in pixels of that image. Nothing is
-    written before all that can be checked is checked. `name` is the id of the STAC item (the
-    image's stem without one), `digest` takes checksums of the inputs, which it may know. Outputs of the same name are
-    replaced, with their statistics and overviews, and outputs of an earlier run that this one does not make are
-    removed; with `overwrite` also where no report says that a run made them, and old models beside the ortho.
+    `image` may be an open scene, and `points` a table of points in pixels of that image. All inputs are checked before
+    anything is written. `name` is the id of the STAC item (default: the stem of the image); `digest` computes
+    checksums of the inputs. Existing outputs are replaced, and outputs of an earlier run that this run does not make
+    are deleted. `overwrite` also deletes such files without a report, and old sidecars of the ortho.
 
     Returns
     -------
     Result
-        `files` has ortho, model, rpc, vrt (unless no RPC stands for the model), residuals and style (with points
-        only), report, html, and, if asked for, accuracy with its style, and stac with thumbnail and overview. If the
-        report could not be made, the others are there, and `failure` says why.
+        `files` has ortho, model, rpc and vrt (unless no RPC represents the model), residuals and style (with points
+        only), report, html, and, if requested, accuracy with its style, and stac with thumbnail and overview. If the
+        report failed, the others are complete, and `failure` gives the reason.
 
     Raises
     ------
     InputError
-        For whatever the user can correct: no heights, a DEM that does not cover the scene, a path that is read and
-        written, an old side-car that would attach to the ortho.
+        If an input or an option is wrong: no heights, a DEM that does not cover the scene, a file that is both input
+        and output, or an old sidecar that would attach to the ortho.
     """
     assert isinstance(points, PointOptions), "with_items makes options of points"
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched
@@ -119,32 +118,26 @@ def rectify(
         stage("Layers and report", 0.0)
         accuracy = layers.write_layers(placed, budget, warped, files)
         angles = write_angles(placed, sun, files)
-        asked = request.asked("scene", "surface", "output", "match")
-        record = provenance(request, opened, placed.surface, hashing.result(), command, asked)
+        settings = request.asked("scene", "surface", "output", "match")
+        record = provenance(request, opened, placed.surface, hashing.result(), command, settings)
     _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
 
     def described() -> SceneReport:
-        made = report.build_report(
-            scene=opened, fit=adjusted.fit, exported=exported, surface=placed.surface,
-            coverage=placed.footprint.coverage, grid=placed.grid, warp=warped, near=request.points.near,
-            provenance=record | read_since(before), matching=adjusted.matching,
-            warnings=[*adjusted.warnings(placed.surface), *placed.footprint.notes(),
-                      *placed.sparse(warped.valid_pixels), *complaints, *notes, *warped.notes(output.memory)],
-        )  # fmt: skip
-        made = report.with_layers(made, accuracy=accuracy, angles=angles)
-        write_report(made, adjusted.fit, files, adjusted.matched, source)
+        outcome = _report_of(placed, exported, warped, record | read_since(before), [*complaints, *notes])
+        outcome = report.with_layers(outcome, accuracy=accuracy, angles=angles)
+        write_report(outcome, adjusted.fit, files, adjusted.matched, source)
         if acquired is not None:
             from ortho_pipeline.report.stac import write_item
 
-            write_item(files["stac"], made, files, acquired, name or stem)
-        return made
+            write_item(files["stac"], outcome, files, acquired, name or stem)
+        return outcome
 
-    made = attempted(described, files, *OF_REPORT)
+    outcome = attempted(described, files, *OF_REPORT)
     resolved.ledger.require_unchanged()
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
-    if isinstance(made, ReportError):
-        return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
-    return Result(files, {"report": made.to_json()}, report.summary_text(made))
+    if isinstance(outcome, ReportError):
+        return Result(files, {"report": None}, "Ortho and model are complete, but the report is missing.", outcome)
+    return Result(files, {"report": outcome.to_json()}, report.summary_text(outcome))
 
 
 @with_items
@@ -157,7 +150,7 @@ def check(
     match: MatchOptions = MatchOptions(),
     output: OutputOptions = OutputOptions(),
 ) -> dict[str, Any]:
-    """Do all that `rectify` does before the first pixel: what it would say then, it says now.
+    """Do all that `rectify` does before the first pixel, with the same errors and warnings.
 
     Returns
     -------
@@ -198,19 +191,19 @@ def export(
     match: MatchOptions = MatchOptions(),
     force: bool = False,
 ) -> Result:
-    """Write the model of a scene, adjusted if there are points, in formats that GDAL and every GIS read.
+    """Write the model of a scene, adjusted to its points if given, in formats that GDAL and every GIS read.
 
     Parameters
     ----------
     formats : sequence of str
-        Names of formats: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, and those of plugins, such as csm.
+        Names of formats: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, and formats of plugins, such as csm.
     force : bool
-        Accept a file that is more than 0.1 px off the model.
+        Write a file even if it differs from the model by more than 0.1 px.
 
     Returns
     -------
     Result
-        `document` says whether the RPC is exact, and the largest error of everything that is not.
+        `document` states whether the RPC is exact, and the largest error of each approximation.
 
     Raises
     ------
@@ -218,7 +211,7 @@ def export(
         For an unknown format, a geolocation without heights, and as `fit`.
     """
     chosen = check_formats(formats, Host.discover().formats)
-    files = {one.name: Path(folder) / f"{Path(image).stem}{one.ending}" for one in chosen}
+    files = {file_format.name: Path(folder) / f"{Path(image).stem}{file_format.ending}" for file_format in chosen}
     request = Request(image, scene, points, surface, match)
     inputs.check_paths(files, request)
     adjusted, heights = adjust(resolved := adjustable(request)), resolved.surface
@@ -229,11 +222,16 @@ def export(
         if heights is not None:
             heights = footprint.facing(adjusted.model, heights, *size)
         job = Export(
-            dataset, adjusted.model, size, heights, adjustment.points.select(adjustment.used), adjustment.rejected,
+            dataset,
+            adjusted.model,
+            size,
+            heights,
+            adjustment.points.select(adjustment.used),
+            adjustment.rejected,
             force=force,
-        )  # fmt: skip
-        for one in chosen:
-            job.write(one, files[one.name])
+        )
+        for file_format in chosen:
+            job.write(file_format, files[file_format.name])
     document = {**job.document, "model": adjustment.model_name, "model_source": adjusted.scene.model_source}
     return Result(files, document, job.summary(adjustment.model_name, adjusted.scene.model_source, chosen))
 
@@ -242,13 +240,13 @@ def export(
 
 
 def _unwatched(stage: str, share: float) -> None:
-    """Tell nobody how far the work is."""
+    """Ignore the progress."""
 
 
 def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_of_them: bool) -> list[Path]:
-    """Return what an earlier run wrote for this scene and this one does not, and side-cars of the ortho it wrote.
+    """Return outputs of an earlier run that this run does not write, and sidecars of its ortho.
 
-    Without its report, only `all_of_them` takes files of such names for its own.
+    Without a report of that run, only `all_of_them` returns such files.
     """
     ours, before = all_of_them, folder / f"{stem}{ENDINGS['report']}"
     if not ours and before.is_file():
@@ -259,23 +257,26 @@ def _of_earlier_run(folder: Path, stem: str, files: Mapping[str, Path], *, all_o
 
 
 def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
-    """Return the time of acquisition for the STAC item, None where none is asked for."""
+    """Return the time of acquisition for the STAC item; None without an item."""
     if output.stac:
         from ortho_pipeline.report.stac import acquisition_time
 
         return acquisition_time(facts, output.acquired)
     if output.acquired is not None:
-        raise InputError("only a STAC item says when", field="output.acquired",
-                         remedy=Text("give ", Setting("output.stac"), " too, or leave it out"))  # fmt: skip
+        raise InputError(
+            "the time of acquisition is only for a STAC item",
+            field="output.acquired",
+            remedy=Text("add ", Setting("output.stac"), ", or leave it out"),
+        )
     return None
 
 
 def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
-    """Return the model as RPC and what there is to say about it; None where no RPC stands for it."""
+    """Return the model as RPC, and notices; None if no RPC represents it."""
     try:
         exported = rpc.export_rpc(model)
     except InputError as error:
-        return None, [Notice("no-rpc", Text("no RPC files were written: ", error.message))]
+        return None, [Notice("no-rpc", Text("no RPC written: ", error.message))]
     return exported, list(exported.warnings)
 
 
@@ -286,23 +287,62 @@ def _warp(
     path: Path | Hiding,
     progress: Progress,
 ) -> WarpRecord:
-    # The compiled kernels take a while to load: beside the checksums.
+    # The compiled kernels load slowly, so they load while checksums are computed.
     from ortho_pipeline.warp.engines import engine_of
     from ortho_pipeline.warp.job import WarpJob
 
     output = placed.request.output
     job = WarpJob(
-        placed.model, source, placed.surface, placed.grid, output.resampling, output.dem_interpolation,
-        output.tolerance, Resources(output.memory, output.threads, progress), output.format,
-        dict(output.creation_options), Profile.of(source, output.dtype, output.nodata), exported,
-    )  # fmt: skip
+        placed.model,
+        source,
+        placed.surface,
+        placed.grid,
+        output.resampling,
+        output.dem_interpolation,
+        output.tolerance,
+        Resources(output.memory, output.threads, progress),
+        output.format,
+        dict(output.creation_options),
+        Profile.of(source, output.dtype, output.nodata),
+        exported,
+    )
     return engine_of(output.engine).rectify(job, path)
+
+
+def _report_of(
+    placed: Placement,
+    exported: rpc.RpcExport | None,
+    warped: WarpRecord,
+    record: Mapping[str, Any],
+    notices: Sequence[Notice],
+) -> SceneReport:
+    """Return the report of an ortho, without its layers."""
+    adjusted, request = placed.adjusted, placed.request
+    return report.build_report(
+        scene=placed.scene,
+        fit=adjusted.fit,
+        exported=exported,
+        surface=placed.surface,
+        coverage=placed.footprint.coverage,
+        grid=placed.grid,
+        warp=warped,
+        near=request.points.near,
+        provenance=record,
+        matching=adjusted.matching,
+        warnings=[
+            *adjusted.warnings(placed.surface),
+            *placed.footprint.notes(),
+            *placed.sparse(warped.valid_pixels),
+            *notices,
+            *warped.notes(request.output.memory),
+        ],
+    )
 
 
 def _write_models(
     placed: Placement, exported: rpc.RpcExport | None, files: dict[str, Path], record: Mapping[str, Any]
 ) -> None:
-    """Write the model in every format; what cannot be written is taken out of `files`."""
+    """Write the model in every format; remove from `files` what cannot be written."""
     scene, request = placed.scene, placed.request
     size = scene.width, scene.height
     write_model_file(SavedModel(placed.model, scene.sensor, scene.model_source, size, record), files["model"])

@@ -62,7 +62,7 @@ _ASKED = {
     "angles": ("angles", "angles_style", "shadow"),
 }
 
-#: Outputs of a scene that tell of the others.
+#: Outputs of a scene that describe the others.
 OF_REPORT = ("residuals", "style", "report", "html", "stac", "thumbnail", "overview")
 
 _P = ParamSpec("_P")
@@ -82,7 +82,7 @@ class FitResult:
 
     @property
     def matching(self) -> MatchingRecord | None:
-        """What was matched, and what its points say of the fit; None where nothing was."""
+        """The matches, with the test of the fit at them; None without matching."""
         return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def to_json(self) -> dict[str, Any]:
@@ -105,12 +105,12 @@ class FitResult:
 
 @dataclass(frozen=True)
 class Result:
-    """Files that a command wrote (paths, or addresses in a store), what it says about them, a summary for people."""
+    """Files that a command wrote (paths, or addresses in a store), their document, and a summary for people."""
 
     files: Mapping[str, Any]
     document: Mapping[str, Any]
     summary: str
-    #: Why there is no report, where it could not be made: the files are complete without it.
+    #: Reason why the report failed; the files are complete without it.
     failure: ReportError | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -143,10 +143,10 @@ class CompareResult:
         return {**document, **matching, "files": {name: str(path) for name, path in self.files.items()}}
 
 
-def outputs(folder: str | os.PathLike[str], stem: str, asked: OutputOptions) -> dict[str, Path]:
+def outputs(folder: str | os.PathLike[str], stem: str, options: OutputOptions) -> dict[str, Path]:
     """Return the paths of the outputs of a scene by what they are, of those that are made if all goes well."""
-    idle = {kind for field, kinds in _ASKED.items() if not getattr(asked, field) for kind in kinds}
-    idle |= {"visibility"} if asked.visibility == "nodata" else set()
+    idle = {kind for field, kinds in _ASKED.items() if not getattr(options, field) for kind in kinds}
+    idle |= {"visibility"} if options.visibility == "nodata" else set()
     return {kind: Path(folder) / f"{stem}{ending}" for kind, ending in ENDINGS.items() if kind not in idle}
 
 
@@ -222,7 +222,7 @@ def _to_store(
 
 
 def _goes_along(path: Path) -> bool:
-    """Tell whether a file means the same elsewhere: a VRT names an image of this machine by its way from here."""
+    """Return whether a file is valid elsewhere; a VRT refers to an image by a relative path."""
     return path.suffix != ".vrt" or 'relativeToVRT="1"' not in path.read_text(encoding="utf-8", errors="replace")
 
 
@@ -243,7 +243,7 @@ def attempted(make: Callable[[], _R], files: dict[str, Path], *of_report: str) -
         for kind in of_report:
             files.pop(kind, None)
         why = f"{type(error).__name__}: {error}".removesuffix(": ")
-        remedy = "this is a fault of ortho-pipeline: please report it with the traceback"
+        remedy = "this is a bug in ortho-pipeline: please report it with the traceback"
         if isinstance(error, OrthoError):
             why, remedy = error.message, error.remedy or remedy
         failure = ReportError(
@@ -262,7 +262,7 @@ def write_report(
 ) -> None:
     """Write report and residuals; without points there are no residuals, and they are taken out of `files`.
 
-    The page shows chips of what was matched, and of `pixels`, those of the scene, about measured points.
+    The page shows chips of the matches and, from `pixels` (the raster of the scene), of measured points.
     """
     if len(fit.points):
         write_text(files["residuals"], json.dumps(report.residuals_geojson(fit), allow_nan=False))

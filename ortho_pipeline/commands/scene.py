@@ -61,7 +61,7 @@ def sensors() -> dict[str, Any]:
 
 def formats() -> dict[str, str]:
     """Return the formats that models are written in, by name, each with its title; broken plugins are left out."""
-    return {name: one.title for name, one in host.Host(installed=True, lenient=True).formats.items()}
+    return {name: file_format.title for name, file_format in host.Host(installed=True, lenient=True).formats.items()}
 
 
 @with_items
@@ -101,7 +101,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
 
 
 def _on_a_map(image: str | os.PathLike[str], options: SceneOptions) -> dict[str, Any] | None:
-    """Return the document of a DEM or an ortho; None of what is, or may be, a scene."""
+    """Return the document of a DEM or an ortho; None for a possible scene."""
     if isinstance(image, Scene) or dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
         return None
     if os.path.isdir(image):
@@ -137,12 +137,12 @@ def write_plots(
     Raises
     ------
     InputError
-        If it is not a report, or PNG is asked for and matplotlib is not installed.
+        If it is not a report, or PNG is requested without matplotlib.
     """
-    with completed(report_file, remedy="give a <stem>_report.json as it was written, or make it again"):
-        made = report.read_report(located(report_file, allow_network=allow_network))
+    with completed(report_file, remedy="give an unmodified <stem>_report.json, or make the report again"):
+        document = report.read_report(located(report_file, allow_network=allow_network))
         stem = Path(report_file).stem
-        files = report.write_plots(made, Path(folder), stem, kind)
+        files = report.write_plots(document, Path(folder), stem, kind)
     return Result(
         files, {}, f"{counted(len(files), 'plot')} of {Path(report_file).name.removesuffix(ENDINGS['report'])}"
     )
@@ -171,9 +171,9 @@ def edge(
     InputError
         If there is no such edge, or none is found.
     """
-    given = None if edge is None else resolution.parse_edge(edge)
-    found = resolution.measure(image, edge=given, band=band, allow_network=allow_network)
-    document, stem = resolution.document(found, image, band), Path(image).stem
+    ends = None if edge is None else resolution.parse_edge(edge)
+    result = resolution.measure(image, edge=ends, band=band, allow_network=allow_network)
+    document, stem = resolution.document(result, image, band), Path(image).stem
     files = (
         {}
         if folder is None
@@ -181,7 +181,7 @@ def edge(
     )
     if files:
         write_json(files["json"], document)
-        write_text(files["svg"], resolution.plot(resolution.typical(found)).svg(alone=True) + "\n")
+        write_text(files["svg"], resolution.plot(resolution.typical(result)).svg(alone=True) + "\n")
     return Result(files, document, resolution.text(document))
 
 
@@ -201,9 +201,9 @@ def dem_check(
     points : path
         CSV or GeoJSON with x, y and h.
     crs, vertical : str, optional
-        What they are in, where the file does not say it.
+        CRS and datum of the points, if the file does not state them.
     surface : SurfaceOptions
-        How the heights of the DEM are to be understood.
+        Height datum of the DEM.
 
     Raises
     ------
@@ -213,19 +213,19 @@ def dem_check(
     ground, plane, ids = dem_accuracy.read_check_heights(points, crs, vertical)
     extent = extent_of(ground_transform(plane, "EPSG:4979")(ground)[:, :2])
     heights = dem_as_stated(heights_given(dem_file, scene), surface, scene, extents=[] if extent is None else [extent])
-    found = dem_accuracy.check_dem(heights, ground, plane, ids)
-    if not found.overall.count:
+    result = dem_accuracy.check_dem(heights, ground, plane, ids)
+    if not result.overall.count:
         raise InputError(
             f"none of the {counted(len(ids), 'check point')} has a height in this DEM",
             file=dem_file,
             field="points",
-            remedy="check the CRS of the points, and whether they lie on the DEM",
+            remedy="check the CRS of the points and the extent of the DEM",
         )
     document = {
         "dem": str(dem_file),
         "check_points": str(points),
         "surface": dict(heights.provenance),
-        **found.to_json(),
+        **result.to_json(),
     }
     return Result({}, document, dem_accuracy.summary(document))
 
@@ -261,19 +261,19 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
 
 
 def kept_files(*, verify: bool = False) -> dict[str, Any]:
-    """Return the files that are kept of the network: folder, and address, path, bytes and SHA-256 of each.
+    """Return the cached downloads: folder, and address, path, bytes and SHA-256 of each.
 
     With `verify` also their state: sound, damaged, of another size, missing.
     """
     files = [
-        {"address": one.address, "path": str(one.path), "bytes": one.bytes, "sha256": one.sha256}
-        | ({"state": one.state()} if verify else {})
-        for one in kept.records()
+        {"address": record.address, "path": str(record.path), "bytes": record.bytes, "sha256": record.sha256}
+        | ({"state": record.state()} if verify else {})
+        for record in kept.records()
     ]
     return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": files}
 
 
 def forget_kept_files() -> dict[str, Any]:
-    """Remove the files that are kept of the network; return how many, and of how many bytes."""
+    """Delete the cached downloads; return their number and bytes."""
     count, size = kept.clear()
     return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": count, "bytes": size}

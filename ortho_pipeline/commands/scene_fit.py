@@ -35,9 +35,9 @@ from ortho_pipeline.surface.base import Surface
 
 #: A delivered model that is so many image sizes off belongs to another place, or reads its metadata wrongly.
 _ELSEWHERE = 3.0
-#: Measured points that together say where a reference lies, and by how many sigmas of their mean they have to.
+#: Number of measured points that locate a reference, and significance of their mean in sigmas.
 _AGREE, _SIGMAS = 3, 4.0
-#: How far (in parts of their own extent) beyond the points the DEM is asked for its range of heights.
+#: Margin around the points, as a share of their extent, for the height range of the DEM.
 _MARGIN = 0.25
 
 
@@ -79,62 +79,66 @@ class Adjusted:
 
     @property
     def matching(self) -> MatchingRecord | None:
-        """What was matched, and what its points say of the fit; None where nothing was."""
+        """The matches, with the test of the fit at them; None without matching."""
         return None if self.matched is None else self.matched.tested_by(self.fit)
 
     def warnings(self, surface: Surface | None) -> tuple[Notice, ...]:
-        """Return what people ought to know before they trust the numbers."""
+        """Return the notices to read before the numbers are trusted."""
         scene, adjusted, points = self.scene, self.fit, self.fit.points
         unsuited = [name for name in scene.models if name in scene.unsuited]
-        found = [*scene.notices, *(Notice("unsuited-model", scene.unsuited[name], model=name) for name in unsuited)]
-        found += adjusted.warnings
+        notices = [*scene.notices, *(Notice("unsuited-model", scene.unsuited[name], model=name) for name in unsuited)]
+        notices += adjusted.warnings
         if surface is not None:
-            found += surface.provenance.get("warnings", [])
+            notices += surface.provenance.get("warnings", [])
         if self.matched is not None:
-            found += self.matched.notices
-        found += self.notes
-        found += self._doubtful()
-        found += marks_warning(points.select(adjusted.used & points.control))
+            notices += self.matched.notices
+        notices += self.notes
+        notices += self._doubtful()
+        notices += marks_warning(points.select(adjusted.used & points.control))
         inside = ((points.image >= 0) & (points.image <= (scene.width, scene.height))).all(axis=1)
         if not inside.all():
             outside = np.array(points.ids)[~inside].tolist()
-            text = f"points outside of the image (used all the same): {', '.join(outside)}"
-            found.append(Notice("outside-of-image", text, points=outside))
-        found += self._elsewhere()
+            text = f"points outside the image, but used: {', '.join(outside)}"
+            notices.append(Notice("outside-of-image", text, points=outside))
+        notices += self._elsewhere()
         if len(adjusted.param_names):
-            found += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
+            notices += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
-            text = "no redundancy: the RMSE of the control points is zero by construction and says nothing"
-            found.append(Notice("no-redundancy", text))
+            text = "no redundancy: the RMSE of the control points is zero by construction and proves nothing"
+            notices.append(Notice("no-redundancy", text))
         checks = int(points.check.sum())
         if len(points) and checks < ENOUGH_CHECK_POINTS:
-            found.append(few_check_points(checks))
+            notices.append(few_check_points(checks))
         if self.removed:
-            names = ", ".join(f"{one.name} (t {one.t:.1f})" for one in self.removed)
-            text = f"parameters that the points do not justify were removed: {names}"
-            found.append(Notice("parameters-removed", text, parameters=[one.name for one in self.removed]))
-        return tuple(dict.fromkeys(found))
+            names = ", ".join(f"{parameter.name} (t {parameter.t:.1f})" for parameter in self.removed)
+            text = f"removed parameters that the points do not justify: {names}"
+            notices.append(
+                Notice("parameters-removed", text, parameters=[parameter.name for parameter in self.removed])
+            )
+        return tuple(dict.fromkeys(notices))
 
     def _doubtful(self) -> list[Notice]:
-        """Return a notice for each point left out, and each that contradicts the others unless one of all says it."""
+        """Return a notice for each rejected point, and each that contradicts the others without a common notice."""
         left = [
-            Notice("left-out", f"point {name} was left out: {reason}", point=name, reason=reason)
+            Notice("left-out", f"point {name} was rejected: {reason}", point=name, reason=reason)
             for name, reason in self.fit.rejected
         ]
-        told = {name for one in self.fit.warnings if one.code == "checks-apart" for name in one.fields["points"]}
+        named = {
+            name for notice in self.fit.warnings if notice.code == "checks-apart" for name in notice.fields["points"]
+        }
         return left + [
             Notice(
                 "contradicting-point",
-                f"{one.role} point {one.id} contradicts the others: {one.reason}",
-                point=one.id,
-                role=one.role,
+                f"{notice.role} point {notice.id} contradicts the others: {notice.reason}",
+                point=notice.id,
+                role=notice.role,
             )
-            for one in self.fit.outlying
-            if one.role == "control" or one.id not in told
+            for notice in self.fit.outlying
+            if notice.role == "control" or notice.id not in named
         ]
 
     def _elsewhere(self) -> list[Notice]:
-        """Return a warning if the points say that the model, as delivered, shows quite another place."""
+        """Return a warning if the delivered model shows another place than the points."""
         bias = self.fit.raw_bias
         if bias is None or self.fit.model_name in {family.name for family in families()}:
             return []
@@ -142,14 +146,14 @@ class Adjusted:
         if not sizes > _ELSEWHERE:
             return []
         text = (
-            f"the model as delivered is {sizes:.3g} image sizes away from the points: points or metadata of another "
-            "scene, longitude and latitude exchanged, or an angle of another sign or unit"
+            f"the delivered model is {sizes:.3g} image sizes away from the points. Possible causes: points or metadata "
+            "of another scene, swapped longitude and latitude, or an angle with the wrong sign or unit"
         )
         return [Notice("model-elsewhere", text, image_sizes=sizes)]
 
 
 def adjustable(request: Request) -> Resolved:
-    """Resolve a request whose model is to be adjusted; where a model family is fitted, the image needs no model.
+    """Resolve a request for an adjustment; to fit a model family, the image needs no model.
 
     Raises
     ------
@@ -161,13 +165,13 @@ def adjustable(request: Request) -> Resolved:
     if points.fit_model is None:
         if points.model_crs is not None:
             raise InputError(
-                Text(Setting("points.model_crs"), " is the ground CRS of a fitted model"),
+                Text(Setting("points.model_crs"), " is only for fitted models"),
                 field="points.model_crs",
                 remedy=Text("give ", Setting("points.fit_model")),
             )
         if points.ridge != "auto":
             raise InputError(
-                Text(Setting("points.ridge"), " regularises a fitted model"),
+                Text(Setting("points.ridge"), " is only for fitted models"),
                 field="points.ridge",
                 remedy=Text("give ", Setting("points.fit_model")),
             )
@@ -177,24 +181,24 @@ def adjustable(request: Request) -> Resolved:
         raise InputError(
             Text(
                 Setting("points.fit_model"),
-                " takes the place of the image's own model, ",
+                " replaces the image's own model, and ",
                 Setting(other),
-                " starts from it",
+                " needs it",
             ),
             field="points.fit_model",
             remedy=Text("leave out one of ", Setting("points.fit_model"), " and ", Setting(other)),
         )
     if not request.has_control:
         raise InputError(
-            "a model is fitted to points",
+            "a fitted model needs control points",
             field="points.gcps",
             remedy=Text("give a file of points with ", Setting("points.gcps")),
         )
     if points.fit_model not in {family.name for family in families()}:
         raise InputError(
-            f"no model is called {points.fit_model!r}",
+            f"there is no model {points.fit_model!r}",
             field="points.fit_model",
-            remedy=f"one of {', '.join(family.name for family in families())} (see `ortho models`)",
+            remedy=f"use one of {', '.join(family.name for family in families())} (see `ortho models`)",
         )
     return resolve(request, needs_model=False)
 
@@ -202,7 +206,7 @@ def adjustable(request: Request) -> Resolved:
 def adjust(resolved: Resolved) -> Adjusted:
     """Adjust the model of a scene, or fit the family of the options to the points alone.
 
-    Without points nothing is adjusted, and the model is as it was delivered.
+    Without points the delivered model is used.
 
     Raises
     ------
@@ -235,25 +239,27 @@ def adjust(resolved: Resolved) -> Adjusted:
 
 
 def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
-    """Return a notice if control was matched, here or by `ortho match`: it does not say where the reference lies."""
+    """Return a notice if control was matched, here or by `ortho match`: accuracy is then relative."""
     count, control = int((adjusted.points.groups[adjusted.used] >= 0).sum()), int(adjusted.used.sum())
     if not count:
         return []
     sigma = float(adjusted.points.sigma_common[adjusted.used].max()) or match.reference_sigma
-    part = "all control was matched" if count == control else f"{count} of {control} control points were matched"
+    part = (
+        "all control points were matched" if count == control else f"{count} of {control} control points were matched"
+    )
     common = adjusted.common_error
-    floor = "how accurate that is was not stated"
+    floor = "The accuracy of the reference is not stated"
     if sigma:
-        floor = f"its own {metres(sigma)} per axis are the floor of all residuals"
+        floor = f"The reference is accurate to {metres(sigma)} per axis, which the residuals do not show"
     if common is not None:
-        floor += ", and in the sigmas of the parameters"
+        floor += " but the sigmas of the parameters include"
     text = (
-        f"{part}: the accuracy is relative to the reference, and {floor}; an error that scene and reference have in "
-        "common is not seen"
+        f"accuracy is relative to the reference, because {part}. {floor}. An error common to scene and reference "
+        "cannot be detected"
     )
     if common is not None and common.value.any():
         east, north = common.value * common.sigma
-        text += f"; the other points put the reference {east:+.2f} m along x and {north:+.2f} m along y"
+        text += f". The other points place the reference {east:+.2f} m along x and {north:+.2f} m along y"
     relative = Notice(
         "relative-to-reference",
         text,
@@ -267,16 +273,16 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
         return [relative]
     east, north = off.mean(axis=0).tolist()
     text = (
-        f"{counted(len(off), 'measured point')} that took no part put the reference {east:+.2f} m along x and "
-        f"{north:+.2f} m along y, and the ortho lies where it does"
+        f"{counted(len(off), 'measured check point')} show that the reference, and so the ortho, is displaced by "
+        f"{east:+.2f} m along x and {north:+.2f} m along y"
     )
     return [relative, Notice("reference-displaced", text, reference_off_m=[east, north], points=len(off))]
 
 
 def _reference_off(adjusted: Fit) -> Array | None:
-    """Return by how much (m, x and y) each measured check point puts the reference off, if they agree that it is."""
+    """Return the displacement (m, x and y) of the reference at each check point, if it is significant."""
     points = adjusted.points
-    measured = points.tests & (points.groups < 0) & ~np.isin(points.ids, [one.id for one in adjusted.outlying])
+    measured = points.tests & (points.groups < 0) & ~np.isin(points.ids, [point.id for point in adjusted.outlying])
     shifts = in_metres(adjusted, adjusted.residuals)[measured]
     shifts = shifts[np.isfinite(shifts).all(axis=1)]
     if len(shifts) < _AGREE:
@@ -286,7 +292,7 @@ def _reference_off(adjusted: Fit) -> Array | None:
 
 
 def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
-    """Return the correction that many matches justify, as `ortho compare` recommends it, and what people read of it.
+    """Return the correction that many matches justify, as `ortho compare` recommends it, and a notice.
 
     Of shift, shift-drift, affine, and the model's own parameters where it has some, the one with the fewest parameters
     whose error is expected to be within 2 % of the smallest over the scene.
@@ -297,9 +303,8 @@ def by_matches(scene: Scene, points: Points) -> tuple[str, Notice]:
     compared = comparing.compare(points, tuple(names), own=own, priors=scene.priors, size=(scene.width, scene.height))
     chosen = "shift" if compared.recommended is None else names[compared.recommended]
     text = Text(
-        "the correction was chosen by the matches (",
+        f"correction {chosen!r} chosen automatically: {compared.recommendation.reason}. Choose another with ",
         Setting("points.correction"),
-        f" chooses another): {compared.recommendation.reason}",
     )
     return chosen, Notice("correction-by-matches", text, correction=chosen)
 
@@ -315,7 +320,7 @@ def _corrected(
     scene: Scene, options: PointOptions, is_delivered: bool, points: Points, surface: Surface | None
 ) -> Adjusted:
     if options.correction != OWN:
-        # What adjusts its own parameters may start anywhere.
+        # A model that adjusts its own parameters may start anywhere.
         refuse_swapped(scene.shared_model, points, scene.height)
     points = with_heights(points, surface)
     correction = options.correction
@@ -323,9 +328,9 @@ def _corrected(
         correction = "shift" if points.control.any() and is_delivered else "none"
     elif correction != "none" and not is_delivered:
         raise InputError(
-            "a model file is an adjusted model: adjusting it again would count points twice",
+            "this model is already adjusted; adjusting it again would count points twice",
             field="points.correction",
-            remedy=Text("adjust the scene's own model with all points (leave out ", Setting("scene.model"), ")"),
+            remedy=Text("leave out ", Setting("scene.model"), " to adjust the delivered model with all points"),
         )
     if correction == OWN:
         scene = _by_own_parameters(scene)
@@ -337,7 +342,7 @@ def _corrected(
 
 
 def _by_own_parameters(scene: Scene) -> Scene:
-    """Return the scene with the first of its models that has parameters in front, such as a pushbroom beside an RPC."""
+    """Return the scene with its first model that has parameters in front, such as a pushbroom before an RPC."""
     chosen = scene.adjustable
     if chosen is None or scene.models[chosen] is scene.model:
         return scene
@@ -364,7 +369,7 @@ def _from_points(scene: Scene, options: PointOptions, points: Points, surface: S
 
 
 def heights_where_wanted(points: Points, surface: Surface | None, *names: str) -> Points:
-    """Fill missing heights from the surface; without one they are an error unless only 2D models are fitted."""
+    """Fill missing heights from the surface; without one they are an error unless all models are 2D."""
     flat = {family.name for family in families() if family.dimensions == 2}
     if surface is None and set(names) <= flat:
         return points
@@ -372,7 +377,7 @@ def heights_where_wanted(points: Points, surface: Surface | None, *names: str) -
 
 
 def heights_around(points: Points, surface: Surface | None) -> tuple[float, float] | None:
-    """Return the lowest and highest terrain about the points (m), None where no surface says."""
+    """Return the lowest and highest terrain around the points (m); None without a surface there."""
     if surface is None or not len(points):
         return None
     plan = np.column_stack([points.ground[:, :2], np.zeros(len(points))])

@@ -29,7 +29,7 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
 
     Columns are those of CSV files: `col` and `row` (px, from the outer corner of the first pixel), `h` (metres above
     the ellipsoid, NaN if not given), `role`, and standard deviations. The geometry is x, y in the CRS of the points.
-    GeoPandas is needed (``pip install 'ortho-pipeline[geopandas]'``).
+    It needs GeoPandas (the extra ``geopandas``).
 
     Raises
     ------
@@ -48,7 +48,7 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
         raise InputError(
             "a GeoDataFrame needs GeoPandas, which is not installed",
             field="points",
-            remedy="pip install 'ortho-pipeline[geopandas]'",
+            remedy="run pip install '.[geopandas]' in the checkout of ortho-pipeline",
         ) from error
     columns: dict[str, Any] = {
         "id": list(points.ids),

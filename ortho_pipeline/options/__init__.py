@@ -11,7 +11,6 @@ from ortho_pipeline.options.block import BlockOptions
 from ortho_pipeline.options.groups import (
     GROUPS,
     MatchOptions,
-    OutputOptions,
     PointOptions,
     PointTable,
     SceneOptions,
@@ -32,6 +31,7 @@ from ortho_pipeline.options.option import (
     numbers_of,
     options_of,
 )
+from ortho_pipeline.options.output import OutputOptions
 
 __all__ = [
     "CORRECTIONS",

@@ -12,16 +12,16 @@ from ortho_pipeline.options.texts import Setting, Text
 @documented
 @dataclass(frozen=True)
 class BlockOptions:
-    """Which points of a block there are, and what is adjusted to them.
+    """Points of a block, and what to adjust to them.
 
-    `model` is a name among the models of each scene, or a family that is fitted to the control points of each image.
+    `model` names a model of each scene, or a family to fit to the control points of each image.
     """
 
     points: Annotated[
         PathLike | None,
         Option(
             "--points",
-            "Rays: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
+            "Image points: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
             "FILE",
         ),
     ] = None
@@ -29,16 +29,18 @@ class BlockOptions:
         str | None,
         Option(
             "--ties",
-            Text("Find tie points between the images by matching, besides those of ", Setting("points.points"), "."),
+            Text("Find tie points by matching the images, in addition to those of ", Setting("points.points"), "."),
             choices=("auto",),
         ),
     ] = None
     gcps: Annotated[
-        PathLike | None, Option("--gcps", "Ground of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
+        PathLike | None, Option("--gcps", "Ground coordinates of the points: CSV (id,x,y,h,...) or GeoJSON.", "FILE")
     ] = None
-    crs: Annotated[str | None, Option("--points-crs", "CRS of the ground, where its file has none.", "CRS")] = None
+    crs: Annotated[
+        str | None, Option("--points-crs", "CRS of the ground coordinates, if their file does not state it.", "CRS")
+    ] = None
     vertical: Annotated[
-        str | None, Option("--points-vertical", f"Height datum of the ground: {VERTICAL_FORMS}.", "DATUM")
+        str | None, Option("--points-vertical", f"Height datum of the ground coordinates: {VERTICAL_FORMS}.", "DATUM")
     ] = None
     pixel_origin: Annotated[str, PIXEL_ORIGIN] = "corner"
     check: Annotated[str | None, CHECK] = None
@@ -46,7 +48,7 @@ class BlockOptions:
         str | None,
         Option(
             "--model",
-            "One of the images' models, such as rpc or pushbroom, or a model fitted to points (see 'ortho models').",
+            "A model of the images, such as rpc or pushbroom, or one to fit to points; 'ortho models' lists these.",
             "NAME",
             unset="the images' best",
         ),
@@ -55,8 +57,8 @@ class BlockOptions:
         str | None,
         Option(
             "--correction",
-            "What is adjusted: the image points, or the parameters of the model itself.",
-            unset="the model's own if it has any, else a shift",
+            "What to adjust: image coordinates (shift, shift-drift, affine), or the parameters of the model (model).",
+            unset="the model's own parameters if it has any, else a shift",
             choices=CORRECTIONS,
         ),
     ] = None
@@ -64,7 +66,7 @@ class BlockOptions:
         str | None,
         Option(
             "--ground-sigma",
-            "Sigmas (m) in plan and height of ground that states none in the points file.",
+            "Standard deviations (m) in plan and height of ground coordinates whose file states none.",
             "XY[,H]",
             unset="estimated",
         ),
@@ -74,18 +76,18 @@ class BlockOptions:
         float | None,
         Option(
             "--hold",
-            "Hold the orientation at its start values with this sigma.",
+            "Keep the orientation near its start values, with this sigma.",
             "PX",
             kind="number",
             above=0,
-            unset="10 where nothing else gives a datum",
+            unset="10 if nothing else defines the datum",
         ),
     ] = None
     dem_heights: Annotated[
         str,
         Option(
             "--dem-heights",
-            Text("Use the heights of ", Setting("surface.dem"), " as observations of the ties, or only to match."),
+            Text("Use the heights of ", Setting("surface.dem"), " as observations of the ties, or only for matching."),
             choices=("on", "off"),
         ),
     ] = "on"
@@ -93,28 +95,28 @@ class BlockOptions:
         float | None,
         Option(
             "--dem-bias",
-            "Standard deviation of an error that all heights of the DEM share.",
+            "Standard deviation of the error that all heights of the DEM have in common.",
             "M",
             kind="number",
-            unset="that of a single height",
+            unset="standard deviation of a single height",
         ),
     ] = None
     dem_correlation: Annotated[
         float | None,
         Option(
             "--dem-correlation",
-            "Distance over which DEM errors are correlated, by exp(-d / M).",
+            "Distance over which the errors of the DEM are correlated, as exp(-d / M).",
             "M",
             kind="number",
             above=0,
-            unset="each sample of the DEM has its own error",
+            unset="errors of the samples are independent",
         ),
     ] = None
     dem_shift_sigma: Annotated[
         float | None,
         Option(
             "--dem-shift-sigma",
-            "Standard deviation of the horizontal position of the DEM, in each axis.",
+            "Standard deviation of the horizontal position of the DEM, per axis.",
             "M",
             kind="number",
             unset="half a sample",
@@ -124,7 +126,7 @@ class BlockOptions:
         float,
         Option(
             "--join-limit",
-            "Warn if the relative position of two images with common points has a larger sigma.",
+            "Warn if the relative position of two images with common points is less certain than this.",
             "PX",
             kind="number",
             above=0,

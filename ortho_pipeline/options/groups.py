@@ -6,54 +6,53 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Protocol
 
-from ortho_pipeline.options.option import (
-    CORRECTIONS,
-    PIXEL_ORIGINS,
-    PIXEL_TYPES,
-    RESAMPLING,
-    Option,
-    PathLike,
-    documented,
-)
+from ortho_pipeline.options.option import CORRECTIONS, PIXEL_ORIGINS, Option, PathLike, documented
+from ortho_pipeline.options.output import OutputOptions
 from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented
 @dataclass(frozen=True)
 class SceneOptions:
-    """How the image is opened."""
+    """How to open the image."""
 
     sensor: Annotated[
-        str | None, Option("--sensor", "Sensor of the image (see 'ortho sensors').", "NAME"),
-    ] = None  # fmt: skip
+        str | None,
+        Option("--sensor", "Sensor of the image; 'ortho sensors' lists them.", "NAME"),
+    ] = None
     rpc: Annotated[
         str | None,
-        Option("--rpc", "Which RPC, where there are several, or an RPC file.", "tag|sidecar|FILE"),
+        Option("--rpc", "Which RPC to use, if there are several, or an RPC file.", "tag|sidecar|FILE"),
     ] = None
     model: Annotated[
-        PathLike | None, Option("--model", "A saved *_model.json in place of the image's model.", kind="file")
+        PathLike | None, Option("--model", "Use this saved *_model.json instead of the image's own model.", kind="file")
     ] = None
     crop_offset: Annotated[
         Sequence[float] | None,
         Option(
-            "--crop-offset", "First pixel of this image in the one that its model belongs to, where it is a crop.",
-            "COL,ROW", kind="pair",
+            "--crop-offset",
+            "If the image is a crop: position of its first pixel in the full image.",
+            "COL,ROW",
+            kind="pair",
         ),
-    ] = None  # fmt: skip
+    ] = None
     sensor_options: Annotated[
         Mapping[str, str],
-        Option("--sensor-option", "Option of the sensor (see 'ortho sensors').", "K=V", kind="keys"),
+        Option("--sensor-option", "Option of the sensor; 'ortho sensors' lists them.", "K=V", kind="keys"),
     ] = field(default_factory=dict)
     allow_network: Annotated[
-        bool, Option("--allow-network", "Open URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
+        bool, Option("--allow-network", "Allow URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
     ] = False
     roots: Annotated[
         Sequence[PathLike],
         Option(
-            "--root", "A folder that files may lead to (a VRT), besides their own.", "DIR", kind="folders",
+            "--root",
+            "Also allow files in this folder, for example the sources of a VRT.",
+            "DIR",
+            kind="folders",
             in_file=False,
         ),
-    ] = ()  # fmt: skip
+    ] = ()
 
     @property
     def access(self) -> dict[str, Any]:
@@ -62,14 +61,14 @@ class SceneOptions:
 
     @property
     def files(self) -> dict[str, str | os.PathLike[str]]:
-        """Files besides the image that the scene is read from, by what they are."""
-        given = {name: value for name, value in self.sensor_options.items() if _is_file(value)}
+        """Files that the scene is read from, apart from the image, by role."""
+        sensor_files = {name: value for name, value in self.sensor_options.items() if _is_file(value)}
         own = {"RPC": self.rpc, "model": self.model}
-        return {**{role: path for role, path in own.items() if path is not None}, **given}
+        return {**{role: path for role, path in own.items() if path is not None}, **sensor_files}
 
 
 def _is_file(value: object) -> bool:
-    """Tell whether a text names a file, on disk or as GDAL names those in an archive."""
+    """Return whether a text names a file, on disk or in an archive as GDAL writes it."""
     return isinstance(value, str | os.PathLike) and (os.fspath(value).startswith("/vsi") or os.path.isfile(value))
 
 
@@ -82,37 +81,39 @@ class PointTable(Protocol):
     def source(self) -> str: ...
 
 
-#: Chips are held in memory, and more matches say no more of a model.
+#: Chips are held in memory, and more matches do not improve a model.
 _MOST_MATCHES = 100_000
 VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n or a grid file"
 PIXEL_ORIGIN = Option(
     "--pixel-origin",
-    "What CSV, ODM and link files call the first pixel: its outer corner or its centre (0, 0), or its corner or its "
-    "centre (1, 1).",
+    "What (0, 0) is in CSV, ODM and link files: the outer corner or the centre of the first pixel. With -1, that "
+    "place is (1, 1).",
     choices=tuple(PIXEL_ORIGINS),
 )
-CHECK = Option("--check", "Points that check and do not control.", "every:N|ids:A,B")
-MODEL_CRS = "Ground of fitted models: geocentric, geographic, utm or EPSG:n."
+CHECK = Option("--check", "Reserve these points as check points: every Nth, or by id.", "every:N|ids:A,B")
+MODEL_CRS = "Ground CRS of fitted models: geocentric, geographic, utm or EPSG:n."
 
 
 @documented
 @dataclass(frozen=True)
 class PointOptions:
-    """Which points there are, and what is adjusted to them.
+    """Points, and what to adjust to them.
 
-    `gcps` may be points that are read already, in pixels of this image, too.
+    `gcps` may also be a table of points that is already read, in pixels of this image.
     """
 
     gcps: Annotated[
         PathLike | PointTable | None,
         Option(
             "--gcps",
-            "Points: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp, ArcGIS link table; or 'own' "
-            "for those in the image.",
+            "Points file: CSV, GeoJSON, QGIS .points, ODM gcp_list.txt, ENVI .pts, ASP .gcp or ArcGIS link table. "
+            "'own' takes the GCPs stored in the image.",
             "FILE|own",
         ),
     ] = None
-    crs: Annotated[str | None, Option("--points-crs", "CRS of the points, where their file has none.", "CRS")] = None
+    crs: Annotated[str | None, Option("--points-crs", "CRS of the points, if their file does not state it.", "CRS")] = (
+        None
+    )
     vertical: Annotated[
         str | None, Option("--points-vertical", f"Height datum of the points: {VERTICAL_FORMS}.", "DATUM")
     ] = None
@@ -121,16 +122,17 @@ class PointOptions:
     select: Annotated[
         str | None,
         Option(
-            "--select", "Points that control: N well spread, N of one region, these, or N at random; all others check.",
+            "--select",
+            "Points to use as control: N well spread, N of one region, by id, or N at random. All others check.",
             "even:N|cluster:N|ids:A,B|random:N:SEED",
         ),
-    ] = None  # fmt: skip
+    ] = None
     correction: Annotated[
         str | None,
         Option(
             "--correction",
-            "What is adjusted: the image points, or the parameters of the model itself, such as the exterior "
-            "orientation of a frame.",
+            "What to adjust: image coordinates (shift, shift-drift, affine), or the parameters of the model "
+            "(model), such as the exterior orientation of a frame.",
             unset="shift if there are control points",
             choices=CORRECTIONS,
         ),
@@ -139,46 +141,54 @@ class PointOptions:
         str | None,
         Option(
             "--fit-model",
-            "Fit a model from the points alone (see 'ortho models'), in place of the image's own.",
+            "Fit this model to the points instead of using the image's own; 'ortho models' lists them.",
             "NAME",
         ),
     ] = None
-    model_crs: Annotated[
-        str | None, Option("--model-crs", MODEL_CRS, "CRS", unset="that of the points")
-    ] = None  # fmt: skip
+    model_crs: Annotated[str | None, Option("--model-crs", MODEL_CRS, "CRS", unset="CRS of the points")] = None
     prune: Annotated[bool, Option("--prune", "Remove parameters that the points do not justify.")] = False
-    params: Annotated[str | None, Option("--params", "Adjust these parameters only.", "A,B,C", unset="all")] = None
+    params: Annotated[str | None, Option("--params", "Adjust only these parameters.", "A,B,C", unset="all")] = None
     significance: Annotated[
         float,
         Option(
-            "--significance", "Above this chance (p) a parameter is not justified.", kind="number", above=0, below=1
+            "--significance",
+            "Significance level: a parameter with a larger p is not justified.",
+            "P",
+            kind="number",
+            above=0,
+            below=1,
         ),
-    ] = 0.05  # fmt: skip
+    ] = 0.05
     ridge: Annotated[
         str,
-        Option("--ridge", "Regularisation of fitted models: found, or of this weight.", "auto|none|gcv|lcurve|W"),
+        Option("--ridge", "Regularisation of fitted models: a method, or a weight W.", "auto|none|gcv|lcurve|W"),
     ] = "auto"
     near: Annotated[
         float | None,
         Option(
-            "--near", "Points closer than this are neighbours in the analysis of residuals.", "M",
-            kind="number", above=0,
+            "--near",
+            "Analysis of residuals: points closer than this are neighbours.",
+            "M",
+            kind="number",
+            above=0,
         ),
-    ] = None  # fmt: skip
+    ] = None
 
 
 @documented
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Where heights come from: a DEM, or one ellipsoidal height in metres."""
+    """Where the heights come from: a DEM, or one ellipsoidal height in metres."""
 
     dem: Annotated[
         PathLike | None,
         Option(
-            "--dem", "Digital elevation model: a file, a pattern of the files that make one, a STAC item or "
-            "collection, or 'auto' for the cells of the Copernicus DEM under the scene.", "FILE|URL|auto",
+            "--dem",
+            "DEM: a file, a pattern of files, or a STAC item or collection. 'auto' takes the cells of the Copernicus "
+            "DEM under the scene.",
+            "FILE|URL|auto",
         ),
-    ] = None  # fmt: skip
+    ] = None
     vertical: Annotated[
         str | None, Option("--dem-vertical", f"Height datum of the DEM: {VERTICAL_FORMS}.", "DATUM")
     ] = None
@@ -186,221 +196,100 @@ class SurfaceOptions:
         bool,
         Option(
             "--override-dem-vertical",
-            Text("Believe ", Setting("surface.vertical"), " even where the DEM declares another datum."),
+            Text("Use ", Setting("surface.vertical"), " even if the DEM declares another datum."),
         ),
     ] = False
     fill: Annotated[
         str,
         Option(
             "--dem-fill",
-            "Where the DEM has no height: stop, leave pixels out, take the nearest, or an ellipsoidal height.",
+            "Gaps in the DEM: stop with an error, mask the pixels, take the nearest height, or ellipsoidal height M.",
             "error|mask|nearest|M",
             kind="number or word",
         ),
     ] = "error"
     height: Annotated[
-        float | None, Option("--height", "One ellipsoidal height, no DEM.", "M", kind="number")
-    ] = None  # fmt: skip
+        float | None,
+        Option("--height", "Flat ground at this ellipsoidal height, instead of a DEM.", "M", kind="number"),
+    ] = None
     sigma: Annotated[
         float | PathLike | None,
         Option(
-            "--dem-sigma", "Standard deviation of the heights, metres: a number or a raster, such as Copernicus' HEM.",
-            "M|FILE", kind="number or word", unset="unknown",
+            "--dem-sigma",
+            "Accuracy of the heights (standard deviation): a number, or a raster such as Copernicus' HEM.",
+            "M|FILE",
+            kind="number or word",
+            unset="unknown",
         ),
-    ] = None  # fmt: skip
+    ] = None
     source: Annotated[
         PathLike | None,
         Option(
-            "--dem-source", Text(
-                "Where ", Setting("surface.dem", "auto"),
-                " finds cells: a folder of them, or an address (https, s3, gs, az)."
-            ), "DIR|URL", unset="the environment variable ORTHO_DEM_SOURCE, or the public bucket",
-        ),
-    ] = None  # fmt: skip
-
-
-@documented
-@dataclass(frozen=True)
-class OutputOptions:
-    """Form of the ortho, and how it is computed.
-
-    `memory` is in bytes.
-    """
-
-    crs: Annotated[str | None, Option("--output-crs -t_srs", metavar="CRS", unset="the UTM zone of the scene")] = None
-    resolution: Annotated[
-        float | Sequence[float] | None,
-        Option(
-            "--resolution -tr", "Pixel size in units of the output CRS.", "X [Y]", unset="the ground sample distance",
-            kind="one or two", above=0,
-        ),
-    ] = None  # fmt: skip
-    extent: Annotated[
-        Sequence[float] | None,
-        Option(
-            "--extent -te", "Bounds of the ortho, taken as they are.", "XMIN YMIN XMAX YMAX", kind="box",
-            unset="the scene's footprint",
-        ),
-    ] = None  # fmt: skip
-    like: Annotated[
-        PathLike | None,
-        Option(
-            "--like", "Take CRS, resolution and extent from this raster, so that pixels fall on pixels.", "RASTER",
-            kind="file",
-        ),
-    ] = None  # fmt: skip
-    align: Annotated[
-        bool, Option("--align -tap", Text("Widen ", Setting("output.extent"), " to whole multiples of the resolution."))
-    ] = False  # fmt: skip
-    resampling: Annotated[str, Option("--resampling -r", choices=RESAMPLING)] = "bilinear"
-    bands: Annotated[
-        Sequence[int] | None,
-        Option(
-            "--band -b", "Only these bands of the image, from 1, in this order.", "N[,...]", unset="all",
-            kind="integers", above=0,
-        ),
-    ] = None  # fmt: skip
-    dtype: Annotated[
-        str | None,
-        Option(
-            "--output-type -ot", "Type of the pixels; values beyond its range are clamped.", "|".join(PIXEL_TYPES),
-            unset="that of the image", choices=PIXEL_TYPES,
-        ),
-    ] = None  # fmt: skip
-    nodata: Annotated[
-        float | str | None,
-        Option(
-            "--nodata -dstnodata", "Value of pixels without an image.", "VALUE", kind="number or nan",
-            unset="that of the image, or a mask",
-        ),
-    ] = None  # fmt: skip
-    dem_interpolation: Annotated[
-        str, Option("--dem-interpolation", "Between the samples of the DEM.", choices=("bilinear", "cubic"))
-    ] = "bilinear"
-    format: Annotated[str, Option("--format -of", choices=("COG", "GTiff"))] = "COG"
-    creation_options: Annotated[
-        Mapping[str, str], Option("--creation-option -co", "Option of GDAL's driver.", "K=V", kind="keys")
-    ] = field(default_factory=dict)
-    engine: Annotated[
-        str,
-        Option(
-            "--engine", "Our warper, or GDAL's with its own transformers, exactly (slow; for comparison).",
-            choices=("ortho", "gdal"),
-        ),
-    ] = "ortho"  # fmt: skip
-    memory: Annotated[
-        int,
-        Option(
-            "--memory -wm", "Bound on windows and caches; or with a unit, such as 2GB.", "MB", kind="bytes",
-            in_file=False,
-        ),
-    ] = 512_000_000  # fmt: skip
-    threads: Annotated[
-        int | None, Option("--threads", unset="all processors", kind="integer", above=0, in_file=False)
-    ] = None
-    tolerance: Annotated[
-        float,
-        Option(
-            "--tolerance", "Bound on the warper's geometric error, in source pixels.", "PX", kind="number", above=0
-        ),
-    ] = 0.01  # fmt: skip
-    accuracy_raster: Annotated[
-        bool,
-        Option(
-            "--accuracy-raster", Text(
-                "Write a raster of how accurate the ortho is at each place; ", Setting("surface.sigma"),
-                " says how good the heights are."
+            "--dem-source",
+            Text(
+                "Where ",
+                Setting("surface.dem", "auto"),
+                " looks for cells: a folder, or an address (https, s3, gs, az).",
             ),
+            "DIR|URL",
+            unset="environment variable ORTHO_DEM_SOURCE, else the public bucket",
         ),
-    ] = False  # fmt: skip
-    visibility: Annotated[
-        str | None,
-        Option(
-            "--visibility", "Look for ground that other terrain hides: write a mask of it, or leave its pixels empty "
-            "(with a surface model a true ortho).", choices=("mask", "nodata"),
-        ),
-    ] = None  # fmt: skip
-    fill_from: Annotated[
-        PathLike | None,
-        Option(
-            "--fill-from", Text(
-                "Fill what ", Setting("output.visibility"), " leaves empty from this ortho, on any grid."
-            ),
-            "ORTHO", kind="file",
-        ),
-    ] = None  # fmt: skip
-    angles: Annotated[
-        bool,
-        Option(
-            "--angles", "Write angles of view at each place and, where the sun is known, of the sun, and which pixels "
-            "lie in shadow.",
-        ),
-    ] = False  # fmt: skip
-    sun: Annotated[
-        Sequence[float] | None,
-        Option(
-            "--sun", Text("Azimuth and elevation of the sun, degrees, for ", Setting("output.angles"), "."), "AZ,EL",
-            kind="pair", unset="that of the metadata",
-        ),
-    ] = None  # fmt: skip
-    layer_step: Annotated[
-        int,
-        Option(
-            "--layer-step", "Pixels of the ortho to one of the layers of accuracy and angles.", "N", kind="integer",
-            above=0,
-        ),
-    ] = 16  # fmt: skip
-    stac: Annotated[bool, Option("--stac", "Write a STAC item of the ortho too.")] = False
-    acquired: Annotated[
-        str | None, Option("--acquired", "Time of acquisition (RFC 3339), where the metadata have none.", "TIME")
     ] = None
-
-    @property
-    def files(self) -> dict[str, str | os.PathLike[str]]:
-        """Rasters besides the image that an ortho is made with, by what they are."""
-        given = {"other ortho": self.fill_from, "grid": self.like}
-        return {role: path for role, path in given.items() if path is not None}
 
 
 @documented
 @dataclass(frozen=True)
 class MatchOptions:
-    """Control points without hands: the scene is matched with reference orthoimages."""
+    """Automatic control points: the scene is matched with reference orthoimages."""
 
     reference: Annotated[
         Sequence[PathLike],
         Option(
-            "--reference", "Orthoimages to take control points from by matching; where several show a place, the "
-            "first.", "ORTHO[,...]", kind="files",
+            "--reference",
+            "Orthoimages to match for control points. Where several overlap, the first is used.",
+            "ORTHO[,...]",
+            kind="files",
         ),
-    ] = ()  # fmt: skip
+    ] = ()
     reference_bands: Annotated[
         Sequence[int] | None,
         Option(
-            "--reference-bands", "Bands of the reference to compare, from 1.", "N[,...]", kind="integers", above=0,
+            "--reference-bands",
+            "Bands of the reference to match, numbered from 1.",
+            "N[,...]",
+            kind="integers",
+            above=0,
             unset="the four with the most content",
         ),
-    ] = None  # fmt: skip
+    ] = None
     search: Annotated[
         float | None,
         Option(
-            "--search", "How far the image's model may be off on the ground.", "M", kind="number", above=0,
-            unset="three times the accuracy that the scene states, else 100",
+            "--search",
+            "Search radius on the ground: the largest expected error of the image's model.",
+            "M",
+            kind="number",
+            above=0,
+            unset="three times the accuracy that the metadata state, else 100",
         ),
-    ] = None  # fmt: skip
+    ] = None
     search_rotation: Annotated[
         float | None,
         Option(
-            "--search-rotation", "How far the image's model may be turned (degrees; 180 for any angle).", "DEG",
-            kind="number", above=0, below=180.001, unset="5 where the model comes from metadata on orbit or attitude, "
-            "else none",
+            "--search-rotation",
+            "Largest expected rotation of the image's model, in degrees; 180 for any.",
+            "DEG",
+            kind="number",
+            above=0,
+            below=180.001,
+            unset="5 if the model comes from orbit or attitude metadata, else 0",
         ),
-    ] = None  # fmt: skip
+    ] = None
     points: Annotated[
         int,
         Option(
             "--match-points",
-            "About how many matches are wanted.",
+            "Approximate number of matches.",
             "N",
             kind="integer",
             above=0,
@@ -410,23 +299,28 @@ class MatchOptions:
     reference_sigma: Annotated[
         float | None,
         Option(
-            "--reference-sigma", "Standard deviation of where the reference lies as a whole, in each axis.", "M",
-            kind="number", above=0,
+            "--reference-sigma",
+            "Accuracy of the reference: standard deviation of its position, per axis.",
+            "M",
+            kind="number",
+            above=0,
         ),
-    ] = None  # fmt: skip
+    ] = None
     gcps_as: Annotated[
         str,
         Option(
-            "--gcps-as", Text(
-                "What ", Setting("points.gcps"), " are beside matches: a test that takes no part, or control too."
-            ),
+            "--gcps-as",
+            Text("Use of ", Setting("points.gcps"), " when matching: only as check points, or also as control."),
             choices=("check", "control"),
         ),
-    ] = "check"  # fmt: skip
+    ] = "check"
 
 
 #: The groups, by the name that they have in messages, in the pipeline file and as arguments of the commands.
 GROUPS: Mapping[str, type] = {
-    "scene": SceneOptions, "points": PointOptions, "surface": SurfaceOptions, "match": MatchOptions,
+    "scene": SceneOptions,
+    "points": PointOptions,
+    "surface": SurfaceOptions,
+    "match": MatchOptions,
     "output": OutputOptions,
-}  # fmt: skip
+}

@@ -5,22 +5,27 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from ortho_pipeline.options.option import Option, documented
+from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented
 @dataclass(frozen=True)
 class MosaicOptions:
-    """One raster of all scenes."""
+    """Options of one raster of all scenes."""
 
     format: Annotated[
-        str, Option("--format -of", "A VRT refers to the orthos, a COG holds a copy.", choices=("VRT", "COG"))
+        str, Option("--format -of", "A VRT refers to the orthos; a COG holds a copy.", choices=("VRT", "COG"))
     ] = "VRT"
     order: Annotated[
         str,
         Option(
             "--order",
-            "What lies on top: the scene that looks down most steeply, or the first; or at each pixel "
-            "the scene that is most accurate there, as their output.accuracy_raster says.",
+            Text(
+                "Which scene is on top: the one with the steepest view, the first, or at each pixel the most accurate "
+                "(needs ",
+                Setting("output.accuracy_raster"),
+                " of each ortho).",
+            ),
             choices=("best-view", "first-on-top", "most-accurate"),
         ),
     ] = "best-view"
@@ -29,13 +34,13 @@ class MosaicOptions:
         bool,
         Option(
             "--seamlines",
-            "Let the seams run where scenes differ least, up to 256 pixels from where the order has them.",
+            "Move the seam lines to where the scenes differ least, by at most 256 pixels.",
         ),
     ] = False
     balance: Annotated[
         bool,
         Option(
             "--balance",
-            "Make the brightness of the scenes alike where they overlap: a gain and an offset of each scene and band.",
+            "Balance the brightness where scenes overlap: one gain and offset for each scene and band.",
         ),
     ] = False

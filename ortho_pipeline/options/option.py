@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, Literal, TypeVar, get_args
 
-#: What a file of points calls the first pixel -> what is added to reach (0, 0) at its outer corner.
+#: Convention of a points file for the first pixel -> offset to (0, 0) at its outer corner.
 PIXEL_ORIGINS = {
     "corner": 0.0,  # (0, 0) is the outer corner of the first pixel: GDAL, QGIS, this package
     "center": 0.5,  # (0, 0) is its centre: RPC files, OpenCV
@@ -19,11 +19,11 @@ PIXEL_ORIGINS = {
 PIXEL_TYPES = ("Byte", "UInt16", "Int16", "UInt32", "Int32", "Float32", "Float64")
 #: What is adjusted: nothing, the image points, or the parameters of the model itself.
 CORRECTIONS = ("none", "shift", "shift-drift", "affine", "model")
-#: Kernels of resampling, and who does the work of a run.
+#: Kernels of resampling, and executors of a run.
 RESAMPLING = ("nearest", "bilinear", "cubic", "lanczos", "average")
 EXECUTORS = ("sequential", "processes", "dask")
 
-#: How the value of an option is written, where choices or a field that is true or false do not say it.
+#: Form of the value of an option that is neither a choice nor true or false.
 Kind = Literal[
     "text",
     "file",
@@ -44,12 +44,12 @@ PathLike = str | os.PathLike[str]
 
 
 def is_usable(number: float) -> bool:
-    """Tell whether a number can be computed with: it is 0, or its cube and that of its inverse are numbers too."""
+    """Return whether a number is 0, or its cube and the cube of its inverse are finite."""
     return number == 0 or 1e-100 <= abs(number) <= 1e100
 
 
 def number_of(text: str | float) -> float:
-    """Return the number that a user gave; NaN for what is none, or none to compute with (`is_usable`)."""
+    """Return the number that a user gave; NaN if it is not a number or not usable (`is_usable`)."""
     try:
         number = float(text)
     except (ValueError, OverflowError):
@@ -58,7 +58,7 @@ def number_of(text: str | float) -> float:
 
 
 def numbers_of(text: str) -> list[float]:
-    """Return the numbers that a user gave with commas between, each as `number_of` has it."""
+    """Return the numbers of a list with commas, each by `number_of`."""
     return [number_of(part) for part in text.split(",")]
 
 
@@ -69,19 +69,19 @@ class Option:
     Parameters
     ----------
     flags : str
-        On the command line, the one that messages show first.
+        Flags on the command line; messages show the first.
     help : str
         One sentence.
     metavar : str
-        What stands for the value; its forms, if there are several, with bars between.
+        Placeholder of the value in the help; several forms are separated by bars.
     unset : str
-        What holds where the option is not given and the field has no default that says it.
+        Behaviour without the option, if the default of the field does not show it.
     choices : sequence of str
         The only values.
     above, below : float, optional
-        Bounds that are no values themselves.
+        Bounds, themselves excluded.
     in_file : bool
-        Whether the file of `ortho run` has it.
+        Whether it is a key of the pipeline file.
     """
 
     flags: str
@@ -100,7 +100,7 @@ _T = TypeVar("_T")
 
 def options_of(group: type) -> dict[str, Option]:
     """Return the option of each field of a group."""
-    return {one.name: get_args(one.type)[1] for one in fields(group)}
+    return {field.name: get_args(field.type)[1] for field in fields(group)}
 
 
 def documented(group: type[_T]) -> type[_T]:
@@ -108,23 +108,27 @@ def documented(group: type[_T]) -> type[_T]:
     lines = []
     for one in fields(group):  # type: ignore[arg-type]
         option: Option = get_args(one.type)[1]
-        said = " ".join(part for part in (option.help, option.unset and f"Default: {option.unset}.") if part)
+        text = " ".join(part for part in (option.help, option.unset and f"Default: {option.unset}.") if part)
         kind = (
             f"{{{', '.join(map(repr, option.choices))}}}"
             if option.choices
             else inspect.formatannotation(get_args(one.type)[0])
         )
-        lines.append(f"{one.name} : {kind}\n    {said}")
+        lines.append(f"{one.name} : {kind}\n    {text}")
     group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
-    signature = inspect.signature(group)
-    plain = [one.replace(annotation=get_args(one.annotation)[0]) for one in signature.parameters.values()]
-    group.__signature__ = signature.replace(parameters=plain)  # type: ignore[attr-defined]
+    types = {field.name: get_args(field.type)[0] for field in fields(group)}  # type: ignore[arg-type]
+    group.__init__.__annotations__ = {**types, "return": None}
     group.__repr__ = _as_called  # type: ignore[method-assign]
     return group
 
 
 def _as_called(self: Any) -> str:
-    """Return options as they are written: those alone that are not as by default."""
-    usual = {one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)}
-    said = ((name, getattr(self, name)) for name in usual)
-    return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in said if value != usual[name])})"
+    """Return the call that makes these options, without defaults."""
+    defaults = {
+        field.name: field.default if field.default_factory is MISSING else field.default_factory()
+        for field in fields(self)
+    }
+    values = ((name, getattr(self, name)) for name in defaults)
+    return (
+        f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in values if value != defaults[name])})"
+    )

@@ -42,7 +42,7 @@ class Setting:
 
 
 class Text(str):
-    """A text for people that knows which options it names, made of strings, other texts and settings.
+    """A text for people that knows the options in it, made of strings, other texts and settings.
 
     A string for all that need no more, also in JSON.
     """

@@ -51,7 +51,7 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
     Parameters
     ----------
     path : path or Hiding
-        Where the ortho is written, or that and what is done about pixels that terrain hides.
+        Path of the ortho, or the path with the treatment of pixels that terrain hides.
 
     Raises
     ------
@@ -85,10 +85,10 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         )
         mask = None if work.looked is None else stack.enter_context(work.looked.writer(job.driver, threads))
         tiles = list(_tiles(grid, square_side(profile, TILE)))
-        for done, made in enumerate(_in_order(threads, work, tiles, ahead), start=1):
-            writer.write(made.left, made.top, made.pixels, made.valid)
+        for done, tile in enumerate(_in_order(threads, work, tiles, ahead), start=1):
+            writer.write(tile.left, tile.top, tile.pixels, tile.valid)
             if mask is not None:
-                mask.write(made.left, made.top, made.classes[None], None)
+                mask.write(tile.left, tile.top, tile.classes[None], None)
             if progress:
                 progress(WARPING, done / len(tiles))
         refuse_empty(work.valid_pixels, path)
@@ -122,7 +122,7 @@ def _check(job: WarpJob) -> None:
     job.check()
     if not 0 < job.tolerance < math.inf:
         raise InputError(
-            "the tolerance must be positive and finite", field="tolerance", remedy="the default is 0.01 px"
+            "the tolerance must be positive and finite", field="tolerance", remedy="use the default, 0.01 px"
         )
 
 
@@ -282,13 +282,13 @@ class TileMaker:
         pixels = source.read(left, top, right - left, bottom - top)
         valid = source.read_valid(left, top, pixels)
         masked = valid is not None
-        whole = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)
+        fully_valid = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)
         if valid is not None:
-            kernels.find_whole(valid, reach, whole)
+            kernels.find_whole(valid, reach, fully_valid)
         return kernels.SourceWindow(
             pixels,
             np.ones((1, 1, 1), dtype=bool) if valid is None else valid,
-            whole,
+            fully_valid,
             masked,
             left,
             top,

@@ -46,7 +46,7 @@ from ortho_pipeline.warp.quality.hiding import Hiding
 
 #: GDAL's fit to points of a model expresses it if it repeats it this closely (px); another fit only resembles it.
 EXPRESSED = 1e-3
-#: Points per side of the ortho at which a transformer is held against the model.
+#: Points per side of the ortho at which a transformer is compared with the model.
 _CHECKS = 150
 #: Points per side that GDAL's polynomial or homography is fitted to.
 _GCP_SIDE = 11
@@ -124,7 +124,7 @@ class Transformer:
 
 @dataclass(frozen=True)
 class Exact:
-    """Where pixels of an ortho lie in the image: exact model, surface, grid, columns and rows of the image."""
+    """Positions of ortho pixels in the image: exact model, surface, grid, columns and rows of the image."""
 
     model: SensorModel
     surface: Surface
@@ -147,17 +147,17 @@ class Exact:
         columns, rows = (axis.ravel() for axis in np.meshgrid(*side))
         ortho = gdal.GetDriverByName("VRT").Create("", self.grid.width, self.grid.height, 1)
         transformer.georeference(ortho, self.grid)
-        made = gdal.Transformer(transformer.source(image), ortho, list(transformer.options))
-        points, success = made.TransformPoints(1, np.column_stack([columns, rows, 0 * rows]).tolist())
-        found, exact = np.array(points)[:, :2], self.image(columns, rows)
-        found[~(np.array(success, dtype=bool) & np.isfinite(found).all(axis=1))] = np.nan
+        transform = gdal.Transformer(transformer.source(image), ortho, list(transformer.options))
+        points, success = transform.TransformPoints(1, np.column_stack([columns, rows, 0 * rows]).tolist())
+        projected, exact = np.array(points)[:, :2], self.image(columns, rows)
+        projected[~(np.array(success, dtype=bool) & np.isfinite(projected).all(axis=1))] = np.nan
         with np.errstate(invalid="ignore"):
-            seen = [((place >= 0) & (place <= self.size)).all(axis=1) for place in (found, exact)]
+            seen = [((place >= 0) & (place <= self.size)).all(axis=1) for place in (projected, exact)]
         use = seen[0] | seen[1]
         if transformer.method == "RPC":
-            # GDAL interpolates beside voids and rims of a DEM, where we have no height.
-            use &= np.isfinite(found).all(axis=1) & np.isfinite(exact).all(axis=1)
-        worst = np.abs(found - exact)[use].max(initial=0.0)
+            # GDAL interpolates next to voids and edges of a DEM, where our engine has no height.
+            use &= np.isfinite(projected).all(axis=1) & np.isfinite(exact).all(axis=1)
+        worst = np.abs(projected - exact)[use].max(initial=0.0)
         return float(worst) if np.isfinite(worst) else np.inf
 
 
@@ -227,7 +227,7 @@ def _check(job: WarpJob) -> None:
         )
     if len(job.source.paths) > 1:
         raise InputError(
-            "GDAL's warper accepts only one file",
+            "GDAL's warper reads only one file",
             file=job.source.paths[1],
             field="engine",
             remedy="use the default engine",
@@ -250,7 +250,7 @@ def _standing(
             continue
         if error <= candidate.limit:
             return replace(candidate, max_error_px=error)
-        tried.append(f"{candidate.method}: {error:.3g} px off")
+        tried.append(f"{candidate.method}: {error:.3g} px error")
     raise InputError(
         f"none of GDAL's transformers represents this model ({'; '.join(tried)})",
         field="output.engine",
@@ -322,9 +322,9 @@ def _write_arrays(exact: Exact, path: Path) -> None:
     """Write the column and row in the image of the centre of every output pixel."""
     width, height = exact.grid.width, exact.grid.height
     options = ["BIGTIFF=IF_SAFER", "INTERLEAVE=BAND"]
-    made = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
+    raster = gdal.GetDriverByName("GTiff").Create(os.fspath(path), width, height, 2, gdal.GDT_Float64, options)
     step = max(1, _PIECE // width)
-    with written(made) as dataset:
+    with written(raster) as dataset:
         for k in (1, 2):
             dataset.GetRasterBand(k).SetNoDataValue(_NO_PLACE)
         for top in range(0, height, step):

@@ -1,4 +1,4 @@
-"""What an engine is asked for, and what it answers: a job of the warp, and its outcome."""
+"""The input and the result of an engine: a job of the warp, and its record."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class WarpJob:
     Parameters
     ----------
     surface : Surface
-        The seam of a global DEM beside the grid (`Surface.around`).
+        The seam of a global DEM, moved off the grid (`Surface.around`).
     resampling, dem_interpolation : str
         How pixels and heights are interpolated.
     tolerance : float
@@ -83,13 +83,13 @@ class WarpJob:
             raise InputError(
                 f"unknown resampling kernel {self.resampling!r}",
                 field="resampling",
-                remedy=f"one of {', '.join(KERNELS)}",
+                remedy=f"use one of {', '.join(KERNELS)}",
             )
         if self.dem_interpolation not in ("bilinear", "cubic"):
             raise InputError(
                 f"unknown DEM interpolation {self.dem_interpolation!r}",
                 field="dem-interpolation",
-                remedy="bilinear or cubic",
+                remedy="use bilinear or cubic",
             )
         if self.source.dtype.kind in "iu" and self.source.dtype.itemsize == 8 and self.resampling != "nearest":
             raise InputError(
@@ -143,7 +143,7 @@ class WarpRecord(Record):
         if self.transformer != "GEOLOC_ARRAY" or took <= memory:
             return []
         text = Text(
-            f"GDAL's warper needs about {took / 1e6:.0f} MB for its geolocation arrays, beyond ",
+            f"GDAL's warper needs about {took / 1e6:.0f} MB for its geolocation arrays, more than ",
             Setting("output.memory"),
             f" {memory / 1e6:.0f}: choose a smaller extent, or leave out ",
             Setting("output.engine", "gdal"),

@@ -65,7 +65,7 @@ VERIFIED = 24
 _CELL = 32
 #: What stands for the terrain of a block in which every pixel is projected: its heights are in its nodes already.
 _NO_TERRAIN = DemWindow(np.zeros((2, 2)), 0, 0, False)
-#: Source pixels beyond the lattice nodes of a window, for what lies higher or lower between the nodes.
+#: Source pixels beyond the lattice nodes of a window, for terrain that is higher or lower between the nodes.
 _MARGIN = 4
 
 
@@ -340,16 +340,16 @@ class TileHeights:
         if not present:
             return []
         together = np.array([windows[k] for k in present])
-        whole = (*together[:, :2].min(axis=0), *together[:, 2:].max(axis=0))
-        if self._fits(whole):
-            self._whole = self._read(whole)
-        found = self._height_ranges(together)
-        for k, window, (lowest, highest) in zip(present, together.tolist(), found, strict=True):
+        tile = (*together[:, :2].min(axis=0), *together[:, 2:].max(axis=0))
+        if self._fits(tile):
+            self._whole = self._read(tile)
+        bounds = self._height_ranges(together)
+        for k, window, (lowest, highest) in zip(present, together.tolist(), bounds, strict=True):
             # A cubic DEM overshoots between its samples by up to a quarter of their range.
             extra = 0.25 * (highest - lowest) if self._cubic else 0.0
             blocks[k].terrain, blocks[k].middle = tuple(window), (lowest + highest) / 2
             blocks[k].half = max((highest - lowest) / 2 + extra, 0.5)
-        return [k for k, (lowest, highest) in zip(present, found, strict=True) if lowest <= highest]
+        return [k for k, (lowest, highest) in zip(present, bounds, strict=True) if lowest <= highest]
 
     def groups(
         self, blocks: list[OutputBlock]
@@ -359,16 +359,16 @@ class TileHeights:
         The part (first row, last row + 1, first column, last column + 1) is the whole block, or a cell of its lattice
         where the DEM is so much finer than the output that even a block's heights do not fit into the memory.
         """
-        whole = (0, BLOCK, 0, BLOCK)
-        yield from (([block], _NO_TERRAIN, whole) for block in blocks if block.spacing == 1)
+        tile = (0, BLOCK, 0, BLOCK)
+        yield from (([block], _NO_TERRAIN, tile) for block in blocks if block.spacing == 1)
         blocks = [block for block in blocks if block.spacing > 1]
         if self._whole is not None:
             if blocks:
-                yield blocks, self._whole, whole
+                yield blocks, self._whole, tile
             return
         for block in blocks:
             if self._fits(block.terrain):
-                yield [block], self._read(block.terrain), whole
+                yield [block], self._read(block.terrain), tile
                 continue
             for cell, nodes in block_cells(block.spacing):
                 window = self._window(block.lattice.dem[nodes])
@@ -377,13 +377,13 @@ class TileHeights:
 
     def heights(self, block: OutputBlock, uv: Array) -> Array:
         """Return the heights ``(BLOCK + 1, BLOCK + 1)`` at DEM points of all pixels of a block; NaN in voids."""
-        found = np.full(uv.shape[:2], np.nan)
+        heights = np.full(uv.shape[:2], np.nan)
         parts: Any = [((), slice(None))] if self._whole is not None or self._fits(block.terrain) else block_cells(1)
         for _, nodes in parts:
             window = self._window(uv[nodes])
             if window is not None:
-                heights_at(uv[nodes], self._whole or self._read(window), found[nodes])
-        return found
+                heights_at(uv[nodes], self._whole or self._read(window), heights[nodes])
+        return heights
 
     def _fits(self, window: Any) -> bool:
         return (window[2] - window[0]) * (window[3] - window[1]) * 8 <= self._window_bytes
@@ -403,16 +403,16 @@ class TileHeights:
 
     def _height_ranges(self, windows: NDArray[np.int64]) -> list[list[float]]:
         """Return lowest and highest height in windows ``(n, 4)``; infinity and minus infinity where all are voids."""
-        found = np.empty((len(windows), 2))
+        ranges = np.empty((len(windows), 2))
         if self._whole is not None:
-            lattice_kernel.height_ranges(self._whole.heights, self._whole.left, self._whole.top, windows, found)
-            return found.tolist()
+            lattice_kernel.height_ranges(self._whole.heights, self._whole.left, self._whole.top, windows, ranges)
+            return ranges.tolist()
         for k, (left, top, right, bottom) in enumerate(windows.tolist()):
             try:
-                found[k] = self._surface.range_within(left, top, right - left, bottom - top)
+                ranges[k] = self._surface.range_within(left, top, right - left, bottom - top)
             except CoverageError:
-                found[k] = math.inf, -math.inf
-        return found.tolist()
+                ranges[k] = math.inf, -math.inf
+        return ranges.tolist()
 
 
 def _extents(points: Array) -> list[list[float]]:

@@ -1,4 +1,4 @@
-"""Compiled bound on the error of the warp's lattices; lattice.py says what it rests on.
+"""Compiled bound on the error of the warp's lattices; lattice.py explains it.
 
 Arrays: `image` ``(blocks, n + 1, n + 1, levels, 2)`` source points of the nodes at each height, `coefficients` of the
 same shape their polynomials in the normalised height, `dem` ``(blocks, n + 1, n + 1, 2)`` DEM points of the nodes,
@@ -66,9 +66,9 @@ def visible(image: Any, width: float, height: float, unknown: Any, cells: Any, a
                 if cells[b, j, i]:
                     first_row, last_row = min(first_row, j), max(last_row, j + 1)
                     first, last = min(first, i), max(last, i + 1)
-        found = last > 0
-        area[b, 0], area[b, 1] = (first_row if found else 0), last_row
-        area[b, 2], area[b, 3] = (first if found else 0), last
+        seen = last > 0
+        area[b, 0], area[b, 1] = (first_row if seen else 0), last_row
+        area[b, 2], area[b, 3] = (first if seen else 0), last
 
 
 @inlined

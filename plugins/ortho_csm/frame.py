@@ -34,36 +34,11 @@ from ortho_pipeline.plugin import (
 HEIGHTS = (-500.0, 9000.0)
 #: Axes of the state's camera (x right, y down, z to the scene) in those of ours (x right, y up, z backwards).
 _OURS_FROM_THEIRS = np.diag([1.0, -1.0, -1.0])
-
-#: Fields that have the same value in each state that is written.
-_CONSTANT: dict[str, Any] = {
-    "m_noAdjustments": [0.0] * 7,
-    "m_samplePp": 0.0,
-    "m_linePp": 0.0,
-    "m_detectorSampleSumming": 1.0,
-    "m_detectorLineSumming": 1.0,
-    "m_startingDetectorSample": 0.0,
-    "m_startingDetectorLine": 0.0,
-    "m_distortionType": 0,
-    "m_opticalDistCoeffs": [0.0, 0.0, 0.0],
-    "m_spacecraftVelocity": [0.0] * 3,
-    "m_sunPosition": [0.0] * 3,
-    "m_imageIdentifier": "",
-    "m_collectionIdentifier": "",
-    "m_platformIdentifier": "",
-    "m_sensorIdentifier": "",
-    "m_trajectoryIdentifier": "",
-    "m_dateTime": "",
-    "m_epsilon": 1e-9,
-    "m_boresight": [0.0, 0.0, 1.0],
-    "m_zDirection": 1.0,
-    "m_instrumentID": "",
-    "m_spacecraftName": "",
-    "m_targetName": "EARTH",
-    "m_lineTimes": [],
-    "m_lineJitter": [],
-    "m_sampleJitter": [],
-}
+#: Fields that a state has to have, and that a camera does not know.
+_IDENTIFIERS = (
+    *(f"m_{name}Identifier" for name in ("image", "collection", "platform", "sensor", "trajectory")),
+    "m_dateTime",
+)
 
 
 def read_frame(state: StateFields) -> FrameCamera:
@@ -113,26 +88,46 @@ def frame_fields(model: FrameCamera) -> dict[str, Any]:
     row = interior.height / 2 - interior.y0 / interior.pitch_y
     quaternion = Rotation.from_matrix((_OURS_FROM_THEIRS @ turn).T).as_quat()
     return {
-        **_CONSTANT,
         "m_nSamples": interior.width,
         "m_nLines": interior.height,
         "m_focalLength": interior.focal_length,
         "m_currentParameterValue": [*place.tolist(), *quaternion.tolist()],
         "m_currentParameterCovariance": np.zeros(49).tolist(),
+        "m_noAdjustments": [0.0] * 7,
         "m_ccdCenter": [row, column],
+        "m_samplePp": 0.0,
+        "m_linePp": 0.0,
         "m_iTransS": [0.0, 1 / interior.pitch_x, 0.0],
         "m_iTransL": [0.0, 0.0, 1 / interior.pitch_y],
         "m_transX": [0.0, interior.pitch_x, 0.0],
         "m_transY": [0.0, 0.0, interior.pitch_y],
+        "m_detectorSampleSumming": 1.0,
+        "m_detectorLineSumming": 1.0,
+        "m_startingDetectorSample": 0.0,
+        "m_startingDetectorLine": 0.0,
+        "m_distortionType": 0,
+        "m_opticalDistCoeffs": [0.0, 0.0, 0.0],
         "m_majorAxis": SEMI_MAJOR,
         "m_minorAxis": SEMI_MAJOR * float(np.sqrt(1 - ECCENTRICITY_SQUARED)),
         "m_minElevation": model.heights[0],
         "m_maxElevation": model.heights[1],
         "m_referencePointXyz": geocentric(_below(model))[0].tolist(),
+        "m_spacecraftVelocity": [0.0] * 3,
+        "m_sunPosition": [0.0] * 3,
         "m_pixelPitch": interior.pitch_x,
+        **dict.fromkeys(_IDENTIFIERS, ""),
+        "m_epsilon": 1e-9,
+        "m_boresight": [0.0, 0.0, 1.0],
         "m_originalHalfLines": interior.height / 2,
         "m_originalHalfSamples": interior.width / 2,
+        "m_zDirection": 1.0,
         "m_ifov": interior.pitch_x / interior.focal_length,
+        "m_instrumentID": "",
+        "m_spacecraftName": "",
+        "m_targetName": "EARTH",
+        "m_lineTimes": [],
+        "m_lineJitter": [],
+        "m_sampleJitter": [],
     }
 
 

@@ -123,12 +123,7 @@ def open_scene(
     pieces, broken = _pieces(image, delivery, component, position, first == "rpc") if image else ((), [])
     contradiction = _disagreement(models)
     if contradiction and vendor is not None and rpc is None and geometry is None:
-        raise InputError(
-            contradiction[0],
-            file=vendor[1],
-            field="rpc",
-            remedy=_CHOOSE,
-        )
+        raise _undecided(contradiction[0], vendor[1])
     return Scene(
         sensor="ikonos",
         path=path,
@@ -292,6 +287,25 @@ def _disagreement(models: dict[str, SensorModel]) -> list[Notice]:
     apart = f"{off:.1f} px" if math.isfinite(off) else "the whole scene"
     text = f"RPC and metadata differ by {apart} at Reference Height. One of them belongs to another image"
     return [Notice("metadata-contradict", text, difference_px=off)]
+
+
+def _undecided(contradiction: str, file: str) -> InputError:
+    """Return the error where nothing says which of RPC and metadata is right."""
+    return InputError(
+        contradiction,
+        file=file,
+        field="rpc",
+        remedy=Text(
+            "choose one: the RPC with ",
+            Setting("scene.rpc", "tag"),
+            ", ",
+            Setting("scene.rpc", "sidecar"),
+            " or ",
+            Setting("scene.rpc", "FILE"),
+            ", or the metadata with ",
+            Setting("scene.sensor_options", "geo", key="geometry"),
+        ),
+    )
 
 
 def _facts(

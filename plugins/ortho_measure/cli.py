@@ -72,7 +72,8 @@ def measure(
     missing = [name for name in ("starlette", "uvicorn") if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(
-            f"measuring in the browser needs {' and '.join(missing)}", remedy='pip install "ortho-pipeline[measure]"'
+            f"measuring in the browser needs {' and '.join(missing)}",
+            remedy="run pip install '.[measure]' in the checkout of ortho-pipeline",
         )
     from ortho_measure.serving.server import serve
 

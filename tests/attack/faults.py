@@ -317,7 +317,7 @@ def untyped(ended: Ended) -> str | None:
     """Return what is wrong with how a command said that it failed."""
     if ended.hung:
         return "hangs"
-    if "Traceback" in ended.said or "fault of ortho-pipeline" in ended.said:
+    if "Traceback" in ended.said or "bug in ortho-pipeline" in ended.said:
         return f"untyped error: {ended.said[-300:]}"
     if ended.code == 1 and not ended.said.strip():
         return f"exit code 1 without a word: {ended.said[-300:]}"

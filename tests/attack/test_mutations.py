@@ -185,11 +185,11 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("images", "said"),
     [
-        ("/".join(["**"] * 8) + "/*.tif", "too long a search"),
-        ("../../**/*.tif", "outside of the root"),
-        ("/**/*.tif", "outside of the root"),
+        ("/".join(["**"] * 8) + "/*.tif", "too complex a pattern"),
+        ("../../**/*.tif", "outside the root folder"),
+        ("/**/*.tif", "outside the root folder"),
         ("a" * 300 + "/*.tif", "not a path"),
-        ("b" * 5000, "too long a search"),
+        ("b" * 5000, "too complex a pattern"),
     ],
 )
 def test_patterns_that_would_not_end_are_refused(tmp_path: Path, images: str, said: str) -> None:
@@ -206,7 +206,7 @@ def test_a_name_longer_than_a_file_system_takes(tmp_path: Path, field: str) -> N
     (tmp_path / "one.tif").touch()
     file = tmp_path / "run.yaml"
     file.write_text(json.dumps({"scenes": [{"image": "one.tif", "scene": {field: "a" * 300}}]}))
-    with pytest.raises(InputError, match="not a path of a file") as caught:
+    with pytest.raises(InputError, match="not the path of a file") as caught:
         batch_plan.plan(file)
     assert caught.value.remedy
 

@@ -189,7 +189,7 @@ def test_no_data_of_a_delivery_lead_elsewhere(tmp_path: Path, sample: Path, kind
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Traceback" not in done.stderr
-    assert "fault of ortho-pipeline" not in done.stderr
+    assert "bug in ortho-pipeline" not in done.stderr
     assert "Unknown" not in done.stderr  # every command reads what it is given
     assert not re.search(r"(connect|sendto|sendmmsg)\(.*AF_INET", log.read_text(errors="replace"))
     assert outside(log, place, tmp_path) == []

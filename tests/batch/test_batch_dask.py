@@ -116,7 +116,7 @@ def test_on_the_command_line(folder, cluster):
 
 def test_no_scheduler(folder, monkeypatch):
     monkeypatch.setattr(executors, "_PATIENCE", "0.2s")
-    with pytest.raises(InputError, match="no dask scheduler answers"):
+    with pytest.raises(InputError, match="cannot connect to the dask scheduler"):
         batch.run(folder / "p.yaml", executor="dask", scheduler="tcp://127.0.0.1:1")
 
 

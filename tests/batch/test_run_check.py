@@ -56,7 +56,7 @@ def test_check_finds_what_a_run_would_and_reads_no_pixel(pipeline_file, monkeypa
     assert not (pipeline_file.parent / "out").exists()
     text = run("run", pipeline_file, "--dry-run")
     assert f"{NAMES[0]}: rpc, rpc+shift; 11 control points, 1 check point; DEM covers 100.0 %" in text.stdout
-    assert "3 scenes: 1 ready, 2 not" in text.stdout
+    assert "3 scenes: 1 ready, 2 with errors" in text.stdout
 
 
 def test_check_of_what_is_ready_is_exit_code_0_and_its_grid_is_that_of_the_run(pipeline_file):

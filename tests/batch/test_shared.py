@@ -84,12 +84,12 @@ def test_an_array_of_jobs_says_which_part_it_is(environment: dict[str, str], par
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
-        ({}, "no array"),
+        ({}, "no job array"),
         ({"JOB_COMPLETION_INDEX": "0", "SLURM_ARRAY_TASK_ID": "0"}, "several"),
-        ({"JOB_COMPLETION_INDEX": "0"}, "nothing how many"),
-        ({"JOB_COMPLETION_INDEX": "2", "ORTHO_SHARDS": "2"}, "no worker of 2"),
-        ({"JOB_COMPLETION_INDEX": "-1", "ORTHO_SHARDS": "2"}, "no number"),
-        ({"SLURM_ARRAY_TASK_ID": "12", "SLURM_ARRAY_TASK_STEP": "5", "SLURM_ARRAY_TASK_COUNT": "4"}, "no worker"),
+        ({"JOB_COMPLETION_INDEX": "0"}, "not how many"),
+        ({"JOB_COMPLETION_INDEX": "2", "ORTHO_SHARDS": "2"}, "does not fit 2 workers"),
+        ({"JOB_COMPLETION_INDEX": "-1", "ORTHO_SHARDS": "2"}, "not a valid number"),
+        ({"SLURM_ARRAY_TASK_ID": "12", "SLURM_ARRAY_TASK_STEP": "5", "SLURM_ARRAY_TASK_COUNT": "4"}, "does not fit"),
     ],
 )  # fmt: skip
 def test_an_environment_that_does_not_say_it_is_refused(environment: dict[str, str], said: str) -> None:
@@ -345,7 +345,7 @@ def test_a_record_that_cannot_be_read_is_none(data: bytes, tmp_path: Path, caplo
     assert RunRecord.parse(data) is None
     (tmp_path / "record.json").write_bytes(data)
     assert RunRecord.at(tmp_path / "record.json") is None
-    assert caplog.text.count("cannot be read") == 1
+    assert caplog.text.count("cannot read this record") == 1
 
 
 @pytest.mark.slow
@@ -399,7 +399,7 @@ def test_a_pipeline_file_in_a_store_names_images_there(store: str, tiny: Any, mo
     address = f"{store}/in/pipeline.yaml"
     with pytest.raises(InputError, match="network access is off"):
         plan(address)
-    with pytest.raises(InputError, match="goes to a store"):
+    with pytest.raises(InputError, match="needs an output in object storage"):
         runner.run(address, allow_network=True)
     command = ["run", address, "-o", f"{store}/out", "--allow-network", "--executor", "sequential", "--json"]
     done = CliRunner().invoke(cli, command)
@@ -456,7 +456,7 @@ def test_a_file_on_this_machine_may_name_addresses_if_that_is_allowed(tiny: Any)
             .replace(f"{public.address}/{tiny.image.name}", f"{public.address}/*.tif")
             .replace("image:", "images:")
         )
-        with pytest.raises(InputError, match="not searched"):
+        with pytest.raises(InputError, match="cannot search a web server"):
             plan(file, allow_network=True)
 
 

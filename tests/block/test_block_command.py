@@ -424,9 +424,9 @@ def test_geoid_heights_are_brought_to_the_ellipsoid(stereo: Stereo, tmp_path: Pa
     ("args", "message"),
     [
         (("--model", "pushbroom"), "has no model 'pushbroom'"),
-        (("--model", "affine3d", "--correction", "shift"), "fitted as a whole"),
-        (("--model-crs", "utm"), "ground CRS of a fitted model"),
-        (("--correction", "model"), "no parameters of its own"),
+        (("--model", "affine3d", "--correction", "shift"), "takes no correction"),
+        (("--model-crs", "utm"), "only for fitted models"),
+        (("--correction", "model"), "no adjustable parameters"),
         (("--check", "every:0"), "not a selection of check points"),
     ],
 )

@@ -297,8 +297,8 @@ def test_a_large_block_says_that_its_sigmas_know_nothing_of_neighbours(
     large = adjust(starts(rpcs), points)
     assert not large.shared_errors
     words.append(relative_to_reference(large, options, match)[0])
-    assert "in the sigmas, for each image" in words[0]
-    assert "not in the sigmas: this block is too large" in words[1]
+    assert "errors common to neighbouring matches, estimated separately for each image" in words[0]
+    assert "too large to include errors common to neighbouring matches" in words[1]
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def test_help_imports_no_command_and_nothing_heavy(program, tmp_path):
         ("raise RuntimeError('no luck')", r"(RuntimeError: no luck at third_party_command.py:1)"),
         ("import sys; sys.exit(0)", "(SystemExit: 0 at third_party_command.py:1)"),
         ("", "has no attribute 'command'"),
-        ("command = 3", "third_party_command:command is a int, not a command of click"),
+        ("command = 3", "third_party_command:command is a int, not a click command"),
     ],
 )
 def test_a_command_that_cannot_be_loaded_names_its_package(program, code, message):

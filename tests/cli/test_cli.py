@@ -281,8 +281,8 @@ def test_without_gdal_every_command_says_one_line_and_its_remedy(tmp_path):
     for code, stdout, stderr in json.loads(done.stdout).values():
         lines = stderr.splitlines()
         assert (code, stdout, len(lines)) == (2, "", 2), stderr
-        assert lines[0].startswith("Error: GDAL's Python bindings cannot be loaded")
-        assert lines[1].startswith("  Remedy: pip install")
+        assert lines[0].startswith("Error: cannot load the Python bindings of GDAL")
+        assert lines[1].startswith("  Remedy: run 'make setup'")
     assert set(cli.list_commands(click.Context(cli))) == {line.split()[0] for line in COMMANDS}
     assert not list(tmp_path.iterdir())
 

@@ -94,7 +94,7 @@ def test_what_is_missing_is_named_with_the_ways_to_get_it(folder):
     for word in ("--dem auto", "--height M", "--gcps FILE", "--reference ORTHO"):
         assert word in said
     (folder / "scene_RPC.TXT").unlink()
-    assert "No image with a model was found" in run("info", folder).stdout
+    assert "No image has a sensor model" in run("info", folder).stdout
 
 
 def test_outputs_are_no_inputs(folder):
@@ -111,7 +111,7 @@ def test_init_writes_a_file_that_a_run_takes(folder):
     (scene,) = checked["scenes"]
     assert (scene["points"]["control"], scene["points"]["check"], scene["coverage"]) == (12, 6, 1.0)
     again = run("init", folder)
-    assert (again.exit_code, "there already" in again.stderr) == (2, True)
+    assert (again.exit_code, "already exists" in again.stderr) == (2, True)
     assert run("init", folder, "--overwrite").exit_code == 0
     elsewhere = run("init", folder, "-o", folder / "deeper" / "p.yaml")
     assert elsewhere.exit_code == 2

@@ -31,7 +31,7 @@ def test_every_command_has_a_manual_page(tmp_path):
     )
     assert done.stderr == ""
     shown = re.sub(r"\x1b\[\d*m|.\x08", "", done.stdout)
-    assert "Every third point only checks:" in shown
+    assert "Reserve every third point as a check point:" in shown
 
 
 ASK = {

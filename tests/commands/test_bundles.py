@@ -69,5 +69,5 @@ def test_the_file_of_points_is_read_once(colours: Scene, tmp_path: Path, monkeyp
 def test_what_is_not_seen_is_refused(colours: Scene, tmp_path: Path) -> None:
     options, _ = measured(colours, tmp_path)
     elsewhere = replace(colours.model, lon_off=colours.model.lon_off + 20.0)
-    with pytest.raises(InputError, match=r"measured in pan.tif, is not seen here"):
+    with pytest.raises(InputError, match=r"of pan.tif is not visible in this image"):
         read_control(replace(colours, models={"rpc": elsewhere}), Request(colours, points=options))

@@ -165,7 +165,7 @@ def test_an_old_side_car_that_would_attach_to_the_ortho_is_refused(tiny, tmp_pat
     out.mkdir()
     stale = out / "tiny_ortho_RPC.TXT"
     stale.write_text("LINE_OFF: 1\n")
-    with pytest.raises(InputError, match="side-car") as caught:
+    with pytest.raises(InputError, match="sidecar file") as caught:
         rectify(tiny, out)
     assert caught.value.file == str(stale)
 
@@ -294,7 +294,7 @@ def test_nothing_is_read_and_written(tiny, tmp_path, where):
         folder = tmp_path / "out"
         image = tiny.image.rename(folder.parent / "tiny.vrt.tif")
         folder = folder.parent
-    with pytest.raises(InputError, match=r"attach to the source|read and written"):
+    with pytest.raises(InputError, match=r"attach to the source|both input and output"):
         commands.rectify(image, folder, surface=dem_of(tiny), points=points_of(tiny))
 
 
@@ -302,7 +302,7 @@ def test_points_cannot_be_an_output(tiny, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     gcps = tiny.gcps.rename(out / "tiny_residuals.geojson")
-    with pytest.raises(InputError, match="read and written"):
+    with pytest.raises(InputError, match="both input and output"):
         rectify(tiny, out, points=points_of(tiny, gcps))
 
 
@@ -334,7 +334,7 @@ def test_points_without_heights_take_them_from_the_dem(tiny):
     lines += [f"{g[0]},{g[1]},{i[0]},{-i[1]},1,0,0,0" for g, i in zip(ground, image, strict=True)]
     path = tiny.folder / "gcps.points"
     path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(InputError, match="without a height"):
+    with pytest.raises(InputError, match="have no height"):
         commands.fit(tiny.image, PointOptions(gcps=path))
     result = commands.fit(tiny.image, PointOptions(gcps=path), surface=dem_of(tiny))
     np.testing.assert_allclose(result.fit.values, tiny.bias, atol=1e-3)
@@ -501,7 +501,7 @@ def test_a_model_of_another_place_is_a_warning(tiny):
     rows = [(name, col + 4 * tiny.width, *others) for name, col, *others in tiny.points(12)]
     moved = tiny.write(tiny.folder / "moved.csv", rows)
     (warning,) = [text for text in commands.fit(tiny.image, points_of(tiny, moved)).warnings if "image sizes" in text]
-    assert warning.startswith("the model as delivered is 4.01 image sizes away from the points: ")
+    assert warning.startswith("the delivered model is 4.01 image sizes away from the points. ")
     assert not [text for text in commands.fit(tiny.image, points_of(tiny)).warnings if "image sizes" in text]
     family = commands.fit(tiny.image, points_of(tiny, moved, fit_model="affine3d")).warnings
     assert not [text for text in family if "image sizes" in text]

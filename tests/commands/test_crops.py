@@ -224,7 +224,7 @@ def test_images_of_a_block_have_rpcs_and_places_of_their_own(pair, tmp_path):
     ("words", "said"),
     [
         (["--rpc", "BANDF_RPC.TXT"], "name the image"),
-        (["--rpc", "third=BANDF_RPC.TXT"], "no image is called 'third'"),
+        (["--rpc", "third=BANDF_RPC.TXT"], "there is no image 'third'"),
         (["--crop-offset", "1,2"], "name the image"),
         (["--crop-offset", "first=1"], "'1' is not COL,ROW"),
     ],

@@ -119,7 +119,7 @@ def test_hardly_any_valid_pixel_is_said(tiny, tmp_path):
     dataset = None
     done = commands.rectify(tiny.image, tmp_path / "out", surface=dem_of(tiny))
     assert any(
-        "of the pixels that the scene covers have a value" in text for text in done.document["report"]["warnings"]
+        "of the pixels inside the footprint have a value" in text for text in done.document["report"]["warnings"]
     )
 
 

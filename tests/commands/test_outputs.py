@@ -44,7 +44,7 @@ def test_an_image_that_changes_meanwhile_is_refused_and_the_old_outputs_stay(tin
         return found
 
     monkeypatch.setattr(rectification, "_warp", meddling)
-    with pytest.raises(InputError, match="changed while it was being used"):
+    with pytest.raises(InputError, match="changed during the run"):
         rectify(tiny, out)
     assert contents(out) == before
 
@@ -150,7 +150,7 @@ def test_a_side_car_of_nothing_would_attach_to_the_ortho(tiny, tmp_path, ending)
     out = tmp_path / "out"
     out.mkdir()
     (out / f"tiny_ortho.tif{ending}").write_bytes(b"")
-    with pytest.raises(InputError, match="attach to the ortho"):
+    with pytest.raises(InputError, match="attach this old sidecar file"):
         rectify(tiny, out)
 
 

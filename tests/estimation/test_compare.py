@@ -218,7 +218,7 @@ def test_points_without_heights_serve_flat_models_only(tiny):
     path = tiny.write(tiny.folder / "flat.csv", [row[:5] for row in tiny.points(8)], "id,col,row,x,y")
     options = PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine2d")
     assert commands.fit(plain(tiny), options).fit.rmse("control").n == 8
-    with pytest.raises(InputError, match="without a height"):
+    with pytest.raises(InputError, match="have no height"):
         commands.fit(plain(tiny), PointOptions(gcps=path, crs="EPSG:4326", fit_model="affine3d"))
 
 

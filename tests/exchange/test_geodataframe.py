@@ -106,4 +106,4 @@ def test_without_geopandas_the_remedy_is_said(points, monkeypatch):
     monkeypatch.setitem(sys.modules, "geopandas", None)
     with pytest.raises(InputError, match=r"needs GeoPandas") as error:
         op.to_geodataframe(points)
-    assert "ortho-pipeline[geopandas]" in error.value.remedy
+    assert ".[geopandas]" in error.value.remedy

@@ -198,7 +198,7 @@ def test_an_ortho_that_cannot_fill_is_refused_before_the_first_pixel(tiny, steep
         with pytest.raises(InputError, match="left empty"):
             commands.check(tiny.image, **common, output=asked)
     asked = dataclasses.replace(output, fill_from=made.files["ortho"])
-    with pytest.raises(InputError, match="read and written"):
+    with pytest.raises(InputError, match="both input and output"):
         commands.rectify(tiny.image, tmp_path / "out", **common, output=asked)
 
 

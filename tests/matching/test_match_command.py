@@ -227,7 +227,7 @@ def test_measured_points_that_only_check_say_where_the_reference_lies(moved: Cas
     found = document(matched(moved, "fit", "--gcps", tmp_path / "survey.csv", "--json"))
     notice = next(one for one in found["notices"] if one["code"] == "reference-displaced")
     np.testing.assert_allclose(notice["reference_off_m"], (5.0, -3.0), atol=0.2)
-    assert (notice["points"], "put the reference +" in notice["text"]) == (5, True)
+    assert (notice["points"], "reference, and so the ortho, is displaced by +" in notice["text"]) == (5, True)
     suspects = {one["id"] for one in found["outlying"]}
     assert suspects & set(points.ids) == {points.ids[2]}
 

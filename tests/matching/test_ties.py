@@ -322,4 +322,4 @@ def test_what_succeeded_between_two_images_is_never_more_than_was_tried() -> Non
     tied = Tied(_points(ties, ("a", "b", "c")), ties, 100.0, 10.0)
     last = tied.to_json()["pairs"][-1]
     assert (last["ties"], last["matched"], last["tried"]) == (4, 1, 2)
-    assert "b - c: 4 ties; 1 of 2 matches tried between these two images succeeded" in tied.summary()
+    assert "b - c: 4 tie points (1 of 2 matches between them succeeded)" in tied.summary()

@@ -413,7 +413,7 @@ def test_a_geoid_that_cannot_be_fetched_as_it_is_stored_makes_no_ortho(
     monkeypatch.setattr("ortho_pipeline.commands.heights.automatic.missing_grid", lambda _: "us_nga_egm08_25.tif")
     monkeypatch.setattr("ortho_pipeline.commands.heights.automatic.fetch_grid", damaged)
     surface = SurfaceOptions(dem="auto", source=bucket.address)
-    with pytest.raises(DatumError, match="cannot be fetched") as caught:
+    with pytest.raises(DatumError, match="cannot download the geoid grid") as caught:
         rectify(tiny.image, tmp_path / "no", surface=surface, scene=SceneOptions(allow_network=True))
     assert caught.value.file == "https://grids/here"
     assert not list((tmp_path / "no").glob("*"))
@@ -555,5 +555,5 @@ def test_the_cache_is_listed_verified_and_cleared(bucket: PublicFolder, geoid: s
     verified = runner.invoke(cli, ["cache", "verify", "--json"])
     assert verified.exit_code == 1
     assert json.loads(verified.stdout)["files"][0]["state"] == "of another size"
-    assert "Removed" in runner.invoke(cli, ["cache", "clear"]).stdout
+    assert "Deleted" in runner.invoke(cli, ["cache", "clear"]).stdout
     assert json.loads(runner.invoke(cli, ["cache", "list", "--json"]).stdout)["files"] == []

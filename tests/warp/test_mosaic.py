@@ -242,7 +242,7 @@ def test_a_mosaic_says_what_is_missing_and_parts_make_none(block):
     for field in ("crs", "resolution"):
         text = FILE.replace('crs: "EPSG:32734", ', "") if field == "crs" else FILE.replace(", resolution: 5", "")
         (block / "p.yaml").write_text(text.replace("FORMAT", "VRT"))
-        with pytest.raises(InputError, match="share a grid") as caught:
+        with pytest.raises(InputError, match="need a common grid") as caught:
             batch.run(block / "p.yaml", executor="sequential")
         assert caught.value.field == f"defaults.output.{field}"
 

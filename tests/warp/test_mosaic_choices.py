@@ -314,7 +314,7 @@ def test_what_cannot_be_is_refused(tmp_path):
         assert not (tmp_path / "m.vrt").exists()
     with pytest.raises(InputError, match="given twice"):
         mosaic([*paths, one.path], tmp_path / "m.tif")
-    with pytest.raises(InputError, match="read and written"):
+    with pytest.raises(InputError, match="both input and output"):
         mosaic(paths, one.path)
     palette = gdal.ColorTable()
     for name in "pq":

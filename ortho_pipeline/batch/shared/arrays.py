@@ -1,4 +1,4 @@
-"""Which part of a run a worker of an array of jobs makes, by what its environment says."""
+"""The part of a run for a worker of a job array, from its environment."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from ortho_pipeline.errors import InputError
 
-#: Environment variable: how many workers there are, where the array does not say it.
+#: Environment variable: number of workers, if the array does not give it.
 COUNT = "ORTHO_SHARDS"
 _AWS, _KUBERNETES, _SLURM = "AWS_BATCH_JOB_ARRAY_INDEX", "JOB_COMPLETION_INDEX", "SLURM_ARRAY_TASK_ID"
 _MOST = 1_000_000
@@ -19,15 +19,15 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
     Raises
     ------
     InputError
-        If the environment is of none of these, of several, or does not say how many workers there are.
+        If the environment has none or several of these, or not the number of workers.
     """
     kinds = [name for name in (_AWS, _KUBERNETES, _SLURM) if name in environment]
     if len(kinds) != 1:
-        what = "no array of jobs" if not kinds else f"several arrays of jobs ({', '.join(kinds)})"
+        what = "no job array" if not kinds else f"several job arrays ({', '.join(kinds)})"
         raise InputError(
-            f"the environment is that of {what}",
+            f"the environment describes {what}",
             field="shard",
-            remedy=f"say the part itself, such as 1/4; one of {_AWS}, {_KUBERNETES}, {_SLURM} is looked for",
+            remedy=f"give the part, such as 1/4, or set one of {_AWS}, {_KUBERNETES}, {_SLURM}",
         )
     kind = kinds[0]
     index, first, step = _number(environment, kind, 0), 0, 1
@@ -42,14 +42,16 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
         count = _number(environment, COUNT, 1)
     if count is None:
         raise InputError(
-            f"{kind} says which worker this is, and nothing how many there are",
+            f"{kind} gives the number of this worker, but not how many there are",
             field="shard",
             remedy=f"set the environment variable {COUNT} to the number of workers",
         )
     part, rest = divmod(index - first, step)
     if rest or not 0 <= part < count:
         raise InputError(
-            f"{kind} is {index}, which is no worker of {count}", field="shard", remedy=f"correct {COUNT} or the array"
+            f"{kind} is {index}, which does not fit {count} workers",
+            field="shard",
+            remedy=f"correct {COUNT} or the array",
         )
     return part + 1, count
 
@@ -57,5 +59,5 @@ def part_of_array(environment: Mapping[str, str] = os.environ) -> tuple[int, int
 def _number(environment: Mapping[str, str], name: str, least: int) -> int:
     text = environment[name].strip()
     if not (text.isascii() and text.isdigit() and len(text) < 10 and least <= int(text) <= _MOST):
-        raise InputError(f"{name} is {text[:40]!r}, which is no number of a worker", field="shard", remedy="correct it")
+        raise InputError(f"{name} is {text[:40]!r}, which is not a valid number", field="shard", remedy="correct it")
     return int(text)

@@ -18,7 +18,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import json_text
 from ortho_pipeline.stores.objects import Conflict, Objects
 
-#: Seconds after which a lease that nobody renews is another's to take; it is renewed four times in that time.
+#: Seconds after which another worker may take a lease that is not renewed; it is renewed four times in that time.
 PATIENCE = 120.0
 _RENEWALS = 4
 _LEASE, _RESULT = ".lease.json", ".result.json"
@@ -97,31 +97,31 @@ class Leases:
         Parameters
         ----------
         seen : str, optional
-            The version that may be taken over: that of a worker that does not live.
+            The version that may be taken over, of a dead worker.
         """
         data = lease_document(self._holder, 0)
         try:
-            made = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
+            taken = self._store.put(name + _LEASE, data, new=seen is None, replacing=seen)
         except Conflict:
             with contextlib.suppress(FileNotFoundError):
                 return self._store.version(name + _LEASE) or ""
             return ""
-        return Lease(self._store, name, made.version, self._holder)
+        return Lease(self._store, name, taken.version, self._holder)
 
     def result(self, name: str) -> RunRecord | None:
         """Return the result of a scene, None where there is none of its name that can be understood."""
         try:
-            found = RunRecord.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
+            record = RunRecord.parse(self._store.read(name + _RESULT, MAX_BYTES)[0])
         except (FileNotFoundError, InputError):
             return None
-        return found if found is not None and found.name == name else None
+        return record if record is not None and record.name == name else None
 
     def finished(self) -> frozenset[str]:
         """Return the names of the scenes that have a result."""
         return frozenset(name.removesuffix(_RESULT) for name, _ in self._store.names() if name.endswith(_RESULT))
 
     def forget(self, name: str) -> None:
-        """Remove result and lease of a scene that is to be made again."""
+        """Delete result and lease of a scene, so that it is made again."""
         self._store.delete(name + _RESULT)
         self._store.delete(name + _LEASE)
 

@@ -28,7 +28,7 @@ from ortho_pipeline.stores.delivery import delivered
 from ortho_pipeline.stores.objects import Objects
 
 _SUMMARY = "run.json"
-#: Seconds between two looks at what the others do.
+#: Seconds between two checks of the other workers.
 _LONGEST_NAP = 5.0
 Make = Callable[[Job], Outcome]
 
@@ -100,7 +100,9 @@ def _made(where: SharedFolder, make: Make, job: Job, lease: Lease) -> Outcome:
                     path.replace(delivery.folder / path.name)
             stored = delivery.stored
             outputs = tuple(
-                one.replaced(mtime_ns=0, tag=stored[one.path].tag) for one in record.outputs if one.path in stored
+                state.replaced(mtime_ns=0, tag=stored[state.path].tag)
+                for state in record.outputs
+                if state.path in stored
             )
             record = record.replaced(outputs=outputs)
             outcome = dataclasses.replace(outcome, files=_files(where, record))
@@ -113,34 +115,34 @@ def _goes_along(path: Path) -> bool:
 
 
 def _files(where: SharedFolder, record: RunRecord) -> dict[str, str]:
-    return {one.role: f"{where.address_of(record.name)}/{one.path}" for one in record.outputs}
+    return {state.role: f"{where.address_of(record.name)}/{state.path}" for state in record.outputs}
 
 
 def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
-    """Return in what a scene is not as its record says; empty if it is.
+    """Return how a scene differs from its record; empty if it does not.
 
     Outputs are asked of the store: size and tag, or with `where.checksums` the content.
     """
     if not is_scene(record):
-        return "its record is that of no finished scene"
+        return "its record is incomplete"
     store = Objects(where.address_of(job.name), allow_network=where.allow_network)
-    for one in record.outputs:
+    for state in record.outputs:
         try:
             if where.checksums:
-                same = store.read(one.path, one.bytes)[1].sha256 == one.sha256
+                same = store.read(state.path, state.bytes)[1].sha256 == state.sha256
             else:
-                same = store.stated(one.path) == (one.bytes, one.tag)
+                same = store.stated(state.path) == (state.bytes, state.tag)
         except (FileNotFoundError, InputError):
-            return f"{one.path} is gone, or larger than it was"
+            return f"{state.path} is missing or has grown"
         if not same:
-            return f"{one.path} is not as it was written"
+            return f"{state.path} has changed"
     if inputs_as_recorded(record, job, where.checksums) is None:
         return "its inputs, settings or software have changed"
     return ""
 
 
 def outcome_of(where: SharedFolder, record: RunRecord) -> Outcome:
-    """Return the outcome that a record tells: what another worker, or an earlier run, has made is unchanged."""
+    """Return the outcome of a record; a scene of another worker or an earlier run is unchanged."""
     status = "failed" if record.status == "failed" else "unchanged"
     return Outcome(record.name, status, record.seconds, _files(where, record), record.facts, record.error)
 
@@ -205,7 +207,7 @@ def run_shared(
 
 
 def _unfit(where: SharedFolder, leases: Leases, job: Job) -> bool:
-    """Tell whether a result says nothing, or is that of another scene than the one that is asked for now."""
+    """Return whether a result is invalid, or belongs to another version of the scene."""
     there = leases.result(job.name)
     if there is None or there.status not in ("done", "failed"):
         return True
@@ -221,7 +223,7 @@ def _collected(
             continue
         there = leases.result(job.name)
         unfinished = there is None or there.status not in ("done", "failed")
-        why = "nobody has finished it" if unfinished else ""
+        why = "no worker has finished it" if unfinished else ""
         if there is not None and there.status == "done":
             why = why_stale(where, job, there)
         if there is None or why:
@@ -234,9 +236,9 @@ def _collected(
 def summary_of(planned: Plan, where: SharedFolder) -> BatchResult:
     """Collect the results of all workers, and write them beside the scenes as ``run.json``; make nothing."""
     begin = time.monotonic()
-    found = tuple(_collected(where, where.leases(), planned, {}))
+    outcomes = tuple(_collected(where, where.leases(), planned, {}))
     store = Objects(where.address, allow_network=where.allow_network)
     files: dict[str, Any] = {"summary": store.of(_SUMMARY)}
-    result = BatchResult(found, files, time.monotonic() - begin)
+    result = BatchResult(outcomes, files, time.monotonic() - begin)
     store.put(_SUMMARY, json_text(result.to_json()).encode())
     return result

@@ -1,1 +1,1 @@
-"""Commands about this machine: what is installed on it, and what is kept on it."""
+"""Commands about this machine: installed parts and cached files."""

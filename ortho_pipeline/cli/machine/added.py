@@ -19,7 +19,7 @@ GROUP = "ortho_pipeline_commands"
 
 
 class AddedCommands:
-    """What installed packages add; a package that breaks the contract is left out with a warning.
+    """The commands that installed packages add; a package that breaks the contract is skipped with a warning.
 
     Parameters
     ----------
@@ -53,14 +53,15 @@ class AddedCommands:
             If its package fails, or its target is no command of click.
         """
         module, _, attribute = self.offers[name].target.partition(":")
-        said = f"the command {name!r} of plugin {self._registry.owner[name]} cannot be loaded"
+        problem = f"the command {name!r} of plugin {self._registry.owner[name]} cannot be loaded"
         try:
             command = getattr(importlib.import_module(module), attribute)
         except (Exception, SystemExit) as error:
-            # A package is somebody else's code, and its other requirements may be missing.
+            # A package may fail in any way, and its requirements may be missing.
             raise PluginError(
-                f"{said} ({described(error, module)})", remedy="install what it needs, or report it to its author"
+                f"{problem} ({described(error, module)})",
+                remedy="install the missing requirement, or report the error to the author of the plugin",
             ) from error
         if not isinstance(command, click.Command):
-            raise PluginError(f"{said}: {module}:{attribute} is a {type(command).__name__}, not a command of click")
+            raise PluginError(f"{problem}: {module}:{attribute} is a {type(command).__name__}, not a click command")
         return command

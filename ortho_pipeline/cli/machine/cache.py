@@ -1,4 +1,4 @@
-"""``ortho cache``: the files of the network that are kept on this machine."""
+"""``ortho cache``: downloaded files that are cached on this machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cache() -> None:
 @cache.command("list")
 @json_option
 def list_kept(as_json: bool) -> None:
-    """List what is kept, and where."""
+    """List the cached files."""
     from ortho_pipeline import commands
 
     _print(commands.kept_files(), as_json)
@@ -33,33 +33,33 @@ def list_kept(as_json: bool) -> None:
 @json_option
 @click.pass_context
 def verify(ctx: click.Context, as_json: bool) -> None:
-    """Hold every file against its checksum; what is damaged is fetched again when it is needed."""
+    """Compare each cached file with its checksum. Damaged files are downloaded again when needed."""
     from ortho_pipeline import commands
 
     document = commands.kept_files(verify=True)
     _print(document, as_json)
-    if any(one["state"] != "sound" for one in document["files"]):
+    if any(file["state"] != "sound" for file in document["files"]):
         ctx.exit(_FAILED)
 
 
 @cache.command()
 @json_option
 def clear(as_json: bool) -> None:
-    """Remove all that is kept."""
+    """Delete all cached files."""
     from ortho_pipeline import commands
 
     document = commands.forget_kept_files()
     if as_json:
         return print_json(document)
-    say(f"Removed {counted(document['files'], 'file')} of {document['bytes'] / 1e6:.1f} MB from {document['folder']}")
+    say(f"Deleted {counted(document['files'], 'file')} ({document['bytes'] / 1e6:.1f} MB) from {document['folder']}")
     return None
 
 
 def _print(document: dict[str, Any], as_json: bool) -> None:
     if as_json:
         return print_json(document)
-    for one in document["files"]:
-        say(f"{one.get('state', ''):<8} {one['bytes'] / 1e6:9.1f} MB  {one['address']}".lstrip())
-    total = sum(one["bytes"] for one in document["files"])
+    for file in document["files"]:
+        say(f"{file.get('state', ''):<8} {file['bytes'] / 1e6:9.1f} MB  {file['address']}".lstrip())
+    total = sum(file["bytes"] for file in document["files"])
     say(f"{counted(len(document['files']), 'file')}, {total / 1e6:.1f} MB, in {document['folder']}")
     return None

@@ -1,4 +1,4 @@
-"""The commands `ortho sensors` and `ortho models`: what there is to choose from."""
+"""The commands `ortho sensors` and `ortho models`: lists of what is installed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sensors(as_json: bool) -> None:
         for option, text in sensor["options"].items():
             say(f"{'':<14}   {option}: {text}")
     for broken in document["broken"]:
-        say(f"left out: {broken['plugin']} ({broken['error']})", err=True)
+        say(f"Warning: plugin {broken['plugin']} was skipped ({broken['error']})", err=True)
     return None
 
 

@@ -1,4 +1,4 @@
-"""What is written to the terminal: printable characters, lines of a bounded length, whatever data hold."""
+"""Output for the terminal: only printable characters, and lines of bounded length."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def printable_json(text: str) -> str:
     """Return a JSON text, which escapes only a part of the control characters itself, with all of them as escapes."""
     if text.replace("\n", "").isprintable():
         return text
-    return "".join(one if one == "\n" or one.isprintable() else _escaped_in_json(one) for one in text)
+    return "".join(letter if letter == "\n" or letter.isprintable() else _escaped_in_json(letter) for letter in text)
 
 
 def _escaped_in_json(character: str) -> str:

@@ -12,9 +12,18 @@ from ortho_pipeline.options import SceneOptions
 
 @click.command(cls=Command)
 @image_argument
-@click.option("--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of its ends  [default: edges are looked for]")
-@click.option("--band", type=click.IntRange(min=1), default=1, show_default=True)
-@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="For JSON and a plot.")
+@click.option(
+    "--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of the ends of one edge.  [default: found automatically]"
+)
+@click.option("--band", type=click.IntRange(min=1), default=1, show_default=True, help="Band to measure.")
+@click.option(
+    "--output",
+    "-o",
+    "folder",
+    type=click.Path(file_okay=False),
+    metavar="DIR",
+    help="Folder for the result (JSON) and a plot.",
+)
 @network_option
 @json_option
 def edge(image: str, edge: str | None, band: int, folder: str | None, scene: SceneOptions, as_json: bool) -> None:
@@ -30,12 +39,13 @@ def edge(image: str, edge: str | None, band: int, folder: str | None, scene: Sce
 @click.command(cls=Command)
 @click.argument("images", nargs=-1, required=True, type=click.Path())
 @folder_option
-@click.option("--reference", metavar="IMAGE", help="Onto which the others are brought  [default: the first]")
+@click.option("--reference", metavar="IMAGE", help="Image to which the others are aligned.  [default: the first]")
 @click.option(
     "--transform",
     type=click.Choice(["similarity", "affine", "projective", "poly2"]),
     default="projective",
     show_default=True,
+    help="Transformation between the bands.",
 )
 @scene_options
 @json_option

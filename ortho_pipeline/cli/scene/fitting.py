@@ -47,8 +47,8 @@ def fit(
 
 @click.command(cls=Command)
 @image_argument
-@click.option("--models", default="all", show_default=True, metavar="all|A,B,C", help="Which models.")
-@click.option("--units", type=click.Choice(["px", "m"]), default="px", show_default=True, help="Of the table.")
+@click.option("--models", default="all", show_default=True, metavar="all|A,B,C", help="Models to compare.")
+@click.option("--units", type=click.Choice(["px", "m"]), default="px", show_default=True, help="Units of the table.")
 @click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the report.")
 @point_options
 @match_options

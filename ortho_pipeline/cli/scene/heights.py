@@ -32,5 +32,5 @@ def dem_check(
     """
     from ortho_pipeline import commands
 
-    given = {"crs": points_crs, "vertical": points_vertical}
-    print_result(commands.dem_check(dem, points, **given, surface=surface, scene=scene), as_json)
+    crs_options = {"crs": points_crs, "vertical": points_vertical}
+    print_result(commands.dem_check(dem, points, **crs_options, surface=surface, scene=scene), as_json)

@@ -27,7 +27,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
 
 @click.command(
     cls=Command,
-    one="It takes one image; 'ortho run PIPELINE.yaml' makes many, and all outputs go to the folder of '-o DIR'.",
+    one="Give one image; for several use 'ortho run PIPELINE.yaml'. Name the output folder with '-o DIR'.",
 )
 @image_argument
 @folder_option
@@ -35,8 +35,8 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
     "--overwrite",
     "-overwrite",
     is_flag=True,
-    help="Remove old models that would attach to the ortho, and what an unreported earlier run left. Outputs of the "
-    "same name are replaced without it.",
+    help="Also delete leftovers of earlier runs and sidecar files that GIS software would pick up. (Existing outputs "
+    "are always replaced.)",
 )
 @dry_run_option
 @point_options
@@ -90,7 +90,7 @@ class _Formats(click.Option):
         from ortho_pipeline import commands
 
         listed = ", ".join(f"{name} ({title})" for name, title in commands.formats().items())
-        self.help = f"{listed}. May be repeated.  [default: the four kinds of RPC]"
+        self.help = f"{listed}. May be repeated.  [default: rpc-txt,rpb,vrt,tag]"
         return super().get_help_record(ctx)
 
 
@@ -98,7 +98,7 @@ class _Formats(click.Option):
 @image_argument
 @folder_option
 @click.option("--format", "formats", cls=_Formats, multiple=True, metavar="F[,F...]", help="What to write.")
-@click.option("--force", is_flag=True, help="Accept a file that is more than 0.1 px from the model.")
+@click.option("--force", is_flag=True, help="Write a file even if it differs from the model by more than 0.1 px.")
 @point_options
 @match_options
 @scene_options
@@ -117,24 +117,30 @@ def export(
 ) -> None:
     """Write the model of IMAGE for other programs.
 
-    With --gcps or --reference the model is adjusted first. Formats: RPC as text, RPB, VRT, or tag of a copy; control
-    points (measured ones, otherwise a grid) as VRT and copy; geolocation arrays.
+    With --gcps or --reference the command adjusts the model first. It writes an RPC as text, RPB, VRT or tag of a
+    copy, control points (measured ones, otherwise a grid) as VRT and copy, and geolocation arrays.
     """
     from ortho_pipeline import commands
 
     chosen = [name.strip() for text in formats for name in text.split(",")]
-    given: dict[str, Any] = {"formats": chosen} if chosen else {}
+    formats_given: dict[str, Any] = {"formats": chosen} if chosen else {}
     result = commands.export(
-        image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **given
+        image, folder, scene=scene, points=points, surface=surface, match=match, force=force, **formats_given
     )
     print_result(result, as_json)
 
 
 @click.command(cls=Command)
 @click.argument("report_file", metavar="REPORT.json", type=click.Path())
-@click.option("--plots", "folder", required=True, type=click.Path(file_okay=False), metavar="DIR", help="Where to.")
 @click.option(
-    "--kind", type=click.Choice(["svg", "png"]), default="svg", show_default=True, help="PNG needs matplotlib."
+    "--plots", "folder", required=True, type=click.Path(file_okay=False), metavar="DIR", help="Folder of the plots."
+)
+@click.option(
+    "--kind",
+    type=click.Choice(["svg", "png"]),
+    default="svg",
+    show_default=True,
+    help="Format of the plots; png needs matplotlib.",
 )
 @network_option
 @json_option

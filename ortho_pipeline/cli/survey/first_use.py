@@ -21,30 +21,28 @@ from ortho_pipeline.options.texts import counted
 if TYPE_CHECKING:
     from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind
 
-#: What belongs to a scene.
+#: Kinds of files that belong to a scene.
 _KINDS: tuple[Kind, ...] = ("dem", "points", "map image")
-#: What one does with the program, and the command for it.
+#: The five most common tasks, and their commands.
 STEPS = (
-    ("See what is there, and what to do next", "ortho info FOLDER"),
-    ("Make an orthoimage, with control points", "ortho rectify scene.tif --dem dem.tif --gcps points.csv -o out"),
+    ("List your files and the next command", "ortho info FOLDER"),
+    ("Make an ortho with your control points", "ortho rectify scene.tif --dem dem.tif --gcps points.csv -o out"),
     (
-        "The same without, from an ortho of the place",
+        "Make one with automatic control points",
         "ortho rectify scene.tif --dem auto --allow-network --reference ortho.tif -o out",
     ),
     ("Compare models on the same points", "ortho compare scene.tif --gcps points.csv -o out"),
-    ("Make the orthos of many scenes", "ortho init FOLDER && ortho run FOLDER/pipeline.yaml"),
+    ("Make many orthos", "ortho init FOLDER && ortho run FOLDER/pipeline.yaml"),
 )
 
 
 def print_steps() -> None:
-    """Print the five things that one does."""
+    """Print the most common tasks."""
     wide = max(len(what) for what, _ in STEPS)
     say("Orthorectify satellite images and report how accurate the result is.\n")
     for what, line in STEPS:
         say(f"  {what:<{wide}}   {line}")
-    say(
-        "\n'ortho --help' lists all commands, 'ortho COMMAND --help' says all of one, 'ortho doctor' what is installed."
-    )
+    say("\n'ortho --help' lists all commands. 'ortho COMMAND --help' explains one. 'ortho doctor' checks your set-up.")
 
 
 @click.command(cls=Command)
@@ -54,8 +52,8 @@ def print_steps() -> None:
 def info(image: str, scene: SceneOptions, as_json: bool) -> None:
     """Describe an image, a DEM, an ortho or a folder.
 
-    For an image: sensor, model and its file, position, ground sample distance. For a DEM or an ortho: what it is, and
-    which option takes it. For a FOLDER: its scenes, DEMs and points, and the next command.
+    For an image: sensor, model and its file, position, ground sample distance. For a DEM or an ortho: its grid, and
+    the option to use it with. For a FOLDER: its scenes, DEMs and points, and the next command.
     """
     from ortho_pipeline import commands
 
@@ -95,9 +93,9 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
     option = FLAGS[document["option"]]
     lines = {
         "Raster": f"{document['image']}  ({document['size'][0]} x {document['size'][1]})",
-        "Looks like": "a DEM: one band of numbers with a sign, on a map"
+        "Looks like": "a DEM: one band of signed numbers on a map grid"
         if dem
-        else "an orthoimage or another raster on a map; it has no sensor model",
+        else "an ortho or another map raster; it has no sensor model",
         "Bands": f"{document['bands']}, {document['type']}, nodata {document['nodata']}",
         "CRS": document["crs"],
         **({"Heights": _heights_text(document)} if dem else {}),
@@ -111,7 +109,7 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
 
 def _heights_text(document: Mapping[str, Any]) -> str:
     low, high = document["heights"]
-    return f"about {low:.0f} to {high:.0f}, {document['vertical'] or 'vertical datum not declared'}"
+    return f"about {low:.0f} to {high:.0f}, {document['vertical'] or 'height datum not declared'}"
 
 
 def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
@@ -120,9 +118,9 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
     seen = survey(folder, scene)
     if as_json:
         return print_json({**seen.to_json(), "next": next_steps(seen)})
-    wide = max([0, *(len(one.path) for one in seen.found)])
-    for one in seen.found:
-        say(f"{one.kind:<10} {one.path:<{wide}}   {one.said}")
+    wide = max([0, *(len(file.path) for file in seen.found)])
+    for file in seen.found:
+        say(f"{file.kind:<10} {file.path:<{wide}}   {file.said}")
     say("\nNext:" if seen.found else "Next:")
     for line in next_steps(seen):
         say(f"  {line}")
@@ -130,7 +128,7 @@ def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:
 
 
 def next_steps(seen: FolderSurvey) -> list[str]:
-    """Return what to do next with what lies in a folder: sentences, and commands that work when they are pasted."""
+    """Return the next steps for the files of a folder: sentences, and commands to paste."""
     from ortho_pipeline.commands.survey.folder import NO_DATUM
 
     scenes, images = seen.of("scene"), seen.of("image")
@@ -141,32 +139,32 @@ def next_steps(seen: FolderSurvey) -> list[str]:
     if not scenes:
         if images and seen.of("points"):
             line = shlex.join(["ortho", "compare", at(images[0]), "--gcps", at(seen.of("points")[0])])
-            return ["No image has a model of its own; one can be fitted to the points:", f"  {line}"]
-        return ["No image with a model was found: put its metadata (RPC, DIMAP, .IMD ...) beside it."]
+            return ["No image has a sensor model. Fit one to the points:", f"  {line}"]
+        return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) beside the image."]
     dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
-    said, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
+    notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:
-        said.append(
-            "There is no DEM: '--dem FILE' gives one, '--dem auto --allow-network' downloads the Copernicus DEM under "
-            "the scene, '--height M' takes flat ground."
+        notes.append(
+            "No DEM found. '--dem auto --allow-network' downloads the Copernicus DEM under the scene. Or use "
+            "'--dem FILE', or '--height M' for flat ground."
         )
-    elif any(one.path == dems[0] and one.said.endswith(NO_DATUM) for one in seen.found):
-        said.append(
-            f"{dems[0]} does not declare its height datum: add '--dem-vertical egm96', 'egm2008' or 'ellipsoid', "
-            "whichever its vendor states."
+    elif any(entry.path == dems[0] and entry.said.endswith(NO_DATUM) for entry in seen.found):
+        notes.append(
+            f"{dems[0]} does not declare its height datum. Add the one that its vendor states: '--dem-vertical egm96', "
+            "'--dem-vertical egm2008' or '--dem-vertical ellipsoid'."
         )
     if points:
         words += ["--gcps", at(points[0])]
     elif maps:
         words += ["--reference", at(maps[0])]
-        said.append(f"There are no control points: they can be matched with {maps[0]}.")
+        notes.append(f"No control points found. The command below matches them with {maps[0]}.")
     else:
-        said.append(
-            "There are no control points: the ortho is as accurate as the model was delivered. '--gcps FILE' gives "
-            "measured ones, '--reference ORTHO' matches them with an ortho of the same place."
+        notes.append(
+            "No control points found. The ortho will be as accurate as the delivered model. To improve it, add "
+            "measured points ('--gcps FILE') or an ortho of the same place ('--reference ORTHO')."
         )
     if len(scenes) == 1:
-        return [*said, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
+        return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
     file, network = at("pipeline.yaml"), [] if dems else ["--allow-network"]
     lines = [
         shlex.join(words)
@@ -176,7 +174,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
             ["ortho", "run", file, *network],
         )
     ]
-    return [*said, f"Make the orthos of {counted(len(scenes), 'scene')}:", *(f"  {line}" for line in lines)]
+    return [*notes, f"Make the orthos of {counted(len(scenes), 'scene')}:", *(f"  {line}" for line in lines)]
 
 
 @click.command(cls=Command)
@@ -187,15 +185,15 @@ def next_steps(seen: FolderSurvey) -> list[str]:
     "path",
     type=click.Path(dir_okay=False),
     metavar="FILE",
-    help="Where to  [default: pipeline.yaml in the folder]",
+    help="Path of the pipeline file.  [default: pipeline.yaml in the folder]",
 )
-@click.option("--overwrite", is_flag=True, help="Replace the file if it is there.")
+@click.option("--overwrite", is_flag=True, help="Overwrite an existing file.")
 @scene_options
 @json_option
 def init(folder: str, path: str | None, overwrite: bool, scene: SceneOptions, as_json: bool) -> None:
     """Write a pipeline file for the scenes of FOLDER.
 
-    The file has comments and is for 'ortho run'.
+    The file is input for 'ortho run'. Its comments explain each setting.
     """
     from ortho_pipeline.commands.survey.pipeline_file import init as write
 

@@ -1,1 +1,1 @@
-"""Orthos as arrays in Python: pixels that are made when they are asked for."""
+"""Orthos as arrays in Python: computed when they are needed."""

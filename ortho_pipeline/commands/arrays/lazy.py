@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.warp.engine import TileMaker
     from ortho_pipeline.warp.job import WarpJob
 
-#: Options of files, and of rasters besides the ortho.
+#: Options of files, and of other rasters than the ortho.
 _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
 
 
@@ -50,7 +50,7 @@ def ortho_array(
     match: MatchOptions = MatchOptions(),
     output: OutputOptions = OutputOptions(),
 ) -> xarray.DataArray:
-    """Return the orthoimage of a scene as an array of which only those blocks are made that are asked for.
+    """Return the orthoimage of a scene as a lazy array: dask computes only the blocks that are used.
 
     The model is adjusted and the scene laid on its surface now; pixels are read and warped by dask, in threads, in
     processes or on a cluster. They are those of the file that `rectify` writes with the same options, bit by bit.
@@ -58,7 +58,7 @@ def ortho_array(
     Parameters
     ----------
     dem : path or SurfaceOptions
-        A DEM that says its height datum, or all that there is to say of heights.
+        A DEM that declares its height datum, or all options of heights.
     chunks : int, optional
         Side of a block in pixels, a multiple of `warp.lattice.BLOCK`.
 
@@ -86,8 +86,8 @@ def ortho_array(
     path = placed.scene.path if isinstance(image, Scene) else image
     # What is sent to other processes holds no options but these.
     opening = functools.partial(open_rasters, placed.scene, Request(path, scene, output=output))
-    made = Tiles(placed.model, opening, placed.surface, placed.grid, dataclasses.replace(output, extent=None))
-    return _array(placed, made, side)
+    tiles = Tiles(placed.model, opening, placed.surface, placed.grid, dataclasses.replace(output, extent=None))
+    return _array(placed, tiles, side)
 
 
 def _side(chunks: int | None) -> int:
@@ -135,8 +135,8 @@ class Tiles:
 
     def __call__(self, top: int, left: int, height: int, width: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return pixels ``(bands, height, width)`` of a tile, and which of them ``(height, width)`` are valid."""
-        made = self._ready().make((top, left, height, width))
-        return made.pixels, made.valid
+        tile = self._ready().make((top, left, height, width))
+        return tile.pixels, tile.valid
 
     def _ready(self) -> TileMaker:
         from ortho_pipeline.warp.job import WarpJob
@@ -169,7 +169,7 @@ def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
         raise InputError(
             f"lazy arrays need {error.name}, which is not installed",
             field="ortho_array",
-            remedy="pip install 'ortho-pipeline[xarray]'",
+            remedy="run pip install '.[xarray]' in the checkout of ortho-pipeline",
         ) from error
     grid, profile = placed.grid, tiles.profile
     maker = dask.delayed(tiles, traverse=False)
@@ -180,9 +180,9 @@ def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
         valid.append([])
         for left in range(0, grid.width, side):
             shape = min(side, grid.height - top), min(side, grid.width - left)
-            made = maker(top, left, *shape)
-            pixels[-1].append(da.from_delayed(made[0], (profile.count, *shape), dtype=profile.dtype))
-            valid[-1].append(da.from_delayed(made[1], shape, dtype=bool))
+            tile = maker(top, left, *shape)
+            pixels[-1].append(da.from_delayed(tile[0], (profile.count, *shape), dtype=profile.dtype))
+            valid[-1].append(da.from_delayed(tile[1], shape, dtype=bool))
     coordinates: dict[str, Any] = {
         "band": np.arange(1, profile.count + 1),
         "y": grid.top - grid.dy * (np.arange(grid.height) + 0.5),
@@ -203,4 +203,4 @@ def _reference(grid: Grid) -> dict[str, Any]:
 
 
 def _names(descriptions: Sequence[str]) -> tuple[str, ...]:
-    return tuple(one or f"band {number}" for number, one in enumerate(descriptions, start=1))
+    return tuple(description or f"band {number}" for number, description in enumerate(descriptions, start=1))

@@ -1,1 +1,1 @@
-"""What a scene is adjusted to: points that somebody measured, and matches with reference orthoimages."""
+"""Control of a scene: measured points, and matches with reference orthoimages."""

@@ -31,13 +31,13 @@ from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
-#: Ground of matches is exact (m): what is not known of it stands in the covariances in the image.
+#: Sigma (m) of the ground of matches: its errors are in the covariances in the image.
 _EXACT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """The points of a block, what people ought to know of them, and of what was matched documents, texts, heights."""
+    """The points of a block and their notices; documents, texts and heights of the matching."""
 
     table: BlockPoints
     notices: list[Notice]
@@ -54,7 +54,7 @@ def gather(
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
 ) -> Gathered:
-    """Return the points of images, called by their labels, from wherever the options say.
+    """Return the points of images, by label, from the sources in the options.
 
     Parameters
     ----------
@@ -86,11 +86,11 @@ def gather(
             document["ties"] = tied.to_json()
             text.append(tied.summary())
         if match.reference:
-            found = _matches(opened, match, heights, scenes[0])
-            tables.append(found.table)
-            notices += found.notices
-            document |= found.document
-            text += found.text
+            matches = _matches(opened, match, heights, scenes[0])
+            tables.append(matches.table)
+            notices += matches.notices
+            document |= matches.document
+            text += matches.text
     elif observes(options, surface):
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
         heights = open_surface(surface, scenes[0], under=alone)
@@ -104,7 +104,7 @@ def settled_scenes(
     options: BlockOptions,
     surface: SurfaceOptions = SurfaceOptions(),
 ) -> tuple[list[SceneOptions], list[Notice]]:
-    """Return how images are opened, with the place of crops that their points or the DEM settle, and notices.
+    """Return the options of images, with the offset of crops that points or DEM decide, and notices.
 
     Raises
     ------
@@ -131,21 +131,21 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
     """
     if options.points is None and options.ties is None:
         raise InputError(
-            "the images have no points in common",
+            "no points connect the images",
             field="points.points",
             remedy=Text(
                 "give measured points with ",
                 Setting("points.points", "FILE"),
                 ", or ",
                 Setting("points.ties", "auto"),
-                " to find ties",
+                " to find tie points by matching",
             ),
         )
     if options.points is None:
         for name in ("gcps", "check", "ground_sigma"):
             if getattr(options, name) is not None:
                 raise InputError(
-                    Text(Setting(f"points.{name}"), " chooses among points of a file, and there is no file"),
+                    Text(Setting(f"points.{name}"), " needs a file of points, and none is given"),
                     field=f"points.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.points")),
                 )
@@ -153,13 +153,13 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
         for name in ("search", "points"):
             if getattr(match, name) != getattr(MatchOptions, name):
                 raise InputError(
-                    "this is said of matching, and nothing is matched",
+                    "this option is for matching, and nothing is matched",
                     field=f"match.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.ties", "auto")),
                 )
         if has_surface(surface) and not observes(options, surface):
             raise InputError(
-                "heights serve matching, and nothing is matched",
+                "heights are used only for matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",
                 remedy=Text("leave them out, or give ", Setting("points.ties", "auto")),
             )
@@ -167,7 +167,7 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
     for name in ("reference_bands", "search_rotation", "reference_sigma"):
         if getattr(match, name) is not None and not match.reference:
             raise InputError(
-                "this is said of a reference, and there is none",
+                "this option is for matching with a reference, and none is given",
                 field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
             )
@@ -181,14 +181,14 @@ def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
     for name in ("dem_bias", "dem_correlation", "dem_shift_sigma"):
         if getattr(options, name) is not None and not observes(options, surface):
             raise InputError(
-                "this describes DEM heights that are observations, and there are none",
+                "this option describes DEM heights used as observations, and there are none",
                 field=f"points.{name}",
                 remedy=Text("leave it out, or give ", remedy),
             )
 
 
 def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
-    """Tell whether the heights of a DEM are observations of the ties."""
+    """Return whether the heights of a DEM are observations of the ties."""
     return surface.dem is not None and options.dem_heights == "on"
 
 
@@ -200,49 +200,49 @@ def observed(options: BlockOptions, surface: SurfaceOptions, heights: Surface | 
 
 
 def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOptions) -> list[Notice]:
-    """Return a notice if control of a block was matched: it does not say where the reference lies."""
+    """Return a notice if control of a block was matched: its accuracy is relative to the reference."""
     common = fit.common_error
     if not match.reference and common is None:
         return []
-    floor, beside = "how accurate that is was not stated", ""
+    floor, beside = "the accuracy of the reference is not stated", ""
     sigma = None if common is None else float(common.sigmas.max())
     if common is not None and sigma:
-        floor = f"its own {metres(sigma)} per axis, common to all matches, are the floor of that, and in the sigmas"
+        floor = f"the sigmas include its {metres(sigma)} per axis, which all matches have in common"
         if common.value.any():
             east, north = common.value * sigma
-            beside = f"; the rest of the block puts it {east:+.2f} m to the east and {north:+.2f} m to the north"
-    part = "all control was matched" if options.points is None else "control was matched"
+            beside = f". The rest of the block moves it by {east:+.2f} m east and {north:+.2f} m north"
+    part = "all control points were matched" if options.points is None else "control points were matched"
     text = (
-        f"{part}: accuracy is relative to the reference, and {floor}{beside}; an error that images and reference have "
-        "in common is not seen"
+        f"accuracy is relative to the reference, because {part}; {floor}{beside}. An error common to images and "
+        "reference cannot be detected"
     )
     if fit.points.groups is not None and not fit.shared_errors:
-        text += "; what neighbouring matches err together is not in the sigmas: this block is too large for that"
+        text += ". The block is too large to include errors common to neighbouring matches in the sigmas"
     elif len(fit.shared_errors) > 1:
-        text += "; what neighbouring matches err together is in the sigmas, for each image as if it had its own"
+        text += ". The sigmas include errors common to neighbouring matches, estimated separately for each image"
     return [Notice("relative-to-reference", text, reference_sigma_m=sigma, in_sigmas=common is not None)]
 
 
 def _matches(scenes: Any, match: MatchOptions, surface: Any, opened: SceneOptions) -> Gathered:
-    """Return the matches of each scene with the references; of those that no reference shows there are none."""
+    """Return the matches of each scene with the references; none for scenes outside all references."""
     tables: dict[str, Points] = {}
     notices, document, text = list[Notice](), dict[str, Any](), list[str]()
     first: InputError | None = None
     for label, scene in scenes.items():
         try:
-            found = match_scene(scene, match, surface, opened)
+            matched = match_scene(scene, match, surface, opened)
         except InputError as error:
             first = first or error
             notices.append(
                 Notice("no-matches", Text("not matched with the reference: ", error.message)).in_image(label)
             )
             continue
-        points = found.matches.points
+        points = matched.matches.points
         tables[label] = replace(
             points, ids=tuple(f"{label} {name}" for name in points.ids), sigma_ground=np.full((len(points), 3), _EXACT)
         )
-        notices += [notice.in_image(label) for notice in found.notices]
-        document[label] = found.to_json()
+        notices += [notice.in_image(label) for notice in matched.notices]
+        document[label] = matched.to_json()
         text.append(f"{label}: {counted(len(points), 'match', 'matches')} with the reference")
     if not tables and first is not None:
         raise first
@@ -260,7 +260,7 @@ def read_points(
     *,
     whole: bool = True,
 ) -> tuple[BlockPoints, list[Notice]]:
-    """Return the points of a file in these images, and what people ought to know of them.
+    """Return the points of a file in these images, and notices.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def read_points(
         For a wrong file, or if there is none.
     """
     if options.points is None:
-        raise InputError("there are no points", field="points.points", remedy="give a file of points")
+        raise InputError("no points given", field="points.points", remedy="give a file of points")
     read = read_block_points(
         located(options.points, allow_network=allow_network),
         gcps=None if options.gcps is None else located(options.gcps, allow_network=allow_network),
@@ -288,23 +288,23 @@ def read_points(
         table = table.with_ground_sigma(*_sigmas(options.ground_sigma))
     notes = []
     if strangers:
-        text = f"points of images that are not given play no part: {', '.join(strangers[:10])}"
+        text = f"skipped the points of images that are not in the block: {', '.join(strangers[:10])}"
         notes.append(Notice("images-not-given", text, images=strangers[:10]))
     flat = table.control & ~np.isfinite(table.ground[:, 2])
     if flat.any():
         names = np.array(table.ids)[flat][:10].tolist()
-        text = f"control points without a height weigh in in plan only: {', '.join(names)}"
+        text = f"control points without a height count in plan only: {', '.join(names)}"
         notes.append(Notice("control-without-height", text, points=names))
     return table, notes
 
 
 def _sigmas(text: str) -> list[float]:
-    """Return what ``XY`` or ``XY,H`` says."""
-    found = numbers_of(text)
-    if len(found) not in (1, 2) or not all(sigma > 0 for sigma in found):
+    """Return the sigmas of ``XY`` or ``XY,H``."""
+    sigmas = numbers_of(text)
+    if len(sigmas) not in (1, 2) or not all(sigma > 0 for sigma in sigmas):
         raise InputError(
-            f"{text!r} is not one sigma, or two",
+            f"{text!r} is neither one nor two positive numbers",
             field="points.ground_sigma",
-            remedy="give metres in plan, or in plan and height, such as 0.5,1",
+            remedy="give the sigma in plan, or in plan and height, in metres, such as 0.5,1",
         )
-    return found
+    return sigmas

@@ -26,7 +26,7 @@ from ortho_pipeline.report import document as reports
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.base import Surface
 
-#: Suffixes of files that say all that is known of a match.
+#: Suffixes of files that hold all properties of a match.
 _SUFFIXES = (".geojson", ".csv", ".tsv")
 
 
@@ -55,16 +55,14 @@ def match(
     Raises
     ------
     InputError
-        For whatever the user can correct; a place that cannot be told is no point.
+        If an input or an option is wrong.
     """
     if not match.reference:
-        raise InputError(
-            "there is nothing to match with", field="match.reference", remedy="give an orthoimage of the same place"
-        )
+        raise InputError("no reference given", field="match.reference", remedy="give an ortho of the same place")
     files = {"points": Path(output)}
     if files["points"].suffix.lower() not in _SUFFIXES:
         raise InputError(
-            "matches are not written in this format",
+            "matches cannot be written in this format",
             file=output,
             field="output",
             remedy=f"one of {', '.join(_SUFFIXES)}",
@@ -79,10 +77,10 @@ def match(
     matched = None if adjusted is None else adjusted.matched
     if matched is None:
         matched = match_scene(opened, match, heights, scene)
-    asked = request.asked("scene", "surface", "match")
-    record = provenance(request, opened, heights, resolved.ledger.hashed(), None, asked)
+    settings = request.asked("scene", "surface", "match")
+    record = provenance(request, opened, heights, resolved.ledger.hashed(), None, settings)
     points = matched.matches.points
-    # Those of a bundle or a strip serve its other images too, if they say where they were measured.
+    # Points of a bundle or strip also serve its other images, if they name the image in which they were measured.
     said = bool(opened.pieces) and files["points"].suffix.lower() != ".geojson"
     failure = None
     with together(files["points"].parent, files["points"].stem):
@@ -101,15 +99,17 @@ def _page(report: str | os.PathLike[str] | None) -> dict[str, Path]:
         return {}
     page = Path(report)
     if page.suffix.lower() != ".html":
-        raise InputError("the report of matches is a page", file=page, field="report", remedy="a name with `.html`")
+        raise InputError(
+            "the report of matches is an HTML page", file=page, field="report", remedy="use a name that ends in .html"
+        )
     return {"html": page, "report": page.with_suffix(".json")}
 
 
 def _write_page(
     adjusted: Adjusted, surface: Surface | None, record: Mapping[str, Any], files: Mapping[str, Path]
 ) -> None:
-    """Write what there is to see of the matches and of the model that they make."""
-    made = reports.build_report(
+    """Write the page of the matches and of the model that is fitted to them."""
+    report = reports.build_report(
         scene=adjusted.scene,
         fit=adjusted.fit,
         surface=surface,
@@ -117,6 +117,6 @@ def _write_page(
         matching=adjusted.matching,
         warnings=adjusted.warnings(surface),
     )
-    reports.write_report_json(made, files["report"])
+    reports.write_report_json(report, files["report"])
     matches = None if adjusted.matched is None else adjusted.matched.matches
-    reports.write_report_html(made, files["html"], matches=matches)
+    reports.write_report_html(report, files["html"], matches=matches)

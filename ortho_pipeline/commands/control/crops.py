@@ -68,14 +68,14 @@ def settled_options(
     Parameters
     ----------
     points : callable(number)
-        Returns the points of an image, of which those with known ground tell; None without any.
+        Returns the points of an image (only those with known ground count); None without any.
 
     Raises
     ------
     UndecidedCrop
         If nothing that is given decides.
     """
-    found, notices = list(scenes), []
+    settled, notices = list(scenes), []
     for number, (image, options) in enumerate(zip(images, scenes, strict=True)):
         # Few images are crops: they alone are opened once more.
         if options.crop_offset is not None or noted_offset(open_dataset(image, **options.access)) is None:
@@ -89,12 +89,12 @@ def settled_options(
             if decided is None:
                 raise
             notices.append(undecided.settled(*decided).notices[-1].in_image(os.fspath(image)))
-            found[number] = replace(options, crop_offset=undecided.offset if decided[0] else (0.0, 0.0))
-    return found, notices
+            settled[number] = replace(options, crop_offset=undecided.offset if decided[0] else (0.0, 0.0))
+    return settled, notices
 
 
 def _by_points(undecided: UndecidedCrop, points: Points) -> tuple[bool, str] | None:
-    """Return whether the model is to be moved, by the median distance of points from where it shows them."""
+    """Return whether to move the model, by the median distance of points from their predicted positions."""
     scene = undecided.scene
     known = points.select(np.isfinite(points.ground[:, :2]).all(axis=1))
     inside = ((known.image >= 0) & (known.image <= (scene.width, scene.height))).all(axis=1)
@@ -107,7 +107,7 @@ def _by_points(undecided: UndecidedCrop, points: Points) -> tuple[bool, str] | N
 
 
 def _by_heights(undecided: UndecidedCrop, surface: SurfaceOptions, options: SceneOptions) -> tuple[bool, str] | None:
-    """Return whether the model is to be moved, where the DEM lies under the crop for one of both alone."""
+    """Return whether to move the model, if the DEM covers the crop for only one of both positions."""
     if surface.dem is None or surface.dem == AUTO or Location(surface.dem).is_collection:
         return None
     heights = open_surface(surface, options)
@@ -129,7 +129,7 @@ def _share_on(heights: DemSurface, scene: Scene) -> float:
 
 
 def _by_matches(undecided: UndecidedCrop, request: Request) -> tuple[bool, str] | None:
-    """Return whether the model is to be moved, by where the reference shows the same."""
+    """Return whether to move the model, by matching with the reference."""
     if not request.match.reference or not has_surface(request.surface):
         return None
     for is_moved, scene in zip((False, True), undecided.both, strict=True):
@@ -146,7 +146,7 @@ def _by_matches(undecided: UndecidedCrop, request: Request) -> tuple[bool, str] 
 
 
 def _by_distance(undecided: UndecidedCrop, off: np.ndarray, what: str) -> tuple[bool, str] | None:
-    """Return whether the model is to be moved, of what is measured minus predicted by it as it was read."""
+    """Return whether to move the model, from measured minus predicted positions."""
     kept, moved = float(np.hypot(*off)), float(np.hypot(*(off + undecided.offset)))
     decided = nearer(kept, moved, undecided.offset)
     return None if decided is None else (decided, f"its {what} are there")

@@ -1,4 +1,4 @@
-"""Matching as a command does it: the scene and its references opened, how far to search, and what is said of it all."""
+"""Matching in a command: opens the scene and its references, chooses the search radius, and records the result."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
     from ortho_pipeline.imaging.matching import Matches, Reference, SceneView
 
-#: How far a model may be off (m) of which nothing is known, and at most this part of the scene's shorter side.
+#: Search radius (m) for a model of unknown accuracy, and its limit as a share of the scene's shorter side.
 DEFAULT_SEARCH, _PART = 100.0, 0.25
-#: Many times the sigma that a scene states are searched, and never less than so many pixels.
+#: Search radius in sigmas that a scene states, and its lower limit in pixels.
 _SIGMAS, _LEAST = 3.0, 8.0
-#: Degrees by which a pose that only metadata give may be turned.
+#: Largest rotation (degrees) of a pose that only metadata give.
 POSE_DEG = 5.0
-#: A reference that covers less than this of a scene is a notice.
+#: A reference that covers a smaller share of a scene gives a notice.
 _COVERS = 0.5
-#: A reference is probably made of the scene itself where the chips are as alike as that in the median, and the matches
+#: A reference was probably made from the scene itself if the median correlation of chips is this high and the matches
 #: agree to so many pixels: two images of one place have noise, heights and light of their own, and do not.
 _SAME, _EXACT = 0.97, 0.01
 #: Fields of the image in which matches are counted hold about so many that were tried; at most so many per side.
@@ -60,7 +60,7 @@ _PER_FIELD, _FIELDS = 5, 10
 
 @dataclass(frozen=True)
 class Search:
-    """How far the model of a scene may be off, and who says so.
+    """The search radius for a scene, and its source.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Search:
         Metres on the ground.
     source : str
     known : bool
-        Whether the user or the scene says so.
+        Whether the user or the scene states it.
     """
 
     distance: float
@@ -78,7 +78,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """What a scene and its references have in common.
+    """The matches of a scene with its references.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class Matched:
         Size (m) of a pixel on the ground.
     notices : tuple of Notice
     dem_sigma : float, optional
-        What the heights were said to be good for (m).
+        Stated accuracy (m) of the heights.
     """
 
     matches: Matches
@@ -112,13 +112,13 @@ class Matched:
 
     @property
     def shift(self) -> Array:
-        """How far (px) the delivered model is off: measured minus predicted, the median over the matches ``(2,)``."""
+        """Error (px) of the delivered model: measured minus predicted, median over the matches ``(2,)``."""
         shift: Array = -np.median(self.matches.offset[self.kept], axis=0)
         return shift
 
     @functools.cached_property
     def record(self) -> MatchingRecord:
-        """What is published of it; what its points say of a fit is told by `tested_by`."""
+        """The published record; `tested_by` adds the test of a fit by its points."""
         from ortho_pipeline.imaging.matching import REASONS
 
         matches, kept, points = self.matches, self.kept, self.matches.points
@@ -138,13 +138,13 @@ class Matched:
             reasons={name: count for name, count in reasons.items() if count},
             levels=tuple(
                 MatchLevel(
-                    factor=one.factor,
-                    radius=one.radius,
-                    chips=one.chips,
-                    agreeing=one.agreeing,
-                    shift_px=(-one.shift[0], -one.shift[1]),
+                    factor=level.factor,
+                    radius=level.radius,
+                    chips=level.chips,
+                    agreeing=level.agreeing,
+                    shift_px=(-level.shift[0], -level.shift[1]),
                 )
-                for one in matches.levels
+                for level in matches.levels
             ),
             shift_px=(shift[0], shift[1]),
             shift_m=float(np.hypot(*shift)) * self.pixel,
@@ -163,7 +163,7 @@ class Matched:
         )
 
     def tested_by(self, fit: Fit) -> MatchingRecord:
-        """Return the record with what matches and measured points say of a fit that they took no part in."""
+        """Return the record with the errors of a fit at matches and measured points that it did not use."""
         checks, matched = fit.points.check, fit.points.groups >= 0
         return self.record.replaced(
             relative=Tested.of(fit, checks & matched), absolute=Tested.of(fit, checks & ~matched)
@@ -181,40 +181,43 @@ class Matched:
             part = np.clip(self.matches.image[mask] / self.size * side, 0, side - 1).astype(int)
             counts[name] = np.bincount(part[:, 1] * side + part[:, 0], minlength=side**2).reshape(side, side)
         share = float((counts["kept"] > 0).mean())
-        return MatchCoverage.model_validate({"share": share, **{name: one.tolist() for name, one in counts.items()}})
+        return MatchCoverage.model_validate(
+            {"share": share, **{name: count.tolist() for name, count in counts.items()}}
+        )
 
     def summary(self) -> list[tuple[str, str]]:
-        """Return what people read of it, as rows of a name and a text."""
+        """Return the summary for people, as rows of a name and a text."""
         from ortho_pipeline.imaging.matching import REASONS
 
-        said = self.record
-        column, row = said.shift_px
-        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said.reasons.items())
+        record = self.record
+        column, row = record.shift_px
+        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in record.reasons.items())
         levels = "; ".join(
-            f"{one.agreeing} of {counted(one.chips, 'chip')} of 1/{one.factor} resolution agree" for one in said.levels
+            f"{level.agreeing} of {counted(level.chips, 'chip')} agree at 1/{level.factor} resolution"
+            for level in record.levels
         )
         sigma = self.options.reference_sigma
         return [
             (
                 "reference",
-                ", ".join(Path(one).name for one in self.references)
-                + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated"),
+                ", ".join(Path(level).name for level in self.references)
+                + (f", accuracy {metres(sigma)} per axis" if sigma else ", accuracy not stated"),
             ),
-            ("matches", f"{said.kept} of {said.tried} tried{': ' + reasons if reasons else ''}"),
+            ("matches", f"{record.kept} of {record.tried} tried{': ' + reasons if reasons else ''}"),
             (
                 "",
-                f"{said.control} control, {said.check} check (every fifth cell), in "
-                f"{said.coverage.share:.0%} of the fields of the image",
+                f"{record.control} control, {record.check} check (one cell in five); they cover "
+                f"{record.coverage.share:.0%} of the image",
             ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             (
                 "model off",
-                f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), {metres(said.shift_m)}",
+                f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
+                f"{metres(record.shift_m)}",
             ),
             (
                 "accuracy",
-                f"{px(said.sigma_px)} in the middle of the matches, relative to the reference: "
-                f"{said.components.text()}",
+                f"{px(record.sigma_px)} (median of the matches), relative to the reference: {record.components.text()}",
             ),
         ]
 
@@ -264,7 +267,7 @@ def match_scene(
     )
     with _of_references():
         matches = match(view, references, settings)
-    paths = tuple(one.path for one in references)
+    paths = tuple(reference.path for reference in references)
     notices = [
         *_default_search(search),
         *_made_of_scene(scene, references, matches),
@@ -302,15 +305,15 @@ def open_reference_views(
         )
     if not scene.models:
         raise InputError(
-            "this image has no model of its own to begin matching with",
+            "this image has no sensor model, which matching needs",
             file=scene.path,
             field="match.reference",
-            remedy=Text("give control points by hand with ", Setting("points.gcps")),
+            remedy=Text("give measured control points with ", Setting("points.gcps")),
         )
     with _of_references():
         references = open_references(options.reference, options.reference_bands or (), **opened.access)
-    for one in references:
-        _refuse_scene(scene, one)
+    for reference in references:
+        _refuse_scene(scene, reference)
     rasters = scene.rasters or (scene.path,)
     return SceneView(Intensity(RasterSource(*rasters, **opened.access)), scene.model, surface), references
 
@@ -330,7 +333,7 @@ def _of_references() -> Iterator[None]:
 
 
 def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
-    """Return how far (m) the model may be off: as the user says, as the scene says, or a default.
+    """Return the search radius (m): of the user, from the accuracy that the scene states, or a default.
 
     Parameters
     ----------
@@ -339,21 +342,21 @@ def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
     """
     if options.search is not None:
         least = 2.0 * pixel  # as far as chips are moved in any case
-        return Search(options.search, "as asked for") if options.search >= least else Search(least, "two pixels")
+        return Search(options.search, "as requested") if options.search >= least else Search(least, "two pixels")
     stated = _stated(scene, pixel)
     if stated is not None:
         sigma, source = stated
         return Search(max(_SIGMAS * sigma, _LEAST * pixel), f"{_SIGMAS:.0f} times {metres(sigma)}, {source}")
     part = _PART * min(scene.width, scene.height) * pixel
     if part < DEFAULT_SEARCH:
-        return Search(part, f"a default: the scene states no accuracy; {_PART:.0%} of its side", known=False)
-    return Search(DEFAULT_SEARCH, "a default: the scene states no accuracy", known=False)
+        return Search(part, f"default, as the scene states no accuracy; {_PART:.0%} of its side", known=False)
+    return Search(DEFAULT_SEARCH, "default, as the scene states no accuracy", known=False)
 
 
 def rotation_of(scene: Scene, options: MatchOptions) -> float:
-    """Return how far (degrees) the model may be turned: as the user says, or `POSE_DEG` where it is a pose.
+    """Return the largest rotation (degrees) of the model: of the user, or `POSE_DEG` if it is a pose.
 
-    An RPC is made of a pose that was adjusted: it is taken not to be turned.
+    An RPC comes from an adjusted pose, so no rotation is assumed.
     """
     if options.search_rotation is not None:
         return options.search_rotation
@@ -361,7 +364,7 @@ def rotation_of(scene: Scene, options: MatchOptions) -> float:
 
 
 def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
-    """Return the standard deviation (m) of a scene's model and who states it; None where nobody does."""
+    """Return the standard deviation (m) of a scene's model and its source; None if it is not stated."""
     model = scene.model
     if isinstance(model, RPC):
         errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
@@ -369,15 +372,15 @@ def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
             return math.hypot(*errors), "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
     names = model.param_names
     sigma = scene.facts.get("position_sigma_m")
-    # Of what has an orientation it is the position of the sensor, and the attitude errs too.
+    # With an orientation it is the position of the sensor, and the attitude has errors too.
     if not names and isinstance(sigma, int | float) and sigma > 0:
-        return float(sigma) * math.sqrt(2), "the accuracy of position in the metadata"
+        return float(sigma) * math.sqrt(2), "the position accuracy in the metadata"
     known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
     if names and set(names) <= set(known):
         centre = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
         spread = model.param_partials(centre)[0] * np.array([known[name] for name in names])
         if np.isfinite(spread).all():
-            return float(np.linalg.norm(spread)) * pixel, "what the sensor knows of its parameters"
+            return float(np.linalg.norm(spread)) * pixel, "the sigmas of the parameters in the metadata"
     return None
 
 
@@ -385,7 +388,7 @@ def _default_search(search: Search) -> list[Notice]:
     if search.known:
         return []
     text = Text(
-        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change it with ",
+        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change this with ",
         Setting("match.search"),
     )
     return [Notice("search-by-default", text, search_m=search.distance)]
@@ -400,28 +403,28 @@ def _partial(matches: Matches) -> list[Notice]:
 
 
 def _bands_apart(matches: Matches) -> list[Notice]:
-    """Return a notice if single bands of the references put the scene in different places."""
+    """Return a notice if single bands of the references give different positions of the scene."""
     from ortho_pipeline.imaging.band_shifts import agreeing, disagreeing, spread
 
     bands = matches.bands
     if not disagreeing(bands):
         return []
     agree = agreeing(bands)
-    said = ", ".join(
-        f"band {one.band} by {one.shift[0]:+.2f} ± {one.sigma[0]:.2f}, {one.shift[1]:+.2f} ± {one.sigma[1]:.2f}"
-        for one in bands
+    shifts = ", ".join(
+        f"band {band.band} by {band.shift[0]:+.2f} ± {band.sigma[0]:.2f}, {band.shift[1]:+.2f} ± {band.sigma[1]:.2f}"
+        for band in bands
     )
     text = Text(
-        "bands of the reference disagree about the place of the scene. Compared with the result, single ",
-        f"bands move it (column, row, px): {said}. The result is not known better than {spread(bands):.1f} px. ",
+        "bands of the reference give different positions of the scene, so the result is uncertain by ",
+        f"{spread(bands):.1f} px. Shifts of single bands from the result (column, row, px): {shifts}. ",
         "Choose bands that agree and look like the scene: ",
         Setting("match.reference_bands", ",".join(map(str, agree))),
     )
-    found = [{"band": one.band, "shift_px": list(one.shift), "sigma_px": list(one.sigma)} for one in bands]
-    return [Notice("bands-disagree", text, bands=found, agreeing=list(agree), spread_px=spread(bands))]
+    fields = [{"band": band.band, "shift_px": list(band.shift), "sigma_px": list(band.sigma)} for band in bands]
+    return [Notice("bands-disagree", text, bands=fields, agreeing=list(agree), spread_px=spread(bands))]
 
 
-# -- what a reference is not -----------------------------------------------------------------------------------------
+# -- the scene as its own reference --------------------------------------------------------------------------------
 
 
 def _refuse_scene(scene: Scene, reference: Reference) -> None:
@@ -430,27 +433,34 @@ def _refuse_scene(scene: Scene, reference: Reference) -> None:
     shown = {os.path.realpath(name) for name in reference.intensity.source.dataset.GetFileList() or ()}
     if own & {os.path.realpath(reference.path), *shown}:
         raise InputError(
-            "the reference is the scene itself: that says nothing of where it lies",
+            "the reference is the scene itself, so matching cannot find its position",
             file=reference.path,
             field="match.reference",
-            remedy="give an orthoimage that was made of other images",
+            remedy="give an ortho that was made from other images",
         )
 
 
 def _made_of_scene(scene: Scene, references: tuple[Reference, ...], matches: Matches) -> list[Notice]:
-    """Return a notice if the reference looks as if it were made of the scene."""
+    """Return a notice if the reference was probably made from the scene."""
     name, alike, agreement = Path(scene.path).name, median_correlation(matches), _agreement(matches)
-    why = next((f"{Path(one.path).name} names {name} as its source" for one in references if _names(one, name)), None)
+    why = next(
+        (
+            f"{Path(reference.path).name} names {name} as its source"
+            for reference in references
+            if _names(reference, name)
+        ),
+        None,
+    )
     if why is None and alike >= _SAME and agreement < _EXACT:
-        why = f"scene and reference are the same to {px(agreement)} (correlation {alike:.3f}), as two images hardly are"
+        why = f"scene and reference agree to {px(agreement)} (correlation {alike:.3f}), which two images hardly do"
     if why is None:
         return []
-    text = f"{why}: if the reference was made of this scene, the matches say nothing of where it lies"
+    text = f"{why}. If the reference was made from this scene, the matches prove nothing about its position"
     return [Notice("reference-made-of-scene", text, correlation=alike)]
 
 
 def _names(reference: Reference, image: str) -> bool:
-    """Tell whether a reference says that it was made of an image: in its metadata, or in the report beside it."""
+    """Return whether a reference was made from an image, by its metadata or its report."""
     described = reference.intensity.source.dataset.GetMetadata() or {}
     if any(image in str(text) for text in described.values()):
         return True
@@ -474,12 +484,14 @@ def _agreement(matches: Matches) -> float:
 def median_correlation(matches: Matches) -> float:
     """Return the median correlation of the intensities of scene and target in the chips that were kept."""
     kept = matches.reason == ""
-    one, other = (chips[kept].reshape(int(kept.sum()), -1).astype(float) for chips in (matches.scene, matches.target))
-    seen = np.isfinite(one) & np.isfinite(other)
-    count = np.maximum(seen.sum(axis=1), 1)[:, None]
-    one, other = (
-        np.where(seen, values - np.where(seen, values, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
-        for values in (one, other)
+    scene, target = (
+        chips[kept].reshape(int(kept.sum()), -1).astype(float) for chips in (matches.scene, matches.target)
     )
-    length = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-    return float(np.median((one * other).sum(axis=1) / np.where(length > 0, length, 1.0)))
+    seen = np.isfinite(scene) & np.isfinite(target)
+    count = np.maximum(seen.sum(axis=1), 1)[:, None]
+    scene, target = (
+        np.where(seen, values - np.where(seen, values, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
+        for values in (scene, target)
+    )
+    length = np.linalg.norm(scene, axis=1) * np.linalg.norm(target, axis=1)
+    return float(np.median((scene * target).sum(axis=1) / np.where(length > 0, length, 1.0)))

@@ -28,9 +28,9 @@ from ortho_pipeline.surface.base import Surface
 
 
 def control_of(resolved: Resolved) -> tuple[Points, Matched | None]:
-    """Return what a scene is adjusted to and held against: points of a file, matches with a reference, or both.
+    """Return the control and check points of a scene: of a file, matches with a reference, or both.
 
-    Points of a file stay themselves beside matches: they check, or control as their file says if the user wants that.
+    With matches, points of a file are check points; if the user wants it, they keep the roles of their file.
 
     Raises
     ------
@@ -70,20 +70,20 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
     if chosen is not None and points.gcps is None:
         raise InputError(
-            Text(Setting(f"points.{chosen}"), " chooses among ", Setting("points.gcps"), ", and there are none"),
+            Text(Setting(f"points.{chosen}"), " selects from ", Setting("points.gcps"), ", which is not given"),
             field=f"points.{chosen}",
-            remedy="leave it out: every fifth cell of the matches checks",
+            remedy="leave it out; one cell in five of the matches is reserved for checking",
         )
     if chosen is not None and match.gcps_as == "check":
         raise InputError(
-            Text(Setting(f"points.{chosen}"), " chooses among points that all check"),
+            Text(Setting(f"points.{chosen}"), " selects control points, but these points are all check points"),
             field=f"points.{chosen}",
             remedy=Text("leave it out, or give ", Setting("match.gcps_as", "control")),
         )
 
 
 def _refuse_idle(match: MatchOptions) -> None:
-    """Refuse what is said of matching where there is no reference.
+    """Refuse options of matching without a reference.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def _refuse_idle(match: MatchOptions) -> None:
     for name in ("reference_bands", "search", "search_rotation", "points", "reference_sigma", "gcps_as"):
         if getattr(match, name) != getattr(MatchOptions, name):
             raise InputError(
-                "this is said of matching, and there is no reference",
+                "this option is for matching, and no reference is given",
                 field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
             )
@@ -143,9 +143,9 @@ def read_control(scene: Scene, request: Request, surface: Surface | None = None)
     points = _given_points(scene, request, surface)
     if options.select is not None and options.check is not None:
         raise InputError(
-            Text(Setting("points.select"), " and ", Setting("points.check"), " both say which points check"),
+            Text(Setting("points.select"), " and ", Setting("points.check"), " both choose the check points"),
             field="points.select",
-            remedy="give one of them",
+            remedy="use one of them",
         )
     if options.select is not None:
         return select_control(points, options.select)
@@ -162,12 +162,12 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
     if path is None or os.fspath(path) == OWN_POINTS:
         if origin != "corner" or (path is None and not (crs is vertical is None)):
             raise InputError(
-                "these points say themselves what their coordinates are",
+                "these points already state their coordinate system",
                 field="points.pixel_origin",
                 remedy=Text(
-                    "leave ",
+                    "leave out ",
                     Setting("points.pixel_origin"),
-                    " out, and of points that are read already ",
+                    "; for a table of points also ",
                     Setting("points.crs"),
                     " and ",
                     Setting("points.vertical"),
@@ -182,7 +182,7 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
     name, path = Path(scene.path).name, located(path, allow_network=request.scene.allow_network)
     table = read_table(path, name, pieces)
     points = points_of(table, crs, vertical, origin)
-    # The same rows in the same order: the table says in which image each of them was measured.
+    # The same rows in the same order: the table names the image in which each was measured.
     named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in table.rows])
     for piece in scene.pieces:
         if piece.sees_apart:
@@ -208,10 +208,10 @@ def _taken_over(
     lost = there & ~np.isfinite(image).all(axis=1)
     if lost.any():
         raise InputError(
-            f"the point {points.ids[int(np.argmax(lost))]!r}, measured in {Path(piece.path).name}, is not seen here",
+            f"point {points.ids[int(np.argmax(lost))]!r} of {Path(piece.path).name} is not visible in this image",
             file=points.source,
             field="image",
-            remedy="leave it out for this image",
+            remedy="remove the point for this image",
         )
     scale = np.where(there, piece.scale, 1.0)
     return replace(
@@ -238,17 +238,17 @@ def no_points() -> Points:
 
 
 def with_heights(points: Points, surface: Surface | None) -> Points:
-    """Fill heights that a file does not give from the surface."""
+    """Fill missing heights from the surface."""
     missing = ~np.isfinite(points.ground[:, 2])
     if not missing.any():
         return points
     if surface is None:
         names = ", ".join(np.array(points.ids)[missing][:5])
         raise InputError(
-            f"{int(missing.sum())} of {counted(len(points), 'point')} without a height ({names})",
+            f"{int(missing.sum())} of {counted(len(points), 'point')} have no height ({names})",
             file=points.source,
             field="h",
-            remedy=Text("give heights in the file, or a DEM with ", Setting("surface.dem"), " to take them from"),
+            remedy=Text("add heights to the file, or give a DEM with ", Setting("surface.dem")),
         )
     ground = points.ground.copy()
     ground[missing, 2] = surface.heights(ground[missing, :2], points.crs)

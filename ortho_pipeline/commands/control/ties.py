@@ -43,15 +43,15 @@ if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
     from ortho_pipeline.imaging.ties import Ties
 
-#: How wrong (m) the heights of a DEM may be of which nothing is said, and those of ground that is taken to be flat.
+#: Assumed sigma (m) of the heights of a DEM without a stated accuracy, and of flat ground.
 DEM_SIGMA, FLAT_SIGMA = 10.0, 30.0
-#: Fewer ties than this between two scenes are said.
+#: Fewer ties than this between two scenes give a notice.
 _FEW = 30
 
 
 @dataclass(frozen=True, eq=False)
 class Tied:
-    """Ties between scenes, and what is said of them.
+    """Ties between scenes, with their notices.
 
     Parameters
     ----------
@@ -81,37 +81,37 @@ class Tied:
             "sigma_px": float(np.median(self.points.sigma_image)),
             "pairs": [
                 {
-                    "images": [names[one.images[0]], names[one.images[1]]],
-                    "ties": len(self.ties.of_pair(*one.images)),
-                    "tried": one.tried,
-                    "matched": one.ties,
-                    "shift_px": [-one.shift[0], -one.shift[1]],
-                    "height_m": None if one.components is None else one.components.height,
-                    "reason": one.reason,
+                    "images": [names[pair.images[0]], names[pair.images[1]]],
+                    "ties": len(self.ties.of_pair(*pair.images)),
+                    "tried": pair.tried,
+                    "matched": pair.ties,
+                    "shift_px": [-pair.shift[0], -pair.shift[1]],
+                    "height_m": None if pair.components is None else pair.components.height,
+                    "reason": pair.reason,
                 }
-                for one in self.ties.pairs
+                for pair in self.ties.pairs
             ],
         }
         document: dict[str, Any] = json_value(found)
         return document
 
     def summary(self) -> str:
-        """Return what people read of it."""
-        said = self.to_json()
+        """Return the summary for people."""
+        document = self.to_json()
         tracks = ", ".join(
-            f"{number} in {counted(int(count), 'image')}" for count, number in said["tracks_by_images"].items()
+            f"{number} in {counted(int(count), 'image')}" for count, number in document["tracks_by_images"].items()
         )
-        lines = [f"{counted(said['tracks'], 'tie point')}: {tracks}; {px(said['sigma_px'])} in the median"]
-        for one in said["pairs"]:
-            pair = f"{one['images'][0]} - {one['images'][1]}"
-            if one["reason"]:
-                lines.append(f"{pair}: no ties ({one['reason']})")
+        lines = [f"{counted(document['tracks'], 'tie point')}: {tracks}; median sigma {px(document['sigma_px'])}"]
+        for entry in document["pairs"]:
+            pair = f"{entry['images'][0]} - {entry['images'][1]}"
+            if entry["reason"]:
+                lines.append(f"{pair}: no tie points ({entry['reason']})")
                 continue
-            column, row = one["shift_px"]
+            column, row = entry["shift_px"]
             lines.append(
-                f"{pair}: {counted(one['ties'], 'tie')}; {one['matched']} of {one['tried']} matches tried "
-                f"between these two images succeeded; models apart by column "
-                f"{column:+.2f} px, row {row:+.2f} px; heights off by {metres(one['height_m'])}"
+                f"{pair}: {counted(entry['ties'], 'tie point')} ({entry['matched']} of {entry['tried']} matches "
+                f"between them succeeded); models differ by column {column:+.2f} px, row {row:+.2f} px; heights "
+                f"differ by {metres(entry['height_m'])}"
             )
         return "\n".join(lines)
 
@@ -136,14 +136,14 @@ def tie_scenes(
     from ortho_pipeline.imaging.ties import TieSettings, tie
 
     if len(scenes) < 2:
-        raise InputError("ties are between two images or more", field="images", remedy="give more images")
+        raise InputError("tie points need at least two images", field="images", remedy="give more images")
     for scene in scenes.values():
         if not scene.models:
             raise InputError(
-                "this image has no model of its own to begin matching with",
+                "this image has no sensor model, which matching needs",
                 file=scene.path,
                 field="images",
-                remedy="measure tie points by hand",
+                remedy="measure tie points yourself",
             )
     views = [
         SceneView(Intensity(RasterSource(*(scene.rasters or (scene.path,)), **opened.access)), scene.model, surface)
@@ -156,14 +156,14 @@ def tie_scenes(
     usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
     stated = typical_sigma(surface)
     sigma = usual if stated is None else stated
-    found = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
-    notices = [*_few(found, tuple(scenes))]
+    ties = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
+    notices = [*_few(ties, tuple(scenes))]
     if stated is None:
         text = Text(
             f"accuracy of the heights not given; assuming {metres(sigma)}. Set it with ", Setting("surface.sigma")
         )
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
-    return Tied(_points(found, tuple(scenes)), found, search, sigma, tuple(notices))
+    return Tied(_points(ties, tuple(scenes)), ties, search, sigma, tuple(notices))
 
 
 def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
@@ -187,16 +187,16 @@ def _points(ties: Ties, names: tuple[str, ...]) -> BlockPoints:
 
 def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
     """Return notices of pairs that were not tied, and of those with few ties."""
-    found = []
-    for one in ties.pairs:
-        pair = f"{names[one.images[0]]} and {names[one.images[1]]}"
-        number = len(ties.of_pair(*one.images))
+    notices = []
+    for pair in ties.pairs:
+        label = f"{names[pair.images[0]]} and {names[pair.images[1]]}"
+        number = len(ties.of_pair(*pair.images))
         if number >= _FEW:
             continue
-        why = f" ({one.reason})" if one.reason else ""
-        text = f"{counted(number, 'tie')} between {pair}, which show the same ground{why}"
-        found.append(Notice("few-ties", text, images=[names[image] for image in one.images], count=number))
-    return found
+        why = f" ({pair.reason})" if pair.reason else ""
+        text = f"only {counted(number, 'tie point')} between {label}, which show the same ground{why}"
+        notices.append(Notice("few-ties", text, images=[names[image] for image in pair.images], count=number))
+    return notices
 
 
 @with_items
@@ -222,21 +222,23 @@ def ties(
     Raises
     ------
     InputError
-        For whatever the user can correct.
+        If an input or an option is wrong.
     """
     names = names_of(images)
     files = {"ties": Path(output)}
     if files["ties"].suffix.lower() != ".csv":
-        raise InputError("ties are not written in this format", file=output, field="output", remedy="give a .csv file")
+        raise InputError(
+            "tie points cannot be written in this format", file=output, field="output", remedy="give a .csv file"
+        )
     require_heights(surface)
-    given = scenes_of(images, scene)
-    for image, own in zip(images, given, strict=True):
+    options = scenes_of(images, scene)
+    for image, own in zip(images, options, strict=True):
         inputs.check_paths(files, Request(image, own, surface=surface))
-    given, placed = settled_options(images, given, surface)
-    opened = (inputs.open_scene(image, own) for image, own in zip(images, given, strict=True))
+    options, placed = settled_options(images, options, surface)
+    opened = (inputs.open_scene(image, own) for image, own in zip(images, options, strict=True))
     scenes = dict(zip(names, opened, strict=True))
-    heights = open_surface(surface, given[0], under=scenes.values())
-    tied = tie_scenes(scenes, match, heights, given[0])
+    heights = open_surface(surface, options[0], under=scenes.values())
+    tied = tie_scenes(scenes, match, heights, options[0])
     write_text(output, _csv(tied.points))
     notices = placed + [notice.in_image(name) for name, one in scenes.items() for notice in one.notices]
     return Result(files, {"ties": tied.to_json(), **to_document([*notices, *tied.notices])}, tied.summary())

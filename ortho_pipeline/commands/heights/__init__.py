@@ -1,1 +1,1 @@
-"""Heights of a command: the DEM or the flat ground that its options say, how accurate it is, and where it is found."""
+"""Heights of a command: the DEM or flat ground of its options, its accuracy, and automatic DEMs."""

@@ -1,4 +1,4 @@
-"""Heights that are found by themselves: where the scenes of a command lie, and the cells under them."""
+"""Automatic heights: the extent of the scenes of a command, and the DEM cells under them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def open_automatic(options: SurfaceOptions, access: SceneOptions, memory: int, s
 
 
 def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
-    """Return where scenes lie: see `extent_under`.
+    """Return the extents of scenes: see `extent_under`.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
     extents = [extent_under(scene) for scene in scenes]
     if not extents:
         raise InputError(
-            "heights are only found under a scene",
+            "automatic heights need a scene",
             field="surface.dem",
             remedy=Text("give ", Setting("surface.dem", "FILE")),
         )
@@ -59,7 +59,7 @@ def extents_under(scenes: Iterable[Scene]) -> list[Extent]:
 
 
 def extent_under(scene: Scene) -> Extent:
-    """Return where a scene lies, whatever of the heights that its model is meant for the ground has there.
+    """Return the extent of a scene for all heights in the range of its model.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def extent_under(scene: Scene) -> Extent:
     """
     if not scene.models:
         raise InputError(
-            "an image without a model of its own does not say where it lies",
+            "this image has no sensor model, so its position is unknown",
             file=scene.path,
             field="surface.dem",
             remedy=Text("give ", Setting("surface.dem", "FILE")),
@@ -78,15 +78,15 @@ def extent_under(scene: Scene) -> Extent:
     levels = np.clip(model.height_range, *SANE_HEIGHTS)
     to_degrees = ground_transform(model.crs, "EPSG:4979")
     ground = np.concatenate([to_degrees(model.image_to_ground(ring, float(level))) for level in levels])
-    found = extent_of(ground[:, :2])
-    if found is None:
+    extent = extent_of(ground[:, :2])
+    if extent is None:
         raise InputError(
-            "no border pixel meets the ground: the model does not belong to this image",
+            "no pixel of the image border meets the ground: the model belongs to another image",
             file=scene.path,
             field="model",
-            remedy="give the metadata of this very image",
+            remedy="give the metadata of this image",
         )
-    return found
+    return extent
 
 
 def _require_geoid(allow_network: bool) -> None:
@@ -96,10 +96,10 @@ def _require_geoid(allow_network: bool) -> None:
         return
     if not allow_network:
         raise DatumError(
-            f"the cells' heights are above EGM2008, whose geoid grid {grid} is not installed",
+            f"the heights of the DEM cells need the geoid grid of EGM2008, {grid}, which is not installed",
             field="surface.dem",
             remedy=Text(
-                "fetch it once with `ortho doctor --fetch-grids`, allow the network with ",
+                "download it once with `ortho doctor --fetch-grids`, or use ",
                 Setting("scene.allow_network"),
                 ", or give the file with ",
                 Setting("surface.vertical", f"FOLDER/{grid}"),
@@ -109,7 +109,7 @@ def _require_geoid(allow_network: bool) -> None:
         fetch_grid(grid)
     except OrthoError as error:
         raise DatumError(
-            Text("the cells' heights are above EGM2008, and its geoid grid cannot be fetched: ", error.message),
+            Text("cannot download the geoid grid of EGM2008, which the heights of the DEM cells need: ", error.message),
             file=error.file,
             field="surface.dem",
             remedy=Text(

@@ -1,4 +1,4 @@
-"""The DEM or the flat ground that the options of a command say, and how accurate it is."""
+"""The DEM or flat ground of the options of a command, and its accuracy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def open_surface(
     Parameters
     ----------
     under : iterable of Scene
-        What lies on it, where heights are to be found.
+        Scenes on it, for automatic heights.
     memory : int
         Bytes of the whole job.
 
@@ -47,9 +47,9 @@ def open_surface(
     """
     if options.dem is not None and options.height is not None:
         raise InputError(
-            Text(Setting("surface.dem"), " and ", Setting("surface.height"), " exclude each other"),
+            Text(Setting("surface.dem"), " and ", Setting("surface.height"), " cannot be used together"),
             field="surface.height",
-            remedy="give one of them",
+            remedy="use one of them",
         )
     require_heights(options)
     sigma = open_sigma(options, scene, memory)
@@ -66,7 +66,7 @@ def open_surface(
 def open_sigma(
     options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
 ) -> float | Surface | None:
-    """Return the standard deviation of heights: a number (m), a raster of such, or None where nobody says.
+    """Return the standard deviation of heights: a number (m), a raster, or None if not stated.
 
     Raises
     ------
@@ -85,9 +85,9 @@ def open_sigma(
     if 0 < number <= _LARGEST_SIGMA:
         return number
     raise InputError(
-        f"{options.sigma} is no standard deviation",
+        f"{options.sigma} is not a standard deviation",
         field="surface.sigma",
-        remedy="give metres, or a raster of them such as Copernicus' height error mask",
+        remedy="give a number of metres, or a raster such as Copernicus' height error mask",
     )
 
 
@@ -98,16 +98,16 @@ def dem_as_stated(
     memory: int = OutputOptions.memory,
     extents: Sequence[Extent] = (),
 ) -> DemSurface:
-    """Open a DEM; of the options it is those that say how its heights are to be understood.
+    """Open a DEM with the options that interpret its heights.
 
     Parameters
     ----------
     extents : sequence of Extent
-        Where heights are wanted, of a STAC collection.
+        Needed areas of a STAC collection.
     """
     if options.source is not None:
         raise InputError(
-            "this says where heights are found, and the DEM is given",
+            "this option is only for automatic heights, and a DEM is given",
             field="surface.source",
             remedy=Text("leave it out, or give ", Setting("surface.dem", "auto")),
         )
@@ -124,7 +124,7 @@ def dem_as_stated(
 
 
 def dem_files(options: SurfaceOptions) -> list[str]:
-    """Return the files of the DEM that the user gave: one, those of a pattern, a collection's document, or none."""
+    """Return the files of the given DEM: one file, the files of a pattern, a collection's document, or none."""
     if options.dem is None or options.dem == AUTO:
         return []
     dem = Location(options.dem)
@@ -135,7 +135,7 @@ def require_heights(options: SurfaceOptions) -> None:
     """Raise an `InputError` if there are no heights."""
     if not has_surface(options):
         raise InputError(
-            "there are no heights of the ground",
+            "no heights given",
             field="surface.dem",
             remedy=Text(
                 "give ",
@@ -148,12 +148,12 @@ def require_heights(options: SurfaceOptions) -> None:
 
 
 def has_surface(options: SurfaceOptions) -> bool:
-    """Tell whether heights are given.
+    """Return whether heights are given.
 
     Raises
     ------
     InputError
-        If something is said of a DEM that is not given.
+        If an option of a DEM is set without a DEM.
     """
     idle = {
         "surface.vertical": options.vertical is not None,
@@ -162,9 +162,9 @@ def has_surface(options: SurfaceOptions) -> bool:
         "surface.sigma": options.sigma is not None and options.height is None,
         "surface.source": options.source is not None,
     }
-    for field in (field for field, given in idle.items() if given and options.dem is None):
+    for field in (field for field, is_set in idle.items() if is_set and options.dem is None):
         raise InputError(
-            "this is said of a DEM, and there is none",
+            "this option is for a DEM, and none is given",
             field=field,
             remedy=Text("leave it out, or give ", Setting("surface.dem")),
         )
@@ -173,7 +173,7 @@ def has_surface(options: SurfaceOptions) -> bool:
 
 def sigma_file(options: SurfaceOptions) -> str | os.PathLike[str] | None:
     """Return the raster of standard deviations of heights, None where there is none."""
-    given = options.sigma
-    if given is None or isinstance(given, float | int):
+    sigma = options.sigma
+    if sigma is None or isinstance(sigma, float | int):
         return None
-    return given if isinstance(given, os.PathLike) or math.isnan(number_of(given)) else None
+    return sigma if isinstance(sigma, os.PathLike) or math.isnan(number_of(sigma)) else None

@@ -1,1 +1,1 @@
-"""Layers beside an ortho: what they are made from."""
+"""Additional layers of an ortho, and their inputs."""

@@ -1,4 +1,4 @@
-"""Angles of view and of the sun beside an ortho."""
+"""Layers of view angles and sun angles of an ortho."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
 
 def sun_of(facts: Mapping[str, Any], output: OutputOptions) -> Sun | None:
-    """Return where the sun stands: as the user says, or the metadata; None where nobody says, or it is not asked.
+    """Return the position of the sun, from the user or the metadata; None if unknown or not needed.
 
     Raises
     ------
     InputError
-        If the user gives a sun that does not stand over the horizon, or one that nobody asks for.
+        If the given sun is below the horizon, or angles were not requested.
     """
     if not output.angles:
         if output.sun is not None:
             raise InputError(
-                "only the angles depend on the sun",
+                "the position of the sun is only used for angles",
                 field="output.sun",
-                remedy=Text("give ", Setting("output.angles"), " too, or leave it out"),
+                remedy=Text("add ", Setting("output.angles"), ", or leave it out"),
             )
         return None
     from ortho_pipeline.warp.quality.angles import Sun
@@ -61,7 +61,7 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
     sight, heights = Sight(placed.model, placed.grid), placed.footprint.heights
     resources = Resources(output.memory, output.threads)
     size = placed.scene.width, placed.scene.height
-    found = angles.write_angles(
+    result = angles.write_angles(
         sight,
         placed.surface,
         size,
@@ -71,7 +71,7 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
         sun=sun,
         resources=resources,
     )
-    layer = AnglesLayer(view_zenith_deg=found.view_zenith_deg, sun_deg=None, shadow_share=None)
+    layer = AnglesLayer(view_zenith_deg=result.view_zenith_deg, sun_deg=None, shadow_share=None)
     write_text(files["angles_style"], angles_style(layer))
     if sun is None:
         del files["shadow"]
@@ -80,5 +80,5 @@ def write_angles(placed: Placement, sun: Sun | None, files: dict[str, Path]) -> 
         sight, placed.surface, sun, files["shadow"], heights=heights, resources=resources, driver=output.format
     )
     return AnglesLayer(
-        view_zenith_deg=found.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
+        view_zenith_deg=result.view_zenith_deg, sun_deg=(sun.azimuth_deg, sun.elevation_deg), shadow_share=share
     )

@@ -1,4 +1,4 @@
-"""Layers beside an ortho: what is known of its errors, gathered from scene, points, surface and options."""
+"""The error budget of an ortho, from scene, points, surface and options, and its accuracy layer."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _OTHER_GEOID = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """What is known of the errors, and in words what is not and what is assumed.
+    """The error budget, with its unknown parts and its assumptions in words.
 
     `common` is the variance on the ground (m², both axes) that the covariance of the parameters has of the reference.
     """
@@ -53,7 +53,7 @@ class Known:
 
 
 def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
-    """Return what is known of the errors of an ortho, None where nobody asks, and what there is to say about it.
+    """Return the error budget of an ortho (None if not requested) and notices.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
     ]
     if not budget.knows_model and surface.sigma is None:
         raise InputError(
-            "nothing is known of the errors of this ortho: its model has no stated accuracy, and the heights have none",
+            "no accuracy raster possible: neither the model nor the heights have a stated accuracy",
             field="output.accuracy_raster",
             remedy=Text(
                 "give ",
@@ -94,9 +94,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
         )
     assumed = _assumptions(budget, surface)
     if output.fill_from is not None:
-        assumed.append(
-            f"pixels from {Path(output.fill_from).name} are as accurate as that is: the layer is of the others"
-        )
+        assumed.append(f"the layer does not describe pixels from {Path(output.fill_from).name}")
     known = Known(budget, tuple(unknown), tuple(assumed), covariance is not None, _common(placed))
     if not unknown:
         return known, []
@@ -105,9 +103,9 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
         "heights": Text("the heights (", Setting("surface.sigma"), ")"),
         "reference": Text("the reference (", Setting("match.reference_sigma"), ")"),
     }
-    said = Text.joined(" and of ", (names[name] for name in unknown))
+    sources = Text.joined(" and of ", (names[name] for name in unknown))
     text = Text(
-        "the raster of accuracy knows nothing of the errors of ", said, ": its figures are the least that there is"
+        "the accuracy raster does not include the errors of ", sources, ", which are unknown; real errors are larger"
     )
     return known, [Notice("accuracy-in-part", text, unknown=unknown)]
 
@@ -118,9 +116,9 @@ def stated_accuracy(model: SensorModel) -> float | None:
         model = model.model if isinstance(model, ImageCorrection) else model.first
     if not isinstance(model, RPC):
         return None
-    # What is not positive stands for unknown: -1 in the standard, 0 of some programs.
-    given = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
-    return math.hypot(*given) if given else None
+    # Values that are not positive mean unknown: -1 in the standard, 0 of some programs.
+    errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
+    return math.hypot(*errors) if errors else None
 
 
 def _covariance(placed: Placement) -> Array | None:
@@ -132,12 +130,14 @@ def _covariance(placed: Placement) -> Array | None:
         return predictive(fit.covariance, math.inf if fit.sigma0 is None else fit.degrees_of_freedom)
     if before is None or not placed.model.param_names:
         return None
-    found = _of_record(before, placed.model.param_names)
-    return None if found is None else predictive(found, _number(before.get("statistics"), "degrees_of_freedom"))
+    covariance = _of_record(before, placed.model.param_names)
+    return (
+        None if covariance is None else predictive(covariance, _number(before.get("statistics"), "degrees_of_freedom"))
+    )
 
 
 def _of_record(adjusted: Mapping[str, Any], names: tuple[str, ...]) -> Array | None:
-    """Return the covariance of parameters that a model file tells of; None where it does not tell of all."""
+    """Return the covariance of parameters in a model file; None if it is incomplete."""
     try:
         parameters = adjusted["parameters"]
         sigmas = np.array([float(parameters[name]["sigma"]) for name in names])
@@ -157,27 +157,27 @@ def _number(statistics: Any, name: str) -> float:
 
 
 def _datum(surface: Surface) -> float:
-    """Return the standard deviation (m) of what the heights of a surface are measured above."""
+    """Return the standard deviation (m) of the height datum of a surface."""
     if not isinstance(surface, DemSurface) or surface.vertical.is_ellipsoid:
         return 0.0
     return _GEOIDS.get(surface.vertical.name, _OTHER_GEOID)
 
 
 def _reference(warnings: tuple[Notice, ...], before: Mapping[str, Any] | None) -> tuple[float, bool]:
-    """Return what a reference that points were matched with may be off by beside what the parameters have of it.
+    """Return the error of the reference of matched points that the parameters do not include.
 
     Its standard deviation (m), and whether it is unknown.
     """
-    said = [one.fields for one in warnings if one.code == "relative-to-reference"]
-    said += [one for one in (before or {}).get("notices", ()) if one.get("code") == "relative-to-reference"]
-    if not said:
+    notices = [notice.fields for notice in warnings if notice.code == "relative-to-reference"]
+    notices += [notice for notice in (before or {}).get("notices", ()) if notice.get("code") == "relative-to-reference"]
+    if not notices:
         return 0.0, False
-    sigma = said[0].get("reference_sigma_m")
-    return 0.0 if said[0].get("in_sigmas") else float(sigma or 0.0), not sigma
+    sigma = notices[0].get("reference_sigma_m")
+    return 0.0 if notices[0].get("in_sigmas") else float(sigma or 0.0), not sigma
 
 
 def _common(placed: Placement) -> float:
-    """Return the variance (m², both axes) in the middle of the scene that control points have in common."""
+    """Return the variance (m², both axes) at the scene centre of errors common to all control points."""
     fit, scene = placed.adjusted.fit, placed.scene
     if fit.common_error is None:
         return 0.0
@@ -188,22 +188,22 @@ def _common(placed: Placement) -> float:
 
 
 def _assumptions(budget: Budget, surface: Surface) -> list[str]:
-    said = [
-        "errors of the model, of the heights and of the reference are independent of each other",
-        "the model follows the scene but for its parameters",
-        "an error is where the ortho shows a point, at its height, less where that is",
+    assumptions = [
+        "errors of model, heights and reference are independent",
+        "the model is right apart from its parameters",
+        "an error is the position of a point in the ortho, at its height, minus its true position",
     ]
     if budget.datum:
-        said.insert(1, f"the height datum is good to {metres(budget.datum)}")
+        assumptions.insert(1, f"the height datum is accurate to {metres(budget.datum)}")
     if budget.stated is not None:
-        said.append(f"the model is as good as its vendor states, {metres(budget.stated)} per axis")
+        assumptions.append(f"the model is accurate to {metres(budget.stated)} per axis, as its vendor states")
     if isinstance(surface.sigma, float | int):
-        said.append(f"the heights are as good as {metres(surface.sigma)} everywhere")
-    return said
+        assumptions.append(f"the heights are accurate to {metres(surface.sigma)} everywhere")
+    return assumptions
 
 
 def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | None = None) -> Path | Hiding:
-    """Return where the ortho is written, and what is done about pixels that terrain hides where somebody asks."""
+    """Return the path of the ortho; if requested, with the treatment of pixels that terrain hides."""
     if placed.request.output.visibility is None:
         return files["ortho"]
     from ortho_pipeline.warp.quality.hiding import Hiding
@@ -214,7 +214,7 @@ def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | No
 def write_layers(
     placed: Placement, known: Known | None, warped: WarpRecord, files: Mapping[str, Path]
 ) -> AccuracyLayer | None:
-    """Write the raster of accuracy and its style, if it was asked for, and return what the report says of it."""
+    """Write the accuracy raster and its style, if requested, and return its record for the report."""
     if known is None:
         return None
     from ortho_pipeline.warp.quality.accuracy import write_accuracy
@@ -222,7 +222,7 @@ def write_layers(
 
     budget = dataclasses.replace(known.budget, interpolation_px=warped.max_error_px)
     scene, output = placed.scene, placed.request.output
-    found = write_accuracy(
+    result = write_accuracy(
         budget,
         Sight(placed.model, placed.grid),
         placed.surface,
@@ -233,28 +233,28 @@ def write_layers(
         resources=Resources(output.memory, output.threads),
         metadata={"ASSUMPTIONS": "; ".join(known.assumptions), "UNKNOWN": ", ".join(known.unknown) or "nothing"},
     )
-    if not found.known:
+    if not result.known:
         raise InputError(
-            "the standard deviations of the heights reach no pixel of the ortho",
+            "the raster of height accuracy does not overlap the ortho",
             field="surface.sigma",
-            remedy="give a raster of this place, or a number",
+            remedy="give a raster of this area, or a number",
         )
-    layer = _record(found, known, output.layer_step)
+    layer = _record(result, known, output.layer_step)
     write_text(files["accuracy_style"], accuracy_style(layer))
     return layer
 
 
-def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
-    shares, budget = dict(found.shares), known.budget
+def _record(result: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
+    shares, budget = dict(result.shares), known.budget
     even = shares.pop("even")
     stated = 0.0 if known.adjusted or not budget.stated else budget.stated**2
     part = stated / (stated + budget.reference**2) if even else 0.0
     by = "points" if known.adjusted else "model"
-    common = min(known.common / max(sum(sigma**2 for sigma in found.sigma), 1e-300), shares["model"])
+    common = min(known.common / max(sum(sigma**2 for sigma in result.sigma), 1e-300), shares["model"])
     return AccuracyLayer(
-        ce90_m=found.ce90,
-        range_m=found.quantiles,
-        sigma_m=found.sigma,
+        ce90_m=result.ce90,
+        range_m=result.quantiles,
+        sigma_m=result.sigma,
         shares={
             by: shares["model"] - common + even * part,
             "heights": shares["heights"],
@@ -262,10 +262,10 @@ def _record(found: AccuracyResult, known: Known, step: int) -> AccuracyLayer:
             "interpolation": shares["interpolation"],
         },
         unknown=known.unknown,
-        known=found.known,
+        known=result.known,
         assumptions=known.assumptions,
-        cell=found.cell * step,
-        cells=tuple(tuple(row) for row in json_value(_rounded(found.cells))),
+        cell=result.cell * step,
+        cells=tuple(tuple(row) for row in json_value(_rounded(result.cells))),
     )
 
 

@@ -25,9 +25,9 @@ def other_of(placed: Placement, source: RasterSource) -> Regridded | None:
         return None
     if output.visibility != "nodata":
         raise InputError(
-            "another ortho fills what terrain hides, and hidden pixels are not left empty",
+            "another ortho only fills hidden pixels, and these are not left empty",
             field="output.fill_from",
-            remedy=Text("give ", Setting("output.visibility", "nodata"), " too, or leave it out"),
+            remedy=Text("add ", Setting("output.visibility", "nodata"), ", or leave it out"),
         )
     with completed(field="output.fill_from"):
         access = placed.request.scene.access

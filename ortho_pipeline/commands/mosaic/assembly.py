@@ -52,9 +52,9 @@ def mosaic(
     Parameters
     ----------
     path : path
-        Of the mosaic; its record and its page lie beside it.
+        Path of the mosaic; its record and page get the same name.
     allow_network : bool
-        Whether orthos and the mosaic may lie at addresses; a VRT may not.
+        Allow addresses for orthos and mosaic; a VRT cannot have one.
 
     Raises
     ------
@@ -67,8 +67,8 @@ def mosaic(
         _refuse_far(paths)
     files = {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
     _check_paths(paths, files)
-    layers = [_ortho(one, name) for one, name in zip(paths, _names(paths), strict=True)]
-    ledger = Ledger(begun=states([*paths, *(one.accuracy for one in layers if one.accuracy)]))
+    layers = [_ortho(ortho, name) for ortho, name in zip(paths, _names(paths), strict=True)]
+    ledger = Ledger(begun=states([*paths, *(ortho.accuracy for ortho in layers if ortho.accuracy)]))
     with together(path.parent, path.stem):
         document, failure = assemble(layers, files, options, resources=resources)
         write_json(files["seams"], document)
@@ -80,28 +80,30 @@ def _refuse_far(orthos: Sequence[Path]) -> None:
     for ortho in orthos:
         if Location(ortho).is_far:
             raise InputError(
-                "a VRT refers to orthos below its own folder",
+                "a VRT can only refer to orthos in its folder or below",
                 file=ortho,
                 field="output",
-                remedy="let the name of the mosaic end in .tif",
+                remedy="use a name of the mosaic that ends in .tif",
             )
 
 
 def _check_paths(orthos: Sequence[Path], files: Mapping[str, Path]) -> None:
     if len(set(files.values())) < len(files):
         raise InputError(
-            "record and page lie beside the mosaic under its name",
+            "record (.json) and page (.html) need other names than the mosaic",
             file=files["mosaic"],
             field="output",
-            remedy="let the name end in .tif or .vrt",
+            remedy="use a name that ends in .tif or .vrt",
         )
     known = [ortho.resolve() for ortho in orthos]
     for path in map(allowed, files.values()):
         if path.resolve() in known:
-            raise InputError("this path would be read and written", file=path, field="output", remedy="choose another")
+            raise InputError(
+                "this file is both input and output", file=path, field="output", remedy="choose another name"
+            )
     for ortho in orthos:
         if known.count(ortho.resolve()) > 1:
-            raise InputError("this ortho is given twice", file=ortho, field="orthos", remedy="name it once")
+            raise InputError("this ortho is listed twice", file=ortho, field="orthos", remedy="list it once")
 
 
 def assemble(
@@ -114,7 +116,7 @@ def assemble(
 ) -> tuple[dict[str, Any], ReportError | None]:
     """Write a mosaic and its page; return its document (docs/mosaic.md), which the caller writes.
 
-    The error is that of a page that could not be made; it costs no mosaic.
+    The error means that only the page could not be made.
 
     Parameters
     ----------
@@ -126,16 +128,16 @@ def assemble(
     Raises
     ------
     InputError
-        If what is asked for cannot be said in a VRT, and as the functions of `warp.mosaic`.
+        If a VRT cannot do what the options request, and as the functions of `warp.mosaic`.
     """
     resources, placed = resources or Resources(), lay_out(orthos, options.order)
     for field in ("seamlines", "balance"):
         if options.format == "VRT" and getattr(options, field):
             raise InputError(
-                "a VRT refers to pixels as they are",
+                "a VRT cannot change pixels",
                 file=files["mosaic"],
                 field=f"mosaic.{field}",
-                remedy="make a COG, or leave it out",
+                remedy="write a COG, or leave it out",
             )
     pairs = overlaps(placed) if options.seams or options.balance else []
     memory, threads = resources.memory, resources.threads or 1
@@ -168,12 +170,12 @@ def assemble(
     return document, attempted(lambda: write_page(document, files["page"], files["mosaic"], owners), files, "page")
 
 
-def _of(found: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]) -> dict[str, Any] | None:
-    return found.get((seam["first"], seam["second"]))
+def _of(seams: Mapping[tuple[str, str], dict[str, Any]], seam: Mapping[str, Any]) -> dict[str, Any] | None:
+    return seams.get((seam["first"], seam["second"]))
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return names of orthos that tell them apart: their stems, with folders where these are alike."""
+    """Return unique names of orthos: their stems, with folders if stems are equal."""
     ending = Path(ENDINGS["ortho"]).stem
     stems = [path.stem.removesuffix(ending) for path in paths]
     if len(set(stems)) < len(stems):

@@ -1,1 +1,1 @@
-"""What a command is asked, resolved: the request, its files opened once, and the ledger of them."""
+"""The resolved request of a command: its options, its files opened once, and the ledger of them."""

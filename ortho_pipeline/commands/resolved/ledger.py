@@ -43,7 +43,7 @@ _ORDER = {
     "other ortho": 8,
     "grid": 9,
 }
-#: Options that stand in a record only where they were given: without them, files of the same job keep their bytes.
+#: Options that a record holds only if given, so that other records keep their bytes.
 _IF_GIVEN = ("like", "reference_bands", "search_rotation")
 #: Size, time of change and inode of files.
 State = Mapping[str, tuple[int, int, int]]
@@ -68,12 +68,12 @@ class Ledger:
     def of(
         cls, request: Request, scene: Scene | None = None, surface: Surface | None = None, begun: State | None = None
     ) -> Ledger:
-        """Return the files of a request, and those that the scene and the surface say they were read from.
+        """Return the files of a request, and the files that the scene and the surface were read from.
 
         Parameters
         ----------
         begun : mapping, optional
-            The states of the files that the user named, when the work began; those of now without.
+            States of the named files when the work began; without, the current states.
         """
         found: dict[Path, str] = {}
 
@@ -95,13 +95,13 @@ class Ledger:
         if surface is not None:
             # Of heights that were found: what led to them, and the files.
             enter("DEM", surface.provenance.get("documents", ()))
-            read = (one for one in surface.files if Path(one) not in found and not Location(one).is_far)
+            read = (cell for cell in surface.files if Path(cell) not in found and not Location(cell).is_far)
             enter("DEM", read, attached=True)
         roles = dict(sorted(found.items(), key=lambda entry: _ORDER.get(entry[1], 1)))
         return cls(roles, {**states(roles), **(begun or {})})
 
     def joined(self, *others: Ledger) -> Ledger:
-        """Return the files of several ledgers as one; of a file in several, what the first one says."""
+        """Return the files of several ledgers as one; the first ledger of a file decides its role."""
         roles, begun = dict(self.roles), dict(self.begun)
         for other in others:
             for path, role in other.roles.items():
@@ -110,7 +110,7 @@ class Ledger:
         return Ledger(roles, begun)
 
     def require_unchanged(self) -> None:
-        """Refuse a result whose inputs changed meanwhile: its pixels, model and checksums may be of two files.
+        """Refuse a result whose inputs changed during the run, because its parts may come from different versions.
 
         Raises
         ------
@@ -120,7 +120,7 @@ class Ledger:
         now = states(self.begun)
         for path, state in self.begun.items():
             if now.get(path) != state:
-                raise InputError("this file changed while it was being used", file=path, remedy="run again")
+                raise InputError("this file changed during the run", file=path, remedy="run again")
 
     def hashed(self, digest: Callable[..., str] = sha256, stop: threading.Event | None = None) -> list[dict[str, Any]]:
         """Return role, path, bytes and SHA-256 of each file.
@@ -165,9 +165,9 @@ def provenance(
     surface: Surface | None,
     inputs: list[dict[str, Any]],
     command: str | None,
-    asked: Mapping[str, Any],
+    settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return what is needed to make the same result again: files with checksums, options, versions, the command.
+    """Return the record that reproduces a result: files with checksums, options, versions, the command.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def provenance(
         "model_source": scene.model_source,
         "points": None if request.points.gcps is None else _as_asked(request.points),
         "surface": None if surface is None else dict(surface.provenance),
-        "options": {name: _as_asked(value) for name, value in asked.items()},
+        "options": {name: _as_asked(value) for name, value in settings.items()},
         "software": {
             "ortho-pipeline": software_version(),
             "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
@@ -201,9 +201,9 @@ def read_since(before: int) -> dict[str, Any]:
 
 def _as_asked(options: Any) -> dict[str, Any]:
     """Return options as JSON values, without the budget of the machine, on which no result depends."""
-    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
-    left_out = {"memory", "threads", *(key for key in _IF_GIVEN if given.get(key) is None)}
-    return {key: _text_of(value) for key, value in given.items() if key not in left_out}
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    left_out = {"memory", "threads", *(key for key in _IF_GIVEN if values.get(key) is None)}
+    return {key: _text_of(value) for key, value in values.items() if key not in left_out}
 
 
 def _text_of(value: Any) -> Any:

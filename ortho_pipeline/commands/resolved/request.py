@@ -1,4 +1,4 @@
-"""What a command is asked for one scene."""
+"""The request of a command for one scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OWN_POINTS = "own"
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What is asked of one scene: its image, and the options as the user gave them.
+    """The request for one scene: its image, and the options of the user.
 
     Parameters
     ----------
@@ -63,5 +63,5 @@ class Request:
         return [file for role, path in self.named for file in (dem if role == "DEM" else [(role, path)])]
 
     def asked(self, *groups: str) -> dict[str, Any]:
-        """Return those of the named groups of options that say something, for the record of a result."""
+        """Return the named groups of options that are not empty, for the record of a result."""
         return {name: getattr(self, name) for name in groups if name != "match" or self.match.reference}

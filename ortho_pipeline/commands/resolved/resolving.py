@@ -25,7 +25,7 @@ from ortho_pipeline.surface.footprint import lay
 def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
     """Open the scene of a request, its heights, its points and the raster that gives the grid.
 
-    Points, heights and matches settle whether the model of a crop belongs to it.
+    Points, heights and matches decide whether the model of a crop belongs to it.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
     Raises
     ------
     InputError
-        For whatever cannot be opened, or is not what an option says.
+        If a file cannot be opened or contradicts an option.
     """
     begun = states(path for _, path in request.files)
     scene = open_by_evidence(request, needs_model=needs_model)
@@ -66,12 +66,12 @@ def _grid_like(request: Request) -> Grid | None:
     output = request.output
     if output.like is None:
         return None
-    given = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
-    if given:
+    conflicts = [name for name in ("crs", "resolution", "extent", "align") if getattr(output, name)]
+    if conflicts:
         raise InputError(
-            Text(Setting("output.like"), " gives the grid, and ", Setting(f"output.{given[0]}"), " would change it"),
-            field=f"output.{given[0]}",
-            remedy="leave out one of the two",
+            Text(Setting("output.like"), " sets the grid, which ", Setting(f"output.{conflicts[0]}"), " would change"),
+            field=f"output.{conflicts[0]}",
+            remedy="leave out one of them",
         )
     with completed(os.fspath(output.like), field="output.like"):
         return grid_of(output.like, **request.scene.access)

@@ -1,4 +1,4 @@
-"""What a command was given, with the files in place of STAC items, and what lies elsewhere asked for at once."""
+"""Arguments of a command, with files instead of STAC items; remote files are requested at once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TABLE_BYTES = 50_000_000
 
 
 def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Let STAC items stand where a command takes images, DEMs, references and points.
+    """Let a command accept STAC items as images, DEMs, references and points.
 
     The command has a parameter `image` or `images`, and options. An RPC that is an asset of its own becomes the option
     `scene.rpc`, unless another model is given. Files on other machines are asked for together.
@@ -36,30 +36,30 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
     def wrapper(*args: _P.args, **named: _P.kwargs) -> _R:
         bound = signature.bind(*args, **named)
         bound.apply_defaults()
-        given = bound.arguments
-        place = next((name for name, value in given.items() if isinstance(value, SceneOptions)), None)
-        scene = _of_first(given) if place is None else cast(SceneOptions, given[place])
-        for name, value in given.items():
+        arguments = bound.arguments
+        place = next((name for name, value in arguments.items() if isinstance(value, SceneOptions)), None)
+        scene = _of_first(arguments) if place is None else cast(SceneOptions, arguments[place])
+        for name, value in arguments.items():
             if name == _IMAGE:
-                given[name], scene = resolved(value, scene)
+                arguments[name], scene = resolved(value, scene)
             elif name == _IMAGES:
-                given[name] = [_one_of_several(image, scene) for image in value]
+                arguments[name] = [_one_of_several(image, scene) for image in value]
             elif name == _DEM and not isinstance(value, SurfaceOptions | None):
-                given[name] = heights_given(value, scene)
+                arguments[name] = heights_given(value, scene)
             else:
-                given[name] = _in_options(value, scene)
+                arguments[name] = _in_options(value, scene)
         if place is not None:
-            given[place] = scene
+            arguments[place] = scene
         if scene.allow_network:
-            ask_beside(*_far(given), allow_network=True)
+            ask_beside(*_far(arguments), allow_network=True)
         return command(*bound.args, **bound.kwargs)
 
     return wrapper
 
 
-def _of_first(given: dict[str, Any]) -> SceneOptions:
+def _of_first(arguments: dict[str, Any]) -> SceneOptions:
     """Return how the first image is opened, where there are options for each: their permissions are the same."""
-    lists = (value for value in given.values() if isinstance(value, list | tuple) and value)
+    lists = (value for value in arguments.values() if isinstance(value, list | tuple) and value)
     return next((value[0] for value in lists if isinstance(value[0], SceneOptions)), SceneOptions())
 
 
@@ -97,7 +97,7 @@ def heights_given(dem: str | os.PathLike[str], scene: SceneOptions) -> Location:
 
 
 def _item_at(value: Any) -> Location | None:
-    """Return the place that a value names, if it may be that of a STAC item."""
+    """Return the location that a value names, if it may be a STAC item."""
     place = Location(value) if isinstance(value, str | os.PathLike) else None
     return place if place is not None and place.is_item else None
 
@@ -115,9 +115,9 @@ def _one_of_several(image: Any, scene: SceneOptions) -> Any:
     rpc = item.rpc_of(chosen)
     if rpc is not None:
         raise InputError(
-            f"the RPC of this image lies elsewhere ({rpc.name}), and several images have no option for it",
+            f"the RPC of this image lies elsewhere ({rpc.name}), and there is no option to give it for several images",
             file=image,
-            remedy="put it beside the image, under its name",
+            remedy="put it beside the image, with the same stem",
         )
     return chosen.href
 
@@ -157,10 +157,10 @@ def _points(place: Location, scene: SceneOptions) -> str:
     return item.table(key).href
 
 
-def _far(given: dict[str, Any]) -> list[Any]:
+def _far(arguments: dict[str, Any]) -> list[Any]:
     """Return the files on other machines that a command is about to open."""
-    images = [given.get(_IMAGE), *(given.get(_IMAGES) or ())]
-    for value in given.values():
+    images = [arguments.get(_IMAGE), *(arguments.get(_IMAGES) or ())]
+    for value in arguments.values():
         if isinstance(value, SurfaceOptions):
             images.append(None if value.dem is None or Location(value.dem).is_collection else value.dem)
         elif isinstance(value, MatchOptions):

@@ -1,1 +1,1 @@
-"""What lies in a folder, what to do next with it, and the file of a run over its scenes."""
+"""The contents of a folder, the next command for it, and a pipeline file for its scenes."""

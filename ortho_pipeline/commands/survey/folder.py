@@ -1,4 +1,4 @@
-"""What lies in a folder: scenes with a model, DEMs, map images, points; and what to do next."""
+"""The contents of a folder: scenes with a model, DEMs, map images, points; and the next steps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ IMAGES = (
     ".xml",
     ".til",
 )
-#: Said of a DEM whose file does not say above what its heights are.
+#: Note on a DEM whose file does not declare its height datum.
 NO_DATUM = "no height datum declared"
 #: Those of them that hold pixels and nothing else: such a file that does not open is damaged.
 _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img")
@@ -50,7 +50,7 @@ _MOST, _DEPTH = 2000, 3
 
 @dataclass(frozen=True)
 class SurveyedFile:
-    """A file, by its path from the folder: what it is taken for, and what there is to say about it."""
+    """A file, by its path from the folder: its kind, and its description."""
 
     path: str
     kind: Kind
@@ -59,14 +59,14 @@ class SurveyedFile:
 
 @dataclass(frozen=True)
 class FolderSurvey:
-    """What lies in a folder."""
+    """The contents of a folder."""
 
     folder: Path
     found: tuple[SurveyedFile, ...]
 
     def of(self, kind: Kind) -> list[str]:
         """Return the paths of a kind, from the folder."""
-        return [one.path for one in self.found if one.kind == kind]
+        return [file.path for file in self.found if file.kind == kind]
 
     def beside(self, scene: str, kind: Kind) -> list[str]:
         """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
@@ -74,14 +74,14 @@ class FolderSurvey:
         What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
         if it has some.
         """
-        mine, others = Path(scene).stem, {Path(one).stem for one in self.of("scene")} - {Path(scene).stem}
+        mine, others = Path(scene).stem, {Path(name).stem for name in self.of("scene")} - {Path(scene).stem}
         for folder in Path(scene).parents:
-            if folder != Path(scene).parent and any(Path(one).parent == folder for one in self.of("scene")):
+            if folder != Path(scene).parent and any(Path(name).parent == folder for name in self.of("scene")):
                 break
-            here = [one for one in self.of(kind) if Path(one).parent == folder]
-            if named := [one for one in here if Path(one).stem.startswith(mine)]:
+            here = [name for name in self.of(kind) if Path(name).parent == folder]
+            if named := [name for name in here if Path(name).stem.startswith(mine)]:
                 return named
-            if free := [one for one in here if not any(Path(one).stem.startswith(other) for other in others)]:
+            if free := [name for name in here if not any(Path(name).stem.startswith(other) for other in others)]:
                 return free
         return []
 
@@ -91,25 +91,25 @@ class FolderSurvey:
 
 
 def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> FolderSurvey:
-    """Look at the files of a folder and of those in it; outputs of this program are left out.
+    """List the files of a folder and its subfolders, without outputs of this program.
 
     Raises
     ------
     InputError
-        If there is no such folder, or it has more files than can be looked at.
+        If there is no such folder, or it has too many files.
     """
     place = Path(folder)
     if not place.is_dir():
-        raise InputError("this is no folder", file=folder, remedy="give a folder")
+        raise InputError("this is not a folder", file=folder, remedy="give a folder")
     names = list(islice(_files(place, _DEPTH), _MOST + 1))
     if len(names) > _MOST:
         raise InputError(
-            f"more than {_MOST} files lie here",
+            f"the folder has more than {_MOST} files",
             file=folder,
-            remedy="give the folder of one delivery, or write the file of the run by hand (docs/run.md)",
+            remedy="give the folder of one delivery, or write the pipeline file yourself (docs/run.md)",
         )
-    found = [one for path in names if (one := _looked_at(path, place, options)) is not None]
-    return FolderSurvey(place, tuple(_without_parts(found)))
+    files = [file for path in names if (file := _looked_at(path, place, options)) is not None]
+    return FolderSurvey(place, tuple(_without_parts(files)))
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:
@@ -133,7 +133,7 @@ def _looked_at(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile 
 
 
 def _is_ours(path: Path) -> bool:
-    """Tell whether the report lies beside a file with which this program would have written it."""
+    """Return whether a file has the report that this program would have written with it."""
     ending = next(ending for ending in ENDINGS.values() if path.name.endswith(ending))
     return path.with_name(path.name.removesuffix(ending) + ENDINGS["report"]).exists()
 
@@ -150,7 +150,7 @@ def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
 
 
 def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -> SurveyedFile | None:
-    """Say what an image is that no sensor opens; None for what is no image."""
+    """Describe an image that no sensor opens; None if it is not an image."""
     try:
         dataset = open_dataset(path, **options.access)
     except OrthoError as error:
@@ -164,20 +164,18 @@ def _raster(path: Path, name: str, options: SceneOptions, refused: OrthoError) -
     if kind is None or not (is_upright(dataset) or unread(dataset) is None):
         return SurveyedFile(name, "image", f"{size}, no model: {refused.message}")
     crs = dataset.GetSpatialRef()
-    said = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
+    text = f"{size}, {crs.GetName() if crs is not None else 'a CRS'}"
     datum = crs is None or crs.IsCompound() or crs.GetAxesCount() == 3
-    return SurveyedFile(name, kind, said if kind != "dem" or datum else f"{said}, {NO_DATUM}")
+    return SurveyedFile(name, kind, text if kind != "dem" or datum else f"{text}, {NO_DATUM}")
 
 
 def _points(path: Path, name: str) -> SurveyedFile | None:
     try:
         points = read_points(path)
     except OrthoError as error:
-        # Any text may end so; a table that says in its first line what it is gets told what it lacks.
+        # Any text may have this suffix; a table with a valid header is listed with its missing parts.
         return (
-            SurveyedFile(name, "points", f"to be completed: {error.message}")
-            if error.field in ("crs", "vertical")
-            else None
+            SurveyedFile(name, "points", f"incomplete: {error.message}") if error.field in ("crs", "vertical") else None
         )
     roles = [
         counted(int(mask.sum()), f"{role} point")
@@ -186,13 +184,17 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
     return SurveyedFile(name, "points", ", ".join(roles))
 
 
-def _without_parts(found: list[SurveyedFile]) -> list[SurveyedFile]:
-    """Leave out what opens as the same image as another file: the metadata beside it."""
-    scenes = {Path(one.path).with_suffix("") for one in found if one.kind == "scene" and not one.path.endswith(".xml")}
+def _without_parts(files: list[SurveyedFile]) -> list[SurveyedFile]:
+    """Leave out metadata that open as the same image as another file."""
+    scenes = {
+        Path(file.path).with_suffix("") for file in files if file.kind == "scene" and not file.path.endswith(".xml")
+    }
     return [
-        one
-        for one in found
-        if not (one.path.lower().endswith(".xml") and (one.kind != "scene" or Path(one.path).with_suffix("") in scenes))
+        file
+        for file in files
+        if not (
+            file.path.lower().endswith(".xml") and (file.kind != "scene" or Path(file.path).with_suffix("") in scenes)
+        )
     ]
 
 

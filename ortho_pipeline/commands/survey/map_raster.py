@@ -27,13 +27,13 @@ def kind_of(dataset: Any) -> Literal["dem", "map image"] | None:
 
 
 def is_upright(dataset: Any) -> bool:
-    """Tell whether rows and columns of a raster on a map run along its axes, as those of DEMs and orthos do."""
+    """Return whether rows and columns of a map raster are parallel to its axes, as in DEMs and orthos."""
     _, _, turned, _, skewed, _ = dataset.GetGeoTransform()
     return turned == skewed == 0.0
 
 
 def described(image: str | os.PathLike[str], dataset: Any) -> dict[str, Any]:
-    """Return the document of `ortho info` of a DEM or an ortho: a `dataset` of which `kind_of` says what it is."""
+    """Return the document of `ortho info` for a DEM or an ortho: a `dataset` with a kind (`kind_of`)."""
     kind, band, size = kind_of(dataset), dataset.GetRasterBand(1), (dataset.RasterXSize, dataset.RasterYSize)
     crs = parse_crs(dataset.GetProjection())
     left, along_x, over_x, top, along_y, over_y = dataset.GetGeoTransform()

@@ -1,4 +1,4 @@
-"""The file of a run over the scenes of a folder, with comments that say what each line is for."""
+"""A pipeline file for the scenes of a folder, with comments that explain each line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.options.texts import Setting, Text, counted
 
 NAME = "pipeline.yaml"
-#: What belongs to a scene, and where it stands in the file.
+#: Kinds of files of a scene, with their group and key in the pipeline file.
 _GROUPS: tuple[tuple[Kind, str, str], ...] = (("dem", "surface", "dem"), ("points", "points", "gcps"))
 
 
@@ -26,71 +26,75 @@ def init(
     options: SceneOptions = SceneOptions(),
     overwrite: bool = False,
 ) -> Result:
-    """Write the file of a run over the scenes of a folder.
+    """Write a pipeline file for the scenes of a folder.
 
     Parameters
     ----------
     path : path, optional
-        Where to; ``pipeline.yaml`` in the folder without one. It has to lie in the folder or above it, as the paths in
+        Path of the file; default ``pipeline.yaml`` in the folder. It must be in the folder or above it, as the paths in
         it are written from there.
 
     Raises
     ------
     InputError
-        If there is no scene with a model, the file is there and `overwrite` is not given, or lies elsewhere.
+        If there is no scene with a model, the path is elsewhere, or the file exists and `overwrite` is false.
     """
     seen = survey(folder, options)
     target = Path(folder) / NAME if path is None else Path(path)
     allowed(target)
     if target.exists() and not overwrite:
         raise InputError(
-            "this file is there already", file=target, remedy=Text("give another name, or allow ", Setting("overwrite"))
+            "this file already exists", file=target, remedy=Text("choose another name, or use ", Setting("overwrite"))
         )
     if not seen.of("scene"):
         raise InputError(
-            "no image with a model lies here", file=folder, remedy="put the metadata (RPC, DIMAP, .IMD ...) beside it"
+            "no image has a sensor model",
+            file=folder,
+            remedy="put the metadata (RPC, DIMAP, .IMD ...) beside the image",
         )
     prefix = os.path.relpath(Path(folder).resolve(), target.resolve().parent)
     if prefix.startswith(os.pardir):
         raise InputError(
-            "the file of a run lies in the folder of its scenes or above it", file=target, remedy="give such a name"
+            "a pipeline file must be in the folder of its scenes or above it",
+            file=target,
+            remedy="choose another path",
         )
     write_text(target, text(seen, prefix))
-    skipped = [one for one in seen.found if one.kind == "image"]
+    skipped = [image for image in seen.found if image.kind == "image"]
     lines = [counted(len(seen.of("scene")), "scene")]
     if skipped:
         lines[0] += f", {counted(len(skipped), 'image')} skipped:"
-        lines += [f"  {one.path}: {one.said}" for one in skipped]
+        lines += [f"  {image.path}: {image.said}" for image in skipped]
     file = shlex.quote(str(target))
     if all(seen.beside(name, "dem") for name in seen.of("scene")):
         next_lines = f"  ortho run {file} --dry-run\n  ortho run {file}"
     else:
         next_lines = f"  ortho run {file} --allow-network --dry-run\n  ortho run {file} --allow-network"
-    lines += ["Look at the file, then:", next_lines]
-    document = {"scenes": seen.of("scene"), "skipped": {one.path: one.said for one in skipped}}
+    lines += ["Check the file, then run:", next_lines]
+    document = {"scenes": seen.of("scene"), "skipped": {image.path: image.said for image in skipped}}
     return Result({"pipeline": target}, document, "\n".join(lines))
 
 
 def text(seen: FolderSurvey, prefix: str = ".") -> str:
-    """Return the file: what was found as settings, what was not as comments."""
+    """Return the text of the file: found files as settings, others as comments."""
 
     def at(name: str) -> str:
-        # A JSON text is a YAML text; what begins with * or has a colon stays what it is.
+        # A JSON text is a YAML text; it protects names that begin with * or contain a colon.
         return json.dumps(name if prefix == "." else f"{prefix}/{name}", ensure_ascii=False)
 
     lines = [
         "# Scenes for 'ortho run'. Paths are relative to this file; every field: docs/run.md, 'ortho run --schema'.",
-        "# 'ortho run FILE --dry-run' opens everything and makes nothing; 'ortho run FILE' makes what is missing.",
-        "output: out                     # a folder of each scene goes here",
-        "defaults:                       # what holds for all scenes; a scene below may say otherwise",
+        "# 'ortho run FILE --dry-run' checks all inputs; 'ortho run FILE' makes the scenes that are missing.",
+        "output: out                     # each scene gets a folder in it",
+        "defaults:                       # settings of all scenes; a scene below may override them",
         "  surface:",
         "    dem: auto                   # the Copernicus DEM under the scene; or a file:",
         "    # dem: dem.tif",
-        "    # vertical: egm2008         # its height datum, where the file does not declare it",
+        "    # vertical: egm2008         # its height datum, if the file does not declare it",
         "  # points:",
-        '  #   gcps: "gcps/{stem}.csv"   # control points: a file for each scene, by its name',
+        '  #   gcps: "gcps/{stem}.csv"   # control points: one file per scene, named like it',
         "  # match:",
-        "  #   reference: ortho.tif      # control points without a hand, from an ortho of the place",
+        "  #   reference: ortho.tif      # automatic control points, from an ortho of the place",
         "  # output:",
         '  #   crs: "EPSG:32636"         # default: the UTM zone of the scene',
         "  #   resolution: 2.5           # default: about that of the image",
@@ -99,8 +103,8 @@ def text(seen: FolderSurvey, prefix: str = ".") -> str:
     for scene in seen.of("scene"):
         lines.append(f"  - image: {at(scene)}")
         for kind, group, key in _GROUPS:
-            found = seen.beside(scene, kind)
+            files = seen.beside(scene, kind)
             # Of several the first; which one is right only the user knows.
-            lines += [f"    {group}: {{{key}: {at(one)}}}" for one in found[:1]]
-            lines += [f"    # {group}: {{{key}: {at(one)}}}" for one in found[1:3]]
+            lines += [f"    {group}: {{{key}: {at(file)}}}" for file in files[:1]]
+            lines += [f"    # {group}: {{{key}: {at(file)}}}" for file in files[1:3]]
     return "\n".join(lines) + "\n"

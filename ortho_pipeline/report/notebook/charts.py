@@ -144,6 +144,8 @@ def _new() -> Any:
         from matplotlib import pyplot
     except ImportError as error:
         raise InputError(
-            "plots need matplotlib, which is not installed", field="axes", remedy="pip install 'ortho-pipeline[plots]'"
+            "plots need matplotlib, which is not installed",
+            field="axes",
+            remedy="run pip install '.[plots]' in the checkout of ortho-pipeline",
         ) from error
     return pyplot.subplots(layout="constrained")[1]

@@ -83,11 +83,11 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
         If two orthos do not show the same thing; if they have a palette.
     """
     opened = open_layers(placed, memory)
-    for one in opened:
-        if one.source.palette:
+    for raster in opened:
+        if raster.source.palette:
             raise InputError(
-                "palette indices have no brightness to balance",
-                file=one.layer.ortho.path,
+                "palette indices have no brightness",
+                file=raster.layer.ortho.path,
                 field="mosaic.balance",
                 remedy="leave it out",
             )
@@ -98,9 +98,9 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
         box = intersection(box_of(pair.first), box_of(pair.second))
         for window in () if box is None else _windows(box):
             (values, valid), (others, also) = (opened[k].read_around(window) for k in (first, second))
-            found = _cell_means(values, others, valid & also)
-            means.append(found)
-            ends.append(np.broadcast_to([first, second], (len(found), 2)))
+            cell_means = _cell_means(values, others, valid & also)
+            means.append(cell_means)
+            ends.append(np.broadcast_to([first, second], (len(cell_means), 2)))
     count, bands = len(placed.layers), opened[0].source.count
     cells = np.concatenate(means) if means else np.zeros((0, 2, bands))
     which = np.concatenate(ends) if ends else np.zeros((0, 2), dtype=int)
@@ -108,18 +108,20 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
     before, after, outlying = np.zeros(bands), np.zeros(bands), np.zeros(bands)
     for band in range(bands if len(cells) else 0):
         gains[:, band], offsets[:, band], good = _solved(which, cells[:, :, band], count)
-        made = cells[:, :, band] * gains[which, band] + offsets[which, band]
-        before[band], after[band] = (_rms(np.diff(values[good], axis=1)) for values in (cells[:, :, band], made))
+        balanced_means = cells[:, :, band] * gains[which, band] + offsets[which, band]
+        before[band], after[band] = (
+            _rms(np.diff(values[good], axis=1)) for values in (cells[:, :, band], balanced_means)
+        )
         outlying[band] = 1.0 - good.mean()
     wrong = np.argwhere(~((gains > 1 / _LARGEST_GAIN) & (gains < _LARGEST_GAIN)))
     if len(wrong):
         layer, band = wrong[0]
         raise InputError(
-            f"band {band + 1} of {placed.layers[layer].ortho.name} would need a gain of {gains[layer, band]:.3g}: it "
+            f"band {band + 1} of {placed.layers[layer].ortho.name} needs a gain of {gains[layer, band]:.3g}: it "
             "does not match the orthos that overlap it",
             file=placed.layers[layer].ortho.path,
             field="mosaic.balance",
-            remedy="leave the option out, or make a mosaic of scenes of one kind",
+            remedy="leave the option out, or combine only scenes of one kind",
         )
     return Balance(gains, offsets, before, after, len(cells), float(outlying.mean()))
 
@@ -138,15 +140,15 @@ def _windows(box: Box) -> list[Box]:
     return [(left, top, right, bottom) for top, bottom in starts[1] for left, right in starts[0]]
 
 
-def _cell_means(one: Array, other: Array, valid: NDArray[np.bool_]) -> Array:
+def _cell_means(values: Array, other: Array, valid: NDArray[np.bool_]) -> Array:
     """Return the means of both ``(n, 2, bands)`` over the cells of a window that are valid in both.
 
     A cell all of whose pixels are equal is saturated, or filled: it tells nothing.
     """
     rows, columns = valid.shape[0] // _CELL, valid.shape[1] // _CELL
-    whole = (..., slice(0, rows * _CELL), slice(0, columns * _CELL))
-    full = valid[whole].reshape(rows, _CELL, columns, _CELL).all(axis=(1, 3))
-    parts = [part[whole].reshape(len(part), rows, _CELL, columns, _CELL) for part in (one, other)]
+    cells = (..., slice(0, rows * _CELL), slice(0, columns * _CELL))
+    full = valid[cells].reshape(rows, _CELL, columns, _CELL).all(axis=(1, 3))
+    parts = [part[cells].reshape(len(part), rows, _CELL, columns, _CELL) for part in (values, other)]
     for part in parts:
         full &= (part.max(axis=(2, 4)) > part.min(axis=(2, 4))).all(axis=0)
     return np.stack([part.mean(axis=(2, 4))[:, full].T for part in parts], axis=1)
@@ -168,8 +170,8 @@ def _solved(ends: NDArray[np.int_], cells: Array, count: int) -> tuple[Array, Ar
     scale = 0.0
     for _ in range(_STEPS):
         pairs = unknowns.reshape(-1, 2)
-        made = values * pairs[ends, 0] + pairs[ends, 1]
-        residual = made[:, 0] - made[:, 1]
+        corrected = values * pairs[ends, 0] + pairs[ends, 1]
+        residual = corrected[:, 0] - corrected[:, 1]
         scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
         weight = np.maximum(0.0, 1.0 - (residual / (_TUKEY * scale)) ** 2) ** 2
         unknowns = _step(ends, values, weight / scale**2, count)
@@ -200,12 +202,12 @@ def _start(ends: NDArray[np.int_], values: Array, count: int) -> Array:
 def _line(first: Array, second: Array) -> tuple[float, float]:
     """Return the slope of the first against the second ``(n,)``, and the robust scatter about that line."""
     chosen = np.linspace(0, len(first) - 1, min(len(first), _OF_A_LINE)).astype(int)
-    one, other = first[chosen], second[chosen]
-    if not np.ptp(other) > 0:
+    x, y = first[chosen], second[chosen]
+    if not np.ptp(y) > 0:
         return 1.0, 1.0
-    line = stats.siegelslopes(one, other)
+    line = stats.siegelslopes(x, y)
     slope = float(line.slope) if math.isfinite(line.slope) else 1.0
-    scatter = 1.4826 * float(np.median(np.abs(one - line.slope * other - line.intercept)))
+    scatter = 1.4826 * float(np.median(np.abs(x - line.slope * y - line.intercept)))
     return float(np.clip(slope, 1 / _LARGEST_GAIN, _LARGEST_GAIN)), max(scatter, _LEAST_SCATTER)
 
 

@@ -1,4 +1,4 @@
-"""Orthos placed on their common grid, and which lies on top."""
+"""Orthos on their common grid, and their order."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Ortho:
-    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known.
+    """An orthoimage of a mosaic; `relief_displacement` per metre of height (m), None if unknown.
 
     `accuracy` is the raster that `layers.accuracy` wrote of it.
     """
@@ -35,7 +35,7 @@ class Ortho:
 
 @dataclass(frozen=True)
 class PlacedOrtho:
-    """An orthoimage and where it lies in the mosaic."""
+    """An orthoimage and its position in the mosaic."""
 
     ortho: Ortho
     grid: Grid
@@ -53,7 +53,7 @@ class Mosaic:
 
 
 def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
-    """Return where orthos lie on their common grid.
+    """Return the positions of orthos on their common grid.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
         If they do not share a grid, or differ in bands, type or nodata; if one has no accuracy that would decide.
     """
     if not orthos:
-        raise InputError("a mosaic needs an ortho", field="mosaic")
+        raise InputError("a mosaic needs at least one ortho", field="mosaic")
     without = [ortho for ortho in orthos if ortho.accuracy is None]
     if order == "most-accurate" and without:
         raise InputError(
@@ -89,12 +89,12 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     right = max(grid.left + grid.width * grid.dx for grid in grids)
     bottom = min(grid.top - grid.height * grid.dy for grid in grids)
     width, height = round((right - left) / first.dx), round((top - bottom) / first.dy)
-    whole = Grid(first.crs, left, top, first.dx, first.dy, width, height)
+    mosaic = Grid(first.crs, left, top, first.dx, first.dy, width, height)
     layers = [
         PlacedOrtho(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
         for ortho, grid in zip(orthos, grids, strict=True)
     ]
-    return Mosaic(whole, tuple(layers), order == "most-accurate")
+    return Mosaic(mosaic, tuple(layers), order == "most-accurate")
 
 
 def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
@@ -122,7 +122,7 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
             raise InputError(
                 f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
                 file=ortho.path,
-                remedy="make a mosaic of scenes of one kind",
+                remedy="combine only scenes of one kind",
             )
 
 
@@ -163,5 +163,5 @@ def circular_errors(layer: PlacedOrtho, left: int, top: int, width: int, height:
     steps = [round(size / pixel) for size, pixel in zip((own.dx, own.dy), (layer.grid.dx, layer.grid.dy), strict=True)]
     columns, rows = (np.arange(left, left + width) // steps[0], np.arange(top, top + height) // steps[1])
     part = source.read(int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1))
-    found = part[-1][np.ix_(rows - rows[0], columns - columns[0])]
-    return np.where(np.isfinite(found), found, np.finfo(np.float32).max).astype(np.float32)
+    errors = part[-1][np.ix_(rows - rows[0], columns - columns[0])]
+    return np.where(np.isfinite(errors), errors, np.finfo(np.float32).max).astype(np.float32)

@@ -19,7 +19,7 @@ class Opened:
         self.layer, self.source = layer, RasterSource(layer.ortho.path, memory=memory)
 
     def read(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return pixels and which are valid ``(bands, h, w)`` of a box of the mosaic that lies in the ortho."""
+        """Return pixels and their validity ``(bands, h, w)`` in a box of the mosaic inside the ortho."""
         left, top = box[0] - self.layer.left, box[1] - self.layer.top
         values = self.source.read(left, top, box[2] - box[0], box[3] - box[1])
         good = self.source.read_valid(left, top, values)
@@ -32,14 +32,14 @@ class Opened:
         inner = intersection(box, box_of(self.layer))
         if inner is not None:
             part = (slice(inner[1] - box[1], inner[3] - box[1]), slice(inner[0] - box[0], inner[2] - box[0]))
-            found, good = self.read(inner)
+            pixels, good = self.read(inner)
             valid[part] = good.all(axis=0)
-            values[(slice(None), *part)] = np.where(good, found, 0)
+            values[(slice(None), *part)] = np.where(good, pixels, 0)
         return values, valid
 
 
 def open_layers(placed: Mosaic, memory: int = MEMORY) -> list[Opened]:
     """Open all orthos of a mosaic, with GDAL's cache within the memory (bytes)."""
     opened = [Opened(layer, memory) for layer in placed.layers]
-    limit_cache(memory, 1, max(one.source.block for one in opened))
+    limit_cache(memory, 1, max(raster.source.block for raster in opened))
     return opened

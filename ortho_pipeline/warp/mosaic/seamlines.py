@@ -82,17 +82,17 @@ def owners_of(placed: Mosaic, balance: Balance | None, *, seamlines: bool, memor
         If pixels cannot be compared, because they are indices into a palette.
     """
     opened = open_layers(placed, memory)
-    for one in opened:
-        if seamlines and one.source.palette:
+    for raster in opened:
+        if seamlines and raster.source.palette:
             raise InputError(
                 "seam lines cannot follow palette indices",
-                file=one.layer.ortho.path,
+                file=raster.layer.ortho.path,
                 field="mosaic.seamlines",
                 remedy="leave it out",
             )
     cells = _Cells(placed, opened[0].source.count)
-    for number, one in enumerate(opened):
-        cells.add(number, one, balance)
+    for number, raster in enumerate(opened):
+        cells.add(number, raster, balance)
     return Owners(cells.cell, cells.top, cells.moved() if seamlines else cells.top)
 
 
@@ -111,16 +111,16 @@ class _Cells:
         #: Of each layer the place of its cells, and which of them it fills.
         self.filled: list[tuple[tuple[slice, slice], NDArray[np.bool_]]] = []
 
-    def add(self, number: int, one: Opened, balance: Balance | None) -> None:
+    def add(self, number: int, raster: Opened, balance: Balance | None) -> None:
         """Look at all of a layer."""
-        step, box = self.cell, box_of(one.layer)
+        step, box = self.cell, box_of(raster.layer)
         place = (slice(box[1] // step, -(-box[3] // step)), slice(box[0] // step, -(-box[2] // step)))
         filled = np.zeros(self.top.shape, dtype=bool)
         for left, top, width, height in windows(self.placed.grid, max(1, _WINDOW // step) * step):
             window = left, top, left + width, top + height
             if intersection(window, box) is None:
                 continue
-            means, full = self._means(one, window)
+            means, full = self._means(raster, window)
             part = (slice(top // step, -(-window[3] // step)), slice(left // step, -(-window[2] // step)))
             if balance is not None:
                 means = balance.apply(number, means)
@@ -129,16 +129,16 @@ class _Cells:
                 low, high = self.low[band][part], self.high[band][part]
                 np.minimum(low, means[band], out=low, where=full)
                 np.maximum(high, means[band], out=high, where=full)
-            rank = self._rank(number, one, window)
+            rank = self._rank(number, raster, window)
             better = full & (rank < self.best[part])
             self.best[part] = np.where(better, rank, self.best[part])
             self.top[part] = np.where(better, number, self.top[part])
             self.count[part] += full
         self.filled.append((place, filled[place].copy()))
 
-    def _means(self, one: Opened, window: Box) -> tuple[Array, NDArray[np.bool_]]:
+    def _means(self, raster: Opened, window: Box) -> tuple[Array, NDArray[np.bool_]]:
         """Return the means ``(bands, rows, columns)`` of the cells of a window, and which are full of values."""
-        values, valid = one.read_around(window)
+        values, valid = raster.read_around(window)
         counts = self._sums(valid.astype(np.int64))
         full = counts == self._sums(np.ones(valid.shape, dtype=np.int64))
         return self._sums(values) / np.maximum(counts, 1), full
@@ -147,17 +147,17 @@ class _Cells:
         rows, columns = (np.arange(0, side, self.cell) for side in values.shape[-2:])
         return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=-2), columns, axis=-1))
 
-    def _rank(self, number: int, one: Opened, window: Box) -> NDArray[np.float32]:
+    def _rank(self, number: int, raster: Opened, window: Box) -> NDArray[np.float32]:
         """Return the ranks of a layer in the cells of a window: the topmost has the least."""
         shape = tuple(-(-(window[k + 2] - window[k]) // self.cell) for k in (1, 0))
         if not self.placed.by_pixel:
             return np.full(shape, number, dtype=np.float32)
         errors = np.zeros((window[3] - window[1], window[2] - window[0]))
-        inner = intersection(window, box_of(one.layer))
+        inner = intersection(window, box_of(raster.layer))
         assert inner is not None
         part = (slice(inner[1] - window[1], inner[3] - window[1]), slice(inner[0] - window[0], inner[2] - window[0]))
         size = inner[2] - inner[0], inner[3] - inner[1]
-        errors[part] = circular_errors(one.layer, inner[0] - one.layer.left, inner[1] - one.layer.top, *size)
+        errors[part] = circular_errors(raster.layer, inner[0] - raster.layer.left, inner[1] - raster.layer.top, *size)
         return np.asarray(self._sums(errors) / self._sums(np.ones(errors.shape)), dtype=np.float32)
 
     # -- flooding ----------------------------------------------------------------------------------------------------
@@ -171,20 +171,20 @@ class _Cells:
         level = np.where(free, self._levels(), 0)
         # Markers are lowest: none of them begins when others have flooded everything already.
         relief = np.where(free, -level, -level.max() - 1)
-        found = watershed(relief, markers, mask=self.count > 0)
-        _mend_cut_things(found, markers, level)
-        found = found.astype(np.int16) - 1
-        allowed = np.zeros(found.shape, dtype=bool)
+        labels = watershed(relief, markers, mask=self.count > 0)
+        _mend_cut_things(labels, markers, level)
+        labels = labels.astype(np.int16) - 1
+        allowed = np.zeros(labels.shape, dtype=bool)
         for number, (place, filled) in enumerate(self.filled):
-            allowed[place] |= filled & (found[place] == number)
+            allowed[place] |= filled & (labels[place] == number)
         # Flooding does not know where an ortho ends.
-        return np.where(allowed, found, self.top).astype(np.int16)
+        return np.where(allowed, labels, self.top).astype(np.int16)
 
     def _near_seams(self) -> NDArray[np.bool_]:
         """Return the cells that are near to where the order has a seam; around small holes it has none."""
         reach, near = max(_REACH_CELLS, _REACH // self.cell), np.zeros(self.top.shape, dtype=bool)
         for number, (place, _) in enumerate(self.filled):
-            part = tuple(slice(max(0, one.start - reach), one.stop + reach) for one in place)
+            part = tuple(slice(max(0, side.start - reach), side.stop + reach) for side in place)
             top = self.top[part]
             others = (top >= 0) & ~_without_holes(top == number, (2 * reach) ** 2)
             if others.any():
@@ -206,7 +206,7 @@ class _Cells:
         return np.asarray(level, dtype=np.int16)
 
 
-def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level: NDArray[np.int16]) -> None:
+def _mend_cut_things(labels: NDArray[np.int32], markers: NDArray[np.int32], level: NDArray[np.int16]) -> None:
     """Give whole things to one ortho where that can be, from those that differ little to those that differ much.
 
     A thing is a connected part that differs by a level or more. Flooding enters it from all sides where it is an island
@@ -220,18 +220,18 @@ def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level
     for threshold in np.unique(level[level > 0]):
         things, count = ndimage.label(level >= threshold)
         index = np.arange(1, count + 1)
-        cut = ndimage.minimum(found, things, index) < ndimage.maximum(found, things, index)
+        cut = ndimage.minimum(labels, things, index) < ndimage.maximum(labels, things, index)
         joins = ndimage.minimum(lowest, things, index) < ndimage.maximum(highest, things, index)
         mended = np.concatenate([[False], cut & ~joins])
         cells = np.nonzero(mended[things])
         if not len(cells[0]):
             continue
-        pairs, sizes = np.unique(np.stack([things[cells], found[cells]]), axis=1, return_counts=True)
+        pairs, sizes = np.unique(np.stack([things[cells], labels[cells]]), axis=1, return_counts=True)
         # The last of a thing is the ortho that has most of it.
         order = np.lexsort((-pairs[1], sizes, pairs[0]))
-        owner = np.zeros(count + 1, dtype=found.dtype)
+        owner = np.zeros(count + 1, dtype=labels.dtype)
         owner[pairs[0][order]] = pairs[1][order]
-        found[cells] = owner[things[cells]]
+        labels[cells] = owner[things[cells]]
 
 
 def _without_holes(mask: NDArray[np.bool_], area: int) -> NDArray[np.bool_]:

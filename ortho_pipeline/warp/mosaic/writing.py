@@ -24,7 +24,7 @@ _WINDOW = 2048
 
 
 def write_vrt(placed: Mosaic, path: Path) -> None:
-    """Write the mosaic as a VRT that refers to the orthos by relative paths; they have to lie below its folder.
+    """Write the mosaic as a VRT that refers to the orthos by relative paths; they must be below its folder.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
         )
     names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
     with raster_output(path) as temporary:
-        made = gdal.BuildVRT(
+        vrt = gdal.BuildVRT(
             str(temporary),
             names,
             outputBounds=placed.grid.extent,
@@ -45,13 +45,13 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
             yRes=placed.grid.dy,
             resolution="user",
         )
-        with written(made) as dataset:
+        with written(vrt) as dataset:
             size = dataset.RasterXSize, dataset.RasterYSize
             listed = {Path(name).resolve() for name in dataset.GetFileList()}
         missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (placed.grid.width, placed.grid.height):
             raise InputError(
-                f"GDAL leaves out {', '.join(missing) or 'pixels'} in this VRT", file=path, remedy="write a COG"
+                f"a VRT of GDAL would lose {', '.join(missing) or 'pixels'}", file=path, remedy="write a COG"
             )
 
 
@@ -79,7 +79,7 @@ def write_cog(
     clamped = shown = 0
     with RasterWriter(path, grid, profile, threads=threads) as writer:
         for left, top, width, height in windows(grid, _WINDOW):
-            made = _Window(
+            window = _Window(
                 left,
                 top,
                 np.full((profile.count, height, width), fill, dtype=profile.dtype),
@@ -87,10 +87,10 @@ def write_cog(
                 None if owners is None else owners.window(left, top, width, height),
                 np.full((height, width), np.inf, dtype=np.float32) if owners is not None or placed.by_pixel else None,
             )
-            for number, one in enumerate(opened):
-                clamped += made.put(number, one, balance, profile, by_pixel=placed.by_pixel)
-            shown += int(np.count_nonzero(made.valid))
-            writer.write(left, top, made.pixels, np.all(made.valid, axis=0))
+            for number, raster in enumerate(opened):
+                clamped += window.put(number, raster, balance, profile, by_pixel=placed.by_pixel)
+            shown += int(np.count_nonzero(window.valid))
+            writer.write(left, top, window.pixels, np.all(window.valid, axis=0))
     return clamped / max(shown, 1)
 
 
@@ -107,24 +107,24 @@ class _Window:
     owners: NDArray[np.int16] | None
     best: NDArray[np.float32] | None
 
-    def put(self, number: int, one: Opened, balance: Balance | None, profile: Profile, *, by_pixel: bool) -> int:
+    def put(self, number: int, raster: Opened, balance: Balance | None, profile: Profile, *, by_pixel: bool) -> int:
         """Take from an ortho what has no value yet, or a worse rank; return how many values were clamped."""
         _, height, width = self.pixels.shape
-        box = intersection((self.left, self.top, self.left + width, self.top + height), box_of(one.layer))
+        box = intersection((self.left, self.top, self.left + width, self.top + height), box_of(raster.layer))
         if box is None:
             return 0
         part = (slice(box[1] - self.top, box[3] - self.top), slice(box[0] - self.left, box[2] - self.left))
         place = (slice(None), *part)
         if self.best is None and self.valid[place].all():
             return 0
-        values, good = one.read(box)
+        values, good = raster.read(box)
         if self.best is None:
             new = ~self.valid[place] & good
         else:
             rank = np.full(values.shape[1:], number, dtype=np.float32)
             if by_pixel:
-                there = box[0] - one.layer.left, box[1] - one.layer.top
-                rank = circular_errors(one.layer, *there, box[2] - box[0], box[3] - box[1])
+                there = box[0] - raster.layer.left, box[1] - raster.layer.top
+                rank = circular_errors(raster.layer, *there, box[2] - box[0], box[3] - box[1])
             if self.owners is not None:
                 rank[self.owners[part] == number] = -1.0
             better = good.all(axis=0) & (rank < self.best[part])
@@ -150,7 +150,7 @@ def _balanced(
     exact = balance.apply(number, np.where(good, values, 0).astype(np.float64))
     low, high, _, fill = value_range(profile.dtype, profile)
     beyond = int(np.count_nonzero(((exact < low - 0.5) | (exact > high + 0.5)) & new))
-    made = as_written(exact, good, profile.dtype, fill)
+    written = as_written(exact, good, profile.dtype, fill)
     if profile.validity == "nodata":
-        keep_off_nodata(made, good, fill, low)
-    return made, beyond
+        keep_off_nodata(written, good, fill, low)
+    return written, beyond

@@ -1,4 +1,4 @@
-"""Angles of view and of the sun at each place of an ortho, and what lies in shadow.
+"""View angles and sun angles at each place of an ortho, and its shadows.
 
 Azimuths are clockwise from true north, towards sensor and sun, whatever the map; zenith angles are from the ellipsoid's
 normal, and the sun's incidence is from the normal of the terrain over a pixel of the layer. The sun stands at one place
@@ -29,7 +29,7 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask of shadows, by their values; 0 stands for nothing.
+#: Classes of the shadow mask, by their values; 0 is nodata.
 LIT, SHADED, WITHOUT = 1, 2, 4
 #: Side of a tile, of the layer and of the mask, and pixels of the layer between nodes.
 _TILE, _MASK_TILE, _SPACING = 256, 1024, 16
@@ -52,7 +52,7 @@ class Sun:
     def __post_init__(self) -> None:
         if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
             raise InputError(
-                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} degrees are no position of the sun",
+                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} deg are not a position of the sun",
                 field="output.sun",
                 remedy="give the azimuth from north and an elevation above 0, in degrees",
             )
@@ -153,13 +153,13 @@ def _angles(
     metres = sight.metres(*flat, ground)
     east, north = np.einsum("nij,nj->in", metres, lean)
     # A ray goes against the displacement; straight down it comes from nowhere in particular.
-    found = [np.degrees(np.arctan(np.hypot(east, north))), np.degrees(np.arctan2(-east, -north)) % 360.0]
+    angles = [np.degrees(np.arctan(np.hypot(east, north))), np.degrees(np.arctan2(-east, -north)) % 360.0]
     if sun is not None:
-        found.append(_incidence(sight, surface, flat, metres, sun.way))
-    bands = np.stack(found)
+        angles.append(_incidence(sight, surface, flat, metres, sun.way))
+    bands = np.stack(angles)
     with np.errstate(invalid="ignore"):
         bands[:, ~((image >= 0) & (image <= size)).all(axis=1)] = math.nan
-    return bands.reshape(len(found), height, width)
+    return bands.reshape(len(angles), height, width)
 
 
 def _between(sight: Sight, window: tuple[int, int, int, int], middle: float, half: float) -> Array:
@@ -217,7 +217,7 @@ def write_shadows(
     resources: Resources | None = None,
     driver: str = "COG",
 ) -> float:
-    """Write which pixels of the ortho lie in shadow, their own or that of other terrain; return the share of shadow.
+    """Write the mask of shadowed pixels (own or cast shadow); return the share of shadow.
 
     Byte: 1 in the sun, 2 in shadow, 4 without a height. A line from the pixel to the sun is followed over the surface,
     exactly as lines of sight are (`visibility`).
@@ -237,7 +237,7 @@ def write_shadows(
     return float(counts[SHADED] / max(counts[LIT] + counts[SHADED], 1))
 
 
-def _classes(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    classes = np.full(found.shape, LIT, dtype=np.uint8)
-    classes[found == HIDDEN], classes[found == VOID] = SHADED, WITHOUT
+def _classes(visibility: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    classes = np.full(visibility.shape, LIT, dtype=np.uint8)
+    classes[visibility == HIDDEN], classes[visibility == VOID] = SHADED, WITHOUT
     return classes

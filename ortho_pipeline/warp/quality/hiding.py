@@ -20,7 +20,7 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
+#: Classes of the mask, by their values, with their names and colours; 0 is nodata.
 CLASSES = {
     1: ("visible", "#d9e8d0"),
     2: ("hidden", "#b4500b"),
@@ -32,7 +32,7 @@ VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
 
 @dataclass(frozen=True)
 class Hiding:
-    """Where an ortho is written, and what is done about pixels that terrain hides.
+    """The path of an ortho, and the treatment of pixels that terrain hides.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Looked:
 
     @property
     def filled_share(self) -> float | None:
-        """Share of the same pixels that are those of another ortho; None where none is given."""
+        """Share of the same pixels filled from another ortho; None without one."""
         return None if self.hiding.other is None else self._filled / max(self._shown, 1)
 
     def look(
@@ -90,16 +90,16 @@ class Looked:
             Of the tile, before they are written.
         """
         height, width = pixels.shape[1:]
-        found = self.visibility.look(left, top, width, height)
+        visibility = self.visibility.look(left, top, width, height)
         shown: NDArray[np.bool_] = valid[0] if len(valid) == 1 else np.asarray(valid.any(axis=0))
         count = int(np.count_nonzero(shown))
         # Most tiles of most terrain have nothing hidden: every look at all of their pixels is worth saving.
-        hidden = np.asarray((found == HIDDEN) & shown) if found.any() else None
+        hidden = np.asarray((visibility == HIDDEN) & shown) if visibility.any() else None
         with self._lock:
             self._shown += count
             self._hidden += 0 if hidden is None else int(np.count_nonzero(hidden))
         if self.hiding.mask is not None:
-            return _classes(found, shown, hidden), hidden
+            return _classes(visibility, shown, hidden), hidden
         if hidden is not None:
             pixels[:, hidden], valid[:, hidden] = fill, False
         return None, hidden
@@ -128,7 +128,7 @@ class Looked:
             self._filled += int(np.count_nonzero(new.any(axis=0)))
 
     def writer(self, driver: str, threads: int) -> Any:
-        """Return the writer of the mask by a driver of GDAL as a context; of nothing where none is wanted."""
+        """Return the writer of the mask by a driver of GDAL as a context; a dummy without a mask."""
         if self.hiding.mask is None:
             return contextlib.nullcontext()
         profile = classes_profile("visibility", CLASSES, {})
@@ -138,7 +138,7 @@ class Looked:
 
 
 def of_classes(driver: str) -> dict[str, str]:
-    """Return the creation options of a raster of classes, which is made of large parts that are all the same.
+    """Return the creation options of a raster of classes, which has large uniform areas.
 
     Runs are counted four times as fast as they are deflated, and everything reads them; COGs have no such compression.
     """
@@ -147,11 +147,13 @@ def of_classes(driver: str) -> dict[str, str]:
     return {"LEVEL": "1", "PREDICTOR": "NO", "OVERVIEW_RESAMPLING": "NEAREST"}
 
 
-def _classes(found: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+def _classes(
+    visibility: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None
+) -> NDArray[np.uint8]:
     # Two simple passes: the one through an index of booleans takes ten times as long.
     classes = np.left_shift(shown.view(np.uint8), 1)
     np.subtract(OUTSIDE, classes, out=classes)
     if hidden is not None:
         classes[hidden] = BEHIND
-        classes[(found == VOID) & ~shown] = WITHOUT
+        classes[(visibility == VOID) & ~shown] = WITHOUT
     return classes

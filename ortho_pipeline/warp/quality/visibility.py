@@ -1,6 +1,6 @@
 """What an ortho cannot show: ground that other terrain hides from the sensor, exactly against the surface.
 
-Such a pixel would get the image of what stands in front of it, which the ortho then shows twice. From every pixel the
+Such a pixel would get the image of the terrain that hides it, which the ortho then shows twice. From every pixel the
 line of sight is followed upwards over the surface, until it is above all of it (`visibility_kernel`). The lines are
 straight, and their directions vary so smoothly that they are exact at a few nodes of a tile and heights, bilinear in
 plan and quadratic in height between. Nodes lie at fixed places of the ortho, and a line does not know how much of the
@@ -89,7 +89,7 @@ class Visibility:
         return out
 
     def _is_calm(self, column: int, row: int) -> bool:
-        """Tell whether nothing in a region of the ortho has terrain as steep as a line, nor a void.
+        """Return whether a region of the ortho has no void and no terrain as steep as a line of sight.
 
         It is the cheapest look at the tiles of most terrain. Samples that are nearly as dense as pixels are not looked
         at twice.
@@ -254,7 +254,7 @@ def _extremes(slopes: Array) -> tuple[Array, Array]:
 
 
 def _across(ends: tuple[Array, Array]) -> bool:
-    """Tell whether lines surely move more across the samples than down."""
+    """Return whether lines surely move more across the samples than down."""
     least = np.where(ends[0] * ends[1] > 0, np.minimum(*np.abs(ends)), 0.0)
     return bool(least[0] > least[1])
 

@@ -1,4 +1,4 @@
-"""Compiled march from the ground towards the sensor, or the sun: does other terrain stand in the way?
+"""Compiled march from the ground towards the sensor, or the sun: does other terrain block the line?
 
 A line of sight is straight: it begins on the terrain, bilinear between samples, and goes on by so many samples per
 metre that it rises. Within a cell of four samples the terrain along it is a quadratic function, so that whether it
@@ -127,7 +127,7 @@ def find_steep(heights: Any, void: bool, low: Any, high: Any, tops: Any, squares
 
 @inlined
 def _is_beside_void(heights, j, i):
-    """Tell whether a cell without a void corner has a neighbour with one."""
+    """Return whether a cell without a void corner has a neighbour with one."""
     void = False
     for row in range(max(j - 1, 0), min(j + 3, heights.shape[0])):
         for column in range(max(i - 1, 0), min(i + 3, heights.shape[1])):
@@ -138,7 +138,7 @@ def _is_beside_void(heights, j, i):
 
 @compiled
 def is_steep(heights: Any, low: Any, high: Any) -> bool:
-    """Tell whether any cell climbs faster than some line, as `find_steep` has it."""
+    """Return whether any cell climbs faster than some line, as `find_steep` has it."""
     found = False
     for j in range(heights.shape[0] - 1):
         for i in range(heights.shape[1] - 1):
@@ -235,7 +235,7 @@ def find_known(heights: Any, above: Any, below: Any, known: Any) -> None:
 
 @inlined
 def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
-    """Tell whether the terrain of a cell rises above a line between two of its heights over its beginning."""
+    """Return whether the terrain of a cell rises above a line between two of its heights over its beginning."""
     h00 = heights[j, i]
     a, b = heights[j, i + 1] - h00, heights[j + 1, i] - h00
     c = heights[j + 1, i + 1] - heights[j + 1, i] - a
@@ -251,7 +251,7 @@ def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
 
 @inlined
 def _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend):
-    """Tell whether terrain stands in the way of the line from (x, y) in the window, at the height h.
+    """Return whether terrain stands in the way of the line from (x, y) in the window, at the height h.
 
     It goes `across` and `down` samples per metre upwards.
     """
