@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed
+from ortho_pipeline.cli.machine.browser import open_option, page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable, say
 from ortho_pipeline.cli.options import dry_run_option, json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
-from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_json, print_result, progress
+from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_files, print_json, print_result, progress
 from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
 from ortho_pipeline.options.texts import counted
 
@@ -80,6 +81,7 @@ class _Shard(click.ParamType):
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state, and do nothing.")
 @dry_run_option
 @click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the file, and do nothing.")
+@open_option
 @json_option
 def run(
     pipeline_file: str | None,
@@ -135,6 +137,7 @@ def run(
         raise
     if as_json:
         print_json(result.to_json())
+        show_page(page_of(result.files))
     else:
         _print_summary(result)
     if result.failed:
@@ -154,6 +157,7 @@ def run(
 )
 @mosaic_options
 @network_option
+@open_option
 @json_option
 def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: SceneOptions, as_json: bool) -> None:
     """Combine ORTHOs on one grid into one raster.
@@ -223,8 +227,7 @@ def _print_summary(result: BatchResult) -> None:
     console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
         console.print(printable(_mosaic_text(result.mosaic)), markup=False)
-    for name, path in result.files.items():
-        console.print(printable(f"  {name:<10} {path}"), markup=False)
+    print_files(result.files)
 
 
 def _row(scene: Outcome) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli.machine.browser import open_option, require_page
 from ortho_pipeline.cli.options import (
     image_argument,
     images_argument,
@@ -15,7 +16,7 @@ from ortho_pipeline.cli.options import (
     tie_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result, print_warnings
+from ortho_pipeline.cli.printing import print_result
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 
 
@@ -32,6 +33,7 @@ from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
     metavar="FILE.html",
     help="Page to look at the matches: chips, map, residuals; its numbers beside it as .json.",
 )
+@open_option
 @scene_options
 @json_option
 def match(
@@ -50,10 +52,9 @@ def match(
     """
     from ortho_pipeline.commands.control import command
 
+    require_page("--report FILE.html", report)
     result = command.match(image, output, match, scene=scene, surface=surface, report=report)
     print_result(result, as_json)
-    if not as_json:
-        print_warnings(result.document["warnings"])
 
 
 @click.command(cls=Command)
@@ -81,5 +82,3 @@ def ties(
 
     result = command.ties(images, output, match, scene=scene, surface=surface)
     print_result(result, as_json)
-    if not as_json:
-        print_warnings(result.document["warnings"])

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed, name_as_typed
+from ortho_pipeline.cli.machine.browser import page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable_json, say
 from ortho_pipeline.options.texts import counted
 
@@ -40,13 +41,14 @@ def print_warnings(warnings: Any) -> None:
 
 
 def print_result(result: Result, as_json: bool) -> None:
-    """Print the summary of a result and its files, or its document; end with exit code 3 if its report failed."""
+    """Print summary, warnings and files of a result, or its document; end with exit code 3 if its report failed."""
     if as_json:
         print_json(result.to_json())
+        show_page(page_of(result.files))
     else:
         say(as_typed(result.summary))
-        for name, path in result.files.items():
-            say(f"  {name:<10} {path}")
+        print_warnings(result.document.get("warnings", ()))
+        print_files(result.files)
     if result.failure is not None:
         context = click.get_current_context()
         if context.meta.get("debug"):
@@ -54,6 +56,17 @@ def print_result(result: Result, as_json: bool) -> None:
         name_as_typed(result.failure, context.command)
         say(f"Error: {result.failure}", err=True)
         context.exit(PARTLY_DONE)
+
+
+def print_files(files: Mapping[str, Any]) -> None:
+    """Print the files of a result, the page last; open it if ``--open`` was given."""
+    page = page_of(files)
+    for name, path in files.items():
+        if path is not page:
+            say(f"  {name:<10} {path}")
+    show_page(page)
+    if page is not None:
+        say(f"Report: {page}")
 
 
 def checked_text(name: str, checked: Mapping[str, Any]) -> str:
@@ -230,9 +243,8 @@ def print_comparison(result: CompareResult, units: str) -> None:
         say(f"\nleft out of all models: {point.id} ({point.reason})")
     reason = compared.recommendation.reason
     say(f"\n* Recommended: {reason}." if compared.recommended else f"\nNo recommendation: {reason}.")
-    for name, path in result.files.items():
-        say(f"  {name:<10} {path}")
     print_warnings(compared.warnings)
+    print_files(result.files)
 
 
 def _errors(rmse: Rmse | RmseOnGround | None) -> str:
