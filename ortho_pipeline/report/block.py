@@ -27,14 +27,13 @@ from ortho_pipeline.report.network.facts import found_network, placed, suffices_
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
-from ortho_pipeline.report.records import NOT_TESTED, RpcRecord
+from ortho_pipeline.report.records import UNKNOWN, RpcRecord
 from ortho_pipeline.report.wording import (
     ENOUGH_CHECK_POINTS,
     FEW,
     NO_SCALE,
-    NONE_APART,
+    NOTHING_LEFT,
     NOTICED,
-    UNKNOWN,
     fitness,
     instead,
     refuted,
@@ -49,7 +48,7 @@ if TYPE_CHECKING:
 _DRAWN_RAYS, _LISTED = 400, 400
 #: What makes points of known ground a test.
 KEPT_OUT = "whose ground coordinates took no part"
-TIED = "their image measurements helped to tie the images"
+TIED = "their image measurements tie the images"
 #: Ground that stays this close (m) to its given coordinates was held, not tested.
 _HELD = 0.0005
 #: What the headline says of a block that only ties hold together.
@@ -102,11 +101,10 @@ def build_report(
 
 
 def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHeadline:
-    """Say how accurate the block is from the best evidence that there is: check points, else the fit of control.
+    """Say how accurate the block is from the best evidence that there is: check points.
 
-    How well ties agree is no evidence of it.
-    What matches say is `relative` to their reference; they are seen in one image each, and measured check points in two
-    or more come first.
+    Neither the fit of control points nor how well ties agree is evidence. Matches are `relative` to their reference;
+    they are seen in one image each, and measured check points in two or more come first.
     """
     to = ", relative to the reference" if relative else ""
     notes = [f"{adjustment.gauge[0].upper()}{adjustment.gauge[1:]}."]
@@ -126,15 +124,15 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
         return said(px(check.total), f"{what}, {KEPT_OUT}; {TIED}")
     control = merged(*(one.control for one in seen))
     if adjustment.object_rms.control and control:
-        notes.append(NONE_APART)
         if not adjustment.redundancy:
-            return said(NOT_TESTED, "nothing is left over to test the fit with")
-        what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images{to}: the fit, not a test"
-        return said(px(control.total), what)
+            return said(UNKNOWN, NOTHING_LEFT)
+        fit = f"{px(control.total)} RMSE of {counted(control.n, 'measurement')} of control points in the images{to}"
+        notes.insert(0, f"The fit: {fit}. This does not test the accuracy.")
+        return said(UNKNOWN, _NO_CHECKS)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
     if sizes:
         agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {counted(len(sizes), 'ray')})."
-        notes.insert(0, f"{agree} That tests neither positions nor heights.")
+        notes.insert(0, f"{agree} This tests neither positions nor heights.")
     return said(UNKNOWN, _NO_CHECKS)
 
 
@@ -252,7 +250,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     said = signals(
         report.warnings,
         report.notices,
-        tested=report.headline.figure != NOT_TESTED and report.headline.what != _NO_CHECKS,
+        tested=report.headline.figure != UNKNOWN or refuted(report.notices) is not None,
     )
     return render(
         "report/block.html.j2",
