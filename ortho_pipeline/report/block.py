@@ -24,10 +24,19 @@ from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
 from ortho_pipeline.report.network.facts import found_network, placed, suffices_for, thinly_covered
-from ortho_pipeline.report.page.advice import WORDS, signals
+from ortho_pipeline.report.page.advice import WORDS, Signal, signal_lines, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
 from ortho_pipeline.report.records import UNKNOWN, RpcRecord
+from ortho_pipeline.report.summary import (
+    HELD,
+    RoleErrors,
+    about_block,
+    error_lines,
+    error_table,
+    errors_of_block,
+    processed,
+)
 from ortho_pipeline.report.wording import (
     ENOUGH_CHECK_POINTS,
     FEW,
@@ -49,8 +58,6 @@ _DRAWN_RAYS, _LISTED = 400, 400
 #: What makes points of known ground a test.
 KEPT_OUT = "whose ground coordinates took no part"
 TIED = "their image measurements tie the images"
-#: Ground that stays this close (m) to its given coordinates was held, not tested.
-_HELD = 0.0005
 #: What the headline says of a block that only ties hold together.
 _NO_CHECKS = "there are no check points"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
@@ -186,7 +193,7 @@ def summary_text(report: BlockReport) -> str:
         lines.append(f"{label:<{wide}}  {found.rays:>6}{pairs}  {image.model} of {image.model_source}")
     for role, rms in (("control", adjustment.object_rms.control), ("check", adjustment.object_rms.check)):
         if rms:
-            if max(map(abs, (*rms.min, *rms.max))) < _HELD:
+            if max(map(abs, (*rms.min, *rms.max))) < HELD:
                 held = "held at the given coordinates, so no RMSE on the ground"
                 lines.append(f"{counted(rms.n, f'{role} point')}: {held}")
                 continue
@@ -198,9 +205,31 @@ def summary_text(report: BlockReport) -> str:
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
-    height = f", height {head.height}" if head.height else ""
-    lines += [f"{head.figure}{height}: {head.what}", *head.notes]
-    return Text.joined("\n", [*lines, *(Text("Warning: ", text) for text in report.warnings)])
+    said, errors = _signals_of(report), errors_of_block(report)
+    first = [*accuracy_lines(report, errors), *_notes(head, said), *error_lines(errors), *signal_lines(said)]
+    return Text.joined("\n", [*first, *lines])
+
+
+def accuracy_lines(report: BlockReport, errors: Sequence[RoleErrors]) -> list[str]:
+    """Return the accuracy of a block with CE90 and LE90, and what it is from."""
+    head, check = report.headline, next((one for one in errors if one.role == "check"), None)
+    if head.figure == UNKNOWN:
+        return [f"{head.figure}: {head.what}"]
+    if head.height is None or check is None or check.le90 is None:
+        return [f"Accuracy {head.figure}", f"{head.what[0].upper()}{head.what[1:]}."]
+    plan, height = (f"90 {metres(value)}" for value in (check.ce90, check.le90))
+    said = f"Accuracy {head.figure} in plan (CE{plan}), {head.height} in height (LE{height})"
+    return [said, f"{head.what[0].upper()}{head.what[1:]}."]
+
+
+def _signals_of(report: BlockReport) -> list[Signal]:
+    tested = report.headline.figure != UNKNOWN or refuted(report.notices) is not None
+    return signals(report.warnings, report.notices, tested=tested)
+
+
+def _notes(head: BlockHeadline, said: Sequence[Signal]) -> list[str]:
+    """Return the reservations of the headline without those that a notice states."""
+    return [note for note in head.notes if note not in NOTICED or not said]
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:
@@ -247,17 +276,17 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
     provenance = {key: value for key, value in report.provenance.to_json().items() if key != "inputs"}
-    said = signals(
-        report.warnings,
-        report.notices,
-        tested=report.headline.figure != UNKNOWN or refuted(report.notices) is not None,
-    )
+    said, errors = _signals_of(report), errors_of_block(report)
     return render(
         "report/block.html.j2",
         report=report,
         adjustment=adjustment,
         head=report.headline,
-        notes=[note for note in report.headline.notes if note not in NOTICED or not said],
+        about=about_block(report) | {"Processed": processed()},
+        unknown=report.headline.figure == UNKNOWN,
+        errors=error_table(errors),
+        tested=next((one for one in errors if one.role == "check"), None),
+        notes=_notes(report.headline, said),
         verdict=verdict(report),
         marks=_marks(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),

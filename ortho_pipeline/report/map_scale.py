@@ -94,8 +94,8 @@ def _evidence(fit: Fit) -> dict[Evidence, Array]:
 
 
 def ce90_of(errors: Array) -> float:
-    """Return the error that at most one in ten of errors ``(N, 2)`` in metres exceeds; of few, the largest."""
-    return float(np.sort(np.hypot(*errors.T))[len(errors) - 1 - len(errors) // 10])
+    """Return the size that at most one in ten of errors ``(N, K)`` in metres exceeds; of fewer than ten, the largest."""
+    return float(np.sort(np.linalg.norm(errors, axis=1))[len(errors) - 1 - len(errors) // 10])
 
 
 def judge(errors: Array, evidence: Evidence, pixel: float | None, survey: float = 0.0) -> MapScaleRecord:

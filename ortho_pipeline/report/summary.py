@@ -15,8 +15,10 @@ import numpy as np
 
 from ortho_pipeline.display.numbers import area_km2, metres, plain_size, px, share, short, signed, size_text
 from ortho_pipeline.estimation.records import Bias, Parameter, Point, is_known
+from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Text, counted
+from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.map_scale import ce90_of
 from ortho_pipeline.report.matching import is_relative
 from ortho_pipeline.report.page.advice import Signal, signal_lines, signals
@@ -25,6 +27,8 @@ from ortho_pipeline.report.page.ortho_map import Paper, degrees
 from ortho_pipeline.report.records import UNKNOWN, Dem, FlatGround, SceneReport
 from ortho_pipeline.report.wording import NO_SCALE, NOTICED, evidence_of, fit_notes, refuted
 
+#: Ground that stays this close (m) to its given coordinates was held, not tested.
+HELD = 0.0005
 _AXES = ("x (east)", "y (north)", "z (height)")
 
 
@@ -40,13 +44,17 @@ class AxisErrors:
 
 @dataclass(frozen=True)
 class RoleErrors:
-    """Errors of the points of a role on the ground; `role` is ``check``, ``matched`` or ``control``."""
+    """Errors of the points of a role on the ground; `role` is ``check``, ``matched`` or ``control``.
+
+    `ce90` is of x and y, `le90` of z, both in metres.
+    """
 
     role: str
     title: str
     n: int
     axes: tuple[AxisErrors, ...]
     ce90: float
+    le90: float | None
 
     @classmethod
     def of(cls, role: str, title: str, errors: Array) -> RoleErrors:
@@ -55,7 +63,8 @@ class RoleErrors:
         rmse = np.sqrt((errors**2).mean(axis=0))
         rows = zip(_AXES, errors.mean(axis=0).tolist(), spread, rmse.tolist(), strict=False)
         axes = tuple(AxisErrors(axis, mean, None if std is None else float(std), rms) for axis, mean, std, rms in rows)
-        return cls(role, title, len(errors), axes, ce90_of(errors[:, :2]))
+        le90 = ce90_of(errors[:, 2:]) if errors.shape[1] == 3 else None
+        return cls(role, title, len(errors), axes, ce90_of(errors[:, :2]), le90)
 
 
 def errors_of_points(report: SceneReport) -> list[RoleErrors]:
@@ -70,9 +79,9 @@ def errors_of_points(report: SceneReport) -> list[RoleErrors]:
         elif point.kind == "control":
             kinds["control"].append(point)
     titles = {
-        "check": "Check points (measured)" if apart else "Check points",
-        "matched": "Check points (matches)",
-        "control": "Control points (the fit)" if adjustment.parameters else "Points",
+        "check": "check points (measured)" if apart else "check points",
+        "matched": "check points (matches)",
+        "control": "control points (the fit)" if adjustment.parameters else "points (model as delivered)",
     }
     if relative and not apart:
         titles["check"] += " (relative to the reference)"
@@ -81,6 +90,20 @@ def errors_of_points(report: SceneReport) -> list[RoleErrors]:
         errors = [point.residual_m for point in points if is_known(point.residual_m)]
         if errors:
             found.append(RoleErrors.of(role, titles[role], np.array(errors, dtype=np.float64)))
+    return found
+
+
+def errors_of_block(report: BlockReport) -> list[RoleErrors]:
+    """Return the errors of check points and of control points of a block: known minus adjusted ground.
+
+    Control that is held at its coordinates has none.
+    """
+    found = []
+    for role, title in (("check", "check points"), ("control", "control points (the fit)")):
+        rows = [one.residual for one in report.adjustment.points if one.role == role and None not in one.residual]
+        errors = np.array(rows, dtype=np.float64)
+        if rows and not (role == "control" and np.abs(errors).max() < HELD):
+            found.append(RoleErrors.of(role, title, errors))
     return found
 
 
@@ -118,6 +141,31 @@ def about(report: SceneReport) -> dict[str, str]:
         "Sensor": sensors_text([report.scene.sensor], [report.scene.facts]),
     }
     return {key: text for key, text in texts.items() if text}
+
+
+def about_block(report: BlockReport) -> dict[str, str]:
+    """Return what the images of a block are, as `about`."""
+    images = report.images.values()
+    outlines = [np.array(image.outline) for image in images if image.outline]
+    middle = np.concatenate(outlines).mean(axis=0) if outlines else None
+    texts = {
+        "Acquired": acquired(image.facts.get("acquired") for image in images),
+        "Area": area_km2(_area_of(outlines)) if outlines else None,
+        "Place": None if middle is None else place_text(middle.tolist()),
+        "Sensor": sensors_text((image.sensor for image in images), (image.facts for image in images)),
+    }
+    return {key: text for key, text in texts.items() if text}
+
+
+def _area_of(outlines: Sequence[Array]) -> float:
+    """Return the area of outlines together, longitudes and latitudes, in square metres."""
+    import shapely
+
+    first = outlines[0][0]
+    scale = metres_per_degree(np.array([[*first, 0.0]]))[0]
+    # Over the antimeridian longitudes go on.
+    shapes = [shapely.Polygon(((corners - first + 180.0) % 360.0 - 180.0) * scale) for corners in outlines]
+    return float(shapely.union_all([shape.buffer(0) for shape in shapes]).area)
 
 
 def _area(report: SceneReport) -> float | None:
@@ -207,13 +255,25 @@ def error_lines(roles: Sequence[RoleErrors]) -> list[str]:
         return []
     wide = max(len(one.title) for one in roles) + 1
     lines = [f"{'errors, m':<{wide}} {'points':>6}  {'':<10} {'mean':>8} {'std. dev.':>9} {'RMSE':>8}"]
-    for one in roles:
-        for number, axis in enumerate(one.axes):
+    for one, rows in error_table(roles):
+        for number, (axis, mean, std, rmse) in enumerate(rows):
             name, count = ("", "") if number else (one.title, str(one.n))
-            std = "-" if axis.std is None else f"{axis.std:.2f}"
-            numbers = f"{axis.mean:>+8.2f} {std:>9} {axis.rmse:>8.2f}"
-            lines.append(f"{name:<{wide}} {count:>6}  {axis.axis:<10} {numbers}")
+            lines.append(f"{name:<{wide}} {count:>6}  {axis:<10} {mean:>8} {std:>9} {rmse:>8}")
     return lines
+
+
+def error_table(roles: Sequence[RoleErrors]) -> list[tuple[RoleErrors, list[tuple[str, str, str, str]]]]:
+    """Return the errors of each role as texts: axis, mean, standard deviation, RMSE; in centimetres or millimetres."""
+    digits = 2 if max((axis.rmse for one in roles for axis in one.axes), default=0.0) >= 0.1 else 3
+
+    def text(value: float | None, sign: str = "") -> str:
+        if value is None:
+            return "–"
+        return f"{round(value, digits) + 0.0:{sign if round(value, digits) else ''}.{digits}f}".replace("-", "−")
+
+    return [
+        (one, [(row.axis, text(row.mean, "+"), text(row.std), text(row.rmse)) for row in one.axes]) for one in roles
+    ]
 
 
 def _detail_rows(report: SceneReport) -> list[tuple[str, str]]:

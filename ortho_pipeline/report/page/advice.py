@@ -57,9 +57,7 @@ _LOOK: dict[str, str] = {
     "no-redundancy": "Add points. Until then the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
     "uncertain-at-edge": "Add control points near the corners, or use a simpler correction.",
-    "inseparable-parameters": Text(
-        "Use a simpler correction, or add ", Setting("points.prune"), "."
-    ),
+    "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
     "search-by-default": Text("State the accuracy of the delivered model with ", Setting("match.search"), "."),
     "points-cover-part": "Add ties there (matching finds them), and control near the corners of the block.",
@@ -88,9 +86,7 @@ _LOOK: dict[str, str] = {
 }
 _KNOW: dict[str, str] = {
     "control-without-height": "Add heights if you have them.",
-    "unstated-sigma": Text(
-        "State the accuracy of the points with ", Setting("points.ground_sigma"), "."
-    ),
+    "unstated-sigma": Text("State the accuracy of the points with ", Setting("points.ground_sigma"), "."),
     "parameters-removed": "Nothing to do: the points did not justify these parameters.",
     "relative-to-reference": "Measure check points if the absolute position matters.",
     "dem-sigma-by-default": Text("State the accuracy of the DEM with ", Setting("surface.sigma"), "."),

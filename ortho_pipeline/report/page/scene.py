@@ -22,10 +22,11 @@ from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import LONGEST_ARROW, plot_ortho
 from ortho_pipeline.report.plots import plots
-from ortho_pipeline.report.records import Provenance, SceneReport
+from ortho_pipeline.report.records import UNKNOWN, Provenance, SceneReport
 from ortho_pipeline.report.summary import (
     about,
     circular_error,
+    error_table,
     errors_of_points,
     first_notes,
     processed,
@@ -70,8 +71,9 @@ def write_report_html(
         adjustment=adjustment,
         head=report.headline,
         about=about(report) | {"Processed": processed()},
+        unknown=report.headline.figure == UNKNOWN,
         ce90=circular_error(report),
-        errors=errors_of_points(report),
+        errors=error_table(errors_of_points(report)),
         notes=first_notes(report, said),
         fit_notes=fit_notes(adjustment),
         verdict=verdict(report),
