@@ -167,7 +167,7 @@ def verdict(report: BlockReport) -> str | None:
     if report.map_scale is not None:
         part = any(one["code"] == "points-cover-part" for one in report.notices)
         where = " in plan" + (", where there are points" if part else "")
-        said.append(f"{fitness(report.map_scale, where)} No scale is stated for heights.")
+        said.append(f"{fitness(report.map_scale, where)} This does not cover heights.")
     return " ".join(said) or None
 
 
@@ -309,12 +309,12 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
 
 
 def _marks(report: BlockReport) -> list[str]:
-    """Say what the marks on the map of the network are, of what there is."""
+    """Return what the marks on the map of the network mean, of those that are there."""
     there = {point.role for point in report.adjustment.points}
-    kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
+    kinds = {"control": "dots: control points", "check": "squares: check points", "tie": "small dots: tie points"}
     said = [what for role, what in kinds.items() if role in there]
-    said += ["crosses are what was left out"] if report.adjustment.rejected else []
-    return [*said, "in red rings what contradicts"] if doubted(report.notices) else said
+    said += ["crosses: rejected points"] if report.adjustment.rejected else []
+    return [*said, "red rings: contradicting points"] if doubted(report.notices) else said
 
 
 def plot_rays(report: BlockReport, label: str, rays: Sequence[Ray]) -> Drawing | None:

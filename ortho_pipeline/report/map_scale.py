@@ -94,7 +94,7 @@ def _evidence(fit: Fit) -> dict[Evidence, Array]:
 
 
 def ce90_of(errors: Array) -> float:
-    """Return the size that at most one in ten of errors ``(N, K)`` in metres exceeds; of fewer than ten, the largest."""
+    """Return the size that at most one in ten of errors ``(N, K)`` in metres exceeds; of few, the largest."""
     return float(np.sort(np.linalg.norm(errors, axis=1))[len(errors) - 1 - len(errors) // 10])
 
 

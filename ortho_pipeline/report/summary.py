@@ -262,18 +262,20 @@ def error_lines(roles: Sequence[RoleErrors]) -> list[str]:
     return lines
 
 
-def error_table(roles: Sequence[RoleErrors]) -> list[tuple[RoleErrors, list[tuple[str, str, str, str]]]]:
+def error_table(roles: Sequence[RoleErrors]) -> list[tuple[RoleErrors, list[tuple[str, ...]]]]:
     """Return the errors of each role as texts: axis, mean, standard deviation, RMSE; in centimetres or millimetres."""
-    digits = 2 if max((axis.rmse for one in roles for axis in one.axes), default=0.0) >= 0.1 else 3
+    found = []
+    for one in roles:
+        digits = 2 if max(axis.rmse for axis in one.axes) >= 0.1 else 3
+        found.append((one, [_texts(row, digits) for row in one.axes]))
+    return found
 
-    def text(value: float | None, sign: str = "") -> str:
-        if value is None:
-            return "–"
-        return f"{round(value, digits) + 0.0:{sign if round(value, digits) else ''}.{digits}f}".replace("-", "−")
 
-    return [
-        (one, [(row.axis, text(row.mean, "+"), text(row.std), text(row.rmse)) for row in one.axes]) for one in roles
-    ]
+def _texts(row: AxisErrors, digits: int) -> tuple[str, ...]:
+    numbers = [None if value is None else round(value, digits) + 0.0 for value in (row.mean, row.std, row.rmse)]
+    signs = ("+" if numbers[0] else "", "", "")
+    texts = ["–" if value is None else f"{value:{sign}.{digits}f}" for value, sign in zip(numbers, signs, strict=True)]
+    return row.axis, *(text.replace("-", "−") for text in texts)
 
 
 def _detail_rows(report: SceneReport) -> list[tuple[str, str]]:
