@@ -133,7 +133,7 @@ def run(
                 else batch.run(planned, memory=memory, progress=advance, store=store, **options)
             )
     except KeyboardInterrupt:
-        say("What is done is kept: run it again to go on.", err=True)
+        say("Finished scenes are kept. Run the command again to continue.", err=True)
         raise
     if as_json:
         print_json(result.to_json())
@@ -172,7 +172,7 @@ def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: S
 
 
 def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, as_json: bool) -> None:
-    """Print what stands in the way of each scene; exit as a run would if that were all."""
+    """Print what prevents each scene; exit with the code that a run would have."""
     from ortho_pipeline.batch.dry_run import check_scenes
     from ortho_pipeline.batch.results import SCHEMA_VERSION
 
@@ -197,7 +197,7 @@ def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, 
 
 
 def _print_summary(result: BatchResult) -> None:
-    """Print a table of the scenes and what went wrong; of many scenes only those that failed."""
+    """Print a table of the scenes, and each error with its remedy; of many scenes only those that failed."""
     from rich.console import Console
     from rich.table import Table
 
@@ -208,17 +208,17 @@ def _print_summary(result: BatchResult) -> None:
     console = Console(highlight=False, soft_wrap=True, width=wide)
     scenes = result.scenes if len(result.scenes) <= _SHOWN else [one for one in result.scenes if one.status == "failed"]
     table = Table(box=None, pad_edge=False)
-    for title in ("scene", "state", "model", "check px", "left out px", "control px", "seconds"):
-        table.add_column(title, justify="left" if title in ("scene", "state", "model") else "right", no_wrap=True)
+    for title in ("scene", "state", "RMSE m", "px", "tested at", "model", "seconds"):
+        table.add_column(title, justify="right" if title in ("RMSE m", "px", "seconds") else "left", no_wrap=True)
     for scene in scenes:
         table.add_row(*map(printable, _row(scene)))
     if scenes:
         console.print(table)
     for scene in scenes:
         if scene.error:
-            console.print(printable(f"\n{scene.name}: {_error_text(scene.error)}"), markup=False)
+            console.print(printable(f"\nError: {scene.name}: {_error_text(scene.error)}"), markup=False)
         elif against := refuted(scene.facts.get("notices", ())):
-            console.print(printable(f"\n{scene.name}: Error: accuracy unknown: {against}"), markup=False)
+            console.print(printable(f"\nError: {scene.name}: accuracy unknown: {against}"), markup=False)
     counts = ", ".join(
         f"{result.count(status)} {status}"
         for status in ("done", "unchanged", "failed", "missing")
@@ -233,15 +233,18 @@ def _print_summary(result: BatchResult) -> None:
 def _row(scene: Outcome) -> list[str]:
     from rich.markup import escape
 
-    from ortho_pipeline.report.wording import refuted
+    from ortho_pipeline.report.page.run import evidence_in, tested_at
 
-    rmse = {} if refuted(scene.facts.get("notices", ())) else scene.facts.get("rmse_px", {})
-    numbers = ["-" if rmse.get(which) is None else f"{rmse[which]:.3f}" for which in ("check", "loo", "control")]
-    return [escape(scene.name), scene.status, str(scene.facts.get("model", "-")), *numbers, f"{scene.seconds:.1f}"]
+    facts = scene.facts
+    found = evidence_in(facts) if facts else None
+    sizes = [None if found is None else facts[which].get(found) for which in ("rmse_m", "rmse_px")]
+    numbers = ["-" if size is None else f"{size:.2f}" for size in sizes]
+    tested = tested_at(facts) if facts else "-"
+    return [escape(scene.name), scene.status, *numbers, tested, str(facts.get("model", "-")), f"{scene.seconds:.1f}"]
 
 
 def _mosaic_text(mosaic: Mapping[str, Any]) -> str:
-    """Return what there is to say of a mosaic and its seams."""
+    """Return the result of a mosaic and its seams in words."""
     from ortho_pipeline.report.mosaic.document import summary_text
 
     if mosaic.get("error"):

@@ -35,7 +35,6 @@ from ortho_pipeline.report.summary import (
     error_lines,
     error_table,
     errors_of_block,
-    processed,
 )
 from ortho_pipeline.report.wording import (
     ENOUGH_CHECK_POINTS,
@@ -282,7 +281,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         report=report,
         adjustment=adjustment,
         head=report.headline,
-        about=about_block(report) | {"Processed": processed()},
+        about=about_block(report),
         unknown=report.headline.figure == UNKNOWN,
         errors=error_table(errors),
         tested=next((one for one in errors if one.role == "check"), None),

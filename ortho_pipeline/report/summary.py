@@ -131,11 +131,12 @@ def signals_of(report: SceneReport) -> list[Signal]:
 
 
 def about(report: SceneReport) -> dict[str, str]:
-    """Return what a scene is: when it was acquired, its area and place, and the sensor; what is unknown is left out."""
+    """Return what a scene is: when it was acquired and processed, its area and place, and the sensor."""
     output = (report.provenance.options or {}).get("output", {})
     area, place = _area(report), place_of(report)
     texts = {
-        "Acquired": acquired([output.get("acquired") or report.scene.facts.get("acquired")]),
+        "Acquired": acquired([output.get("acquired") or report.scene.facts.get("acquired")]) or "unknown",
+        "Processed": processed(),
         "Area": area and area_km2(area),
         "Place": place and place_text(place),
         "Sensor": sensors_text([report.scene.sensor], [report.scene.facts]),
@@ -149,7 +150,8 @@ def about_block(report: BlockReport) -> dict[str, str]:
     outlines = [np.array(image.outline) for image in images if image.outline]
     middle = np.concatenate(outlines).mean(axis=0) if outlines else None
     texts = {
-        "Acquired": acquired(image.facts.get("acquired") for image in images),
+        "Acquired": acquired(image.facts.get("acquired") for image in images) or "unknown",
+        "Processed": processed(),
         "Area": area_km2(_area_of(outlines)) if outlines else None,
         "Place": None if middle is None else place_text(middle.tolist()),
         "Sensor": sensors_text((image.sensor for image in images), (image.facts for image in images)),
@@ -224,7 +226,7 @@ def summary_text(report: SceneReport) -> str:
     """Return the report as a screenful of text, without colours: accuracy, points, what to do, then details."""
     said = signals_of(report)
     known = about(report)
-    acquired_ = f", acquired {known['Acquired']}" if "Acquired" in known else ""
+    acquired_ = "" if known["Acquired"] == "unknown" else f", acquired {known['Acquired']}"
     place = ", ".join(known[key] for key in ("Area", "Place") if key in known)
     rows = [
         ("scene", f"{report.scene.name}{acquired_}, sensor {known['Sensor']}"),

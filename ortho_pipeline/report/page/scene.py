@@ -29,7 +29,6 @@ from ortho_pipeline.report.summary import (
     error_table,
     errors_of_points,
     first_notes,
-    processed,
     signals_of,
 )
 from ortho_pipeline.report.wording import fit_notes, runner_up, scale_rules, unsettled, verdict
@@ -70,7 +69,7 @@ def write_report_html(
         report=report,
         adjustment=adjustment,
         head=report.headline,
-        about=about(report) | {"Processed": processed()},
+        about=about(report),
         unknown=report.headline.figure == UNKNOWN,
         ce90=circular_error(report),
         errors=error_table(errors_of_points(report)),
