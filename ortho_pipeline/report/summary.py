@@ -289,6 +289,8 @@ def _detail_rows(report: SceneReport) -> list[tuple[str, str]]:
     if raw := adjustment.raw_bias:
         rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {counted(raw.n, 'point')})"))
     rows += [("fit", note.removeprefix("The fit: ")) for note in fit_notes(adjustment)]
+    named = {one.get("point") for one in report.notices if one["code"] == "left-out"}
+    rows += [("left out", f"{one.id}: {one.reason}") for one in adjustment.rejected if one.id not in named]
     if report.matching:
         rows.append(("matching", report.matching.text()))
     for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):

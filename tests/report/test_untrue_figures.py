@@ -52,7 +52,7 @@ def test_no_output_shows_a_figure_that_an_error_makes_untrue(outputs, tiny):
     assert f"which moves the ortho by {notice['moved_m']:.2f} m" in head["what"]
     assert head["notes"][0].startswith(f"Do not rely on this figure: {rmse}")
     page = (out / "tiny" / "tiny_report.html").read_text()
-    first = page[page.index('<p class="figure">') : page.index('<dl class="facts">')]
+    first = page[page.index('<p class="figure') : page.index('<dl class="facts">')]
     assert first.index("Accuracy unknown") < first.index(why[4:]) < first.index(NO_SCALE) < first.index(rmse)
     assert "Map scales" not in page
     # The run: its terminal, its record and its page.
