@@ -225,6 +225,13 @@ def sensors_text(names: Iterable[str], facts: Iterable[Mapping[str, Any]]) -> st
 def summary_text(report: SceneReport) -> str:
     """Return the report as a screenful of text, without colours: accuracy, points, what to do, then details."""
     said = signals_of(report)
+    lines = [*first_lines(report), *signal_lines(said)]
+    lines += [Text(f"{key:<10}", value) for key, value in _detail_rows(report)]
+    return Text.joined("\n", lines)
+
+
+def first_lines(report: SceneReport) -> list[Text]:
+    """Return what a scene is, its accuracy and the errors of its points, a text for each line."""
     known = about(report)
     acquired_ = "" if known["Acquired"] == "unknown" else f", acquired {known['Acquired']}"
     place = ", ".join(known[key] for key in ("Area", "Place") if key in known)
@@ -232,14 +239,12 @@ def summary_text(report: SceneReport) -> str:
         ("scene", f"{report.scene.name}{acquired_}, sensor {known['Sensor']}"),
         *([("area", place)] if place else []),
         *_accuracy_rows(report),
-        *(("", Text.read(note)) for note in first_notes(report, said)),
+        *(("", Text.read(note)) for note in first_notes(report, signals_of(report))),
     ]
     if report.map_scale or refuted(report.notices):
         rows.append(("map scale", report.map_scale.statement if report.map_scale else NO_SCALE))
     lines = [Text(f"{key:<10}", value) for key, value in rows]
-    lines += [*map(Text, error_lines(errors_of_points(report))), *signal_lines(said)]
-    lines += [Text(f"{key:<10}", value) for key, value in _detail_rows(report)]
-    return Text.joined("\n", lines)
+    return [*lines, *map(Text, error_lines(errors_of_points(report)))]
 
 
 def _accuracy_rows(report: SceneReport) -> list[tuple[str, str]]:

@@ -57,10 +57,10 @@ def test_no_output_shows_a_figure_that_an_error_makes_untrue(outputs, tiny):
     assert "Map scales" not in page
     # The run: its terminal, its record and its page.
     row = next(line for line in printed.splitlines() if line.startswith("tiny "))
-    assert row.split()[3:6] == ["-", "-", "-"]
-    assert f"Error: accuracy unknown: {why}" in printed
+    assert row.split()[2:6] == ["-", "-", "accuracy", "unknown:"]
+    assert f"Error: tiny: accuracy unknown: {why}" in printed
     assert json.loads((out / "run.json").read_text())["scenes"][0]["facts"]["headline"] == head
-    assert "unknown: see the error" in (out / "index.html").read_text()
+    assert "accuracy unknown: see the error" in (out / "index.html").read_text()
     item = json.loads((out / "tiny" / "tiny_stac.json").read_text())
     assert not [name for name in item["properties"] if name.startswith("accuracy:")]
     # `ortho rectify` in the terminal.
