@@ -134,7 +134,7 @@ def adjust(
     with together(folder, "block"):
         _write(files, made, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
-    text = Text.joined("\n", [*gathered.text, block_report.summary_text(made)])
+    text = Text.joined("\n", [block_report.summary_text(made), *gathered.text])
     return Result(files, {"report": made.to_json(), **gathered.document}, text, failure)
 
 

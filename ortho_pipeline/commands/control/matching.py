@@ -191,30 +191,26 @@ class Matched:
         column, row = said.shift_px
         reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in said.reasons.items())
         levels = "; ".join(
-            f"{one.agreeing} of {counted(one.chips, 'chip')} of 1/{one.factor} resolution agree" for one in said.levels
+            f"{one.agreeing} of {counted(one.chips, 'chip')} at 1/{one.factor} resolution agree" for one in said.levels
         )
         sigma = self.options.reference_sigma
         return [
+            ("accuracy", f"{px(said.sigma_px)} (median match), relative to the reference: {said.components.text()}"),
             (
                 "reference",
                 ", ".join(Path(one).name for one in self.references)
-                + (f", +-{metres(sigma)} per axis" if sigma else ", its own accuracy is not stated"),
+                + (f", +-{metres(sigma)} per axis" if sigma else ", accuracy not stated"),
             ),
             ("matches", f"{said.kept} of {said.tried} tried{': ' + reasons if reasons else ''}"),
             (
                 "",
-                f"{said.control} control, {said.check} check (every fifth cell), in "
-                f"{said.coverage.share:.0%} of the fields of the image",
+                f"{said.control} control, {said.check} check (one cell in five), in "
+                f"{said.coverage.share:.0%} of the image",
             ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             (
-                "model off",
+                "shift",
                 f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), {metres(said.shift_m)}",
-            ),
-            (
-                "accuracy",
-                f"{px(said.sigma_px)} in the middle of the matches, relative to the reference: "
-                f"{said.components.text()}",
             ),
         ]
 
