@@ -135,6 +135,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "allow-network": "An input or output has a URL. Network access is off by default.",
         "root": "A VRT refers to files outside its own folder, and you trust it.",
         "fetch-grids": "A geoid grid is missing.",
+        "open": "You want to look at the report at once.",
         "json": "A program reads the result.",
         "verbose": "You want to see what the program does.",
         "quiet": "A script needs only warnings and errors.",

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed
+from ortho_pipeline.cli.machine.browser import open_option, page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable, say
 from ortho_pipeline.cli.options import dry_run_option, json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
-from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_json, print_result, progress
+from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_files, print_json, print_result, progress
 from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
 from ortho_pipeline.options.texts import counted
 
@@ -82,6 +83,7 @@ class _Shard(click.ParamType):
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state; make nothing.")
 @dry_run_option
 @click.option("--schema", "as_schema", is_flag=True, help="Print the JSON Schema of the pipeline file; make nothing.")
+@open_option
 @json_option
 def run(
     pipeline_file: str | None,
@@ -137,6 +139,7 @@ def run(
         raise
     if as_json:
         print_json(result.to_json())
+        show_page(page_of(result.files))
     else:
         _print_summary(result)
     if result.failed:
@@ -156,6 +159,7 @@ def run(
 )
 @mosaic_options
 @network_option
+@open_option
 @json_option
 def mosaic(orthos: tuple[str, ...], output: str, mosaic: MosaicOptions, scene: SceneOptions, as_json: bool) -> None:
     """Combine ORTHOs on one grid into one raster.
@@ -195,7 +199,7 @@ def _dry_run(planned: Plan, only: Sequence[str], shard: tuple[int, int] | None, 
 
 
 def _print_summary(result: BatchResult) -> None:
-    """Print a table of the scenes and what went wrong; of many scenes only those that failed."""
+    """Print a table of the scenes, and each error with its remedy; of many scenes only those that failed."""
     from rich.console import Console
     from rich.table import Table
 
@@ -206,17 +210,17 @@ def _print_summary(result: BatchResult) -> None:
     console = Console(highlight=False, soft_wrap=True, width=wide)
     scenes = result.scenes if len(result.scenes) <= _SHOWN else [one for one in result.scenes if one.status == "failed"]
     table = Table(box=None, pad_edge=False)
-    for title in ("scene", "state", "model", "check px", "left out px", "control px", "seconds"):
-        table.add_column(title, justify="left" if title in ("scene", "state", "model") else "right", no_wrap=True)
+    for title in ("scene", "state", "RMSE m", "px", "tested at", "model", "seconds"):
+        table.add_column(title, justify="right" if title in ("RMSE m", "px", "seconds") else "left", no_wrap=True)
     for scene in scenes:
         table.add_row(*map(printable, _row(scene)))
     if scenes:
         console.print(table)
     for scene in scenes:
         if scene.error:
-            console.print(printable(f"\n{scene.name}: {_error_text(scene.error)}"), markup=False)
+            console.print(printable(f"\nError: {scene.name}: {_error_text(scene.error)}"), markup=False)
         elif against := refuted(scene.facts.get("notices", ())):
-            console.print(printable(f"\n{scene.name}: Error: accuracy unknown: {against}"), markup=False)
+            console.print(printable(f"\nError: {scene.name}: accuracy unknown: {against}"), markup=False)
     counts = ", ".join(
         f"{result.count(status)} {status}"
         for status in ("done", "unchanged", "failed", "missing")
@@ -225,18 +229,20 @@ def _print_summary(result: BatchResult) -> None:
     console.print(f"\n{counted(len(result.scenes), 'scene')}: {counts}  ({result.seconds:.1f} s)")
     if result.mosaic:
         console.print(printable(_mosaic_text(result.mosaic)), markup=False)
-    for name, path in result.files.items():
-        console.print(printable(f"  {name:<10} {path}"), markup=False)
+    print_files(result.files)
 
 
 def _row(scene: Outcome) -> list[str]:
     from rich.markup import escape
 
-    from ortho_pipeline.report.wording import refuted
+    from ortho_pipeline.report.page.run import evidence_in, tested_at
 
-    rmse = {} if refuted(scene.facts.get("notices", ())) else scene.facts.get("rmse_px", {})
-    numbers = ["-" if rmse.get(which) is None else f"{rmse[which]:.3f}" for which in ("check", "loo", "control")]
-    return [escape(scene.name), scene.status, str(scene.facts.get("model", "-")), *numbers, f"{scene.seconds:.1f}"]
+    facts = scene.facts
+    found = evidence_in(facts) if facts else None
+    sizes = [None if found is None else facts[which].get(found) for which in ("rmse_m", "rmse_px")]
+    numbers = ["-" if size is None else f"{size:.2f}" for size in sizes]
+    tested = tested_at(facts) if facts else "-"
+    return [escape(scene.name), scene.status, *numbers, tested, str(facts.get("model", "-")), f"{scene.seconds:.1f}"]
 
 
 def _mosaic_text(mosaic: Mapping[str, Any]) -> str:

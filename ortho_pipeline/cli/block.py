@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli.machine.browser import open_option
 from ortho_pipeline.cli.options import (
     adjustment_options,
     block_options,
@@ -15,7 +16,7 @@ from ortho_pipeline.cli.options import (
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result, print_warnings
+from ortho_pipeline.cli.printing import print_result
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
 
 _models = click.option(
@@ -36,6 +37,7 @@ _models = click.option(
 @matching_options
 @surface_options
 @sensor_options
+@open_option
 @json_option
 def adjust(
     images: tuple[str, ...],
@@ -85,5 +87,3 @@ def intersect(
 
     result = blocks.intersect(images, points, scene, models=models, output=output)
     print_result(result, as_json)
-    if not as_json:
-        print_warnings(result.document["warnings"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli.machine.browser import open_option, require_page
 from ortho_pipeline.cli.options import (
     image_argument,
     images_argument,
@@ -15,7 +16,7 @@ from ortho_pipeline.cli.options import (
     tie_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result, print_warnings
+from ortho_pipeline.cli.printing import print_result
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
 
 
@@ -37,6 +38,7 @@ from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
     metavar="FILE.html",
     help="Page that shows the matches: chips, map, residuals. A .json of the same name has the numbers.",
 )
+@open_option
 @scene_options
 @json_option
 def match(
@@ -55,10 +57,9 @@ def match(
     """
     from ortho_pipeline.commands.control import command
 
+    require_page("--report FILE.html", report)
     result = command.match(image, output, match, scene=scene, surface=surface, report=report)
     print_result(result, as_json)
-    if not as_json:
-        print_warnings(result.document["warnings"])
 
 
 @click.command(cls=Command)
@@ -88,5 +89,3 @@ def ties(
 
     result = command.ties(images, output, match, scene=scene, surface=surface)
     print_result(result, as_json)
-    if not as_json:
-        print_warnings(result.document["warnings"])

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.flags import as_typed, name_as_typed
+from ortho_pipeline.cli.machine.browser import page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable_json, say
 from ortho_pipeline.options.texts import counted
 
@@ -39,14 +40,23 @@ def print_warnings(warnings: Any) -> None:
         say(f"Warning: {as_typed(warning)}", err=True)
 
 
+def print_notices(document: Mapping[str, Any]) -> None:
+    """Print the errors, warnings and notes of a document on stderr, each with its remedy."""
+    from ortho_pipeline.report.page.advice import signal_lines, signals
+
+    for line in signal_lines(signals(document.get("warnings", ()), document.get("notices", ()))):
+        say(as_typed(line), err=True)
+
+
 def print_result(result: Result, as_json: bool) -> None:
-    """Print the summary of a result and its files, or its document; end with exit code 3 if its report failed."""
+    """Print summary, warnings and files of a result, or its document; end with exit code 3 if its report failed."""
     if as_json:
         print_json(result.to_json())
+        show_page(page_of(result.files))
     else:
         say(as_typed(result.summary))
-        for name, path in result.files.items():
-            say(f"  {name:<10} {path}")
+        print_notices(result.document)
+        print_files(result.files)
     if result.failure is not None:
         context = click.get_current_context()
         if context.meta.get("debug"):
@@ -54,6 +64,17 @@ def print_result(result: Result, as_json: bool) -> None:
         name_as_typed(result.failure, context.command)
         say(f"Error: {result.failure}", err=True)
         context.exit(PARTLY_DONE)
+
+
+def print_files(files: Mapping[str, Any]) -> None:
+    """Print the files of a result, the page last; open it if ``--open`` was given."""
+    page = page_of(files)
+    for name, path in files.items():
+        if path is not page:
+            say(f"  {name:<10} {path}")
+    show_page(page)
+    if page is not None:
+        say(f"Report: {page}")
 
 
 def checked_text(name: str, checked: Mapping[str, Any]) -> str:
@@ -70,12 +91,35 @@ def checked_text(name: str, checked: Mapping[str, Any]) -> str:
 
 
 def print_fit(result: FitResult) -> None:
-    """Print parameters, residuals (of many points the largest) and the RMSEs."""
-    from ortho_pipeline.report.wording import NO_SCALE, refuted
+    """Print accuracy, errors and notices, then residuals (of many points the largest) and statistics."""
+    from ortho_pipeline.report import document as reports
+    from ortho_pipeline.report.summary import first_lines
 
     document = result.to_json()
-    say(f"Sensor {document['sensor']}, model {document['model']} of {document['model_source']}")
+    made = reports.build_report(
+        scene=result.scene, fit=result.fit, matching=result.matching, near=result.near, warnings=result.warnings
+    )
+    for line in first_lines(made):
+        say(as_typed(line))
+    print_notices({"warnings": made.warnings, "notices": made.notices})
+    say(f"\nModel {document['model']} of {document['model_source']}")
+    if document["raw_bias"] and document["parameters"]:
+        bias = document["raw_bias"]
+        say(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
     _print_parameters(document)
+    _print_residuals(document)
+    _print_rmses(document)
+    if result.matching:
+        say(f"Matching: {result.matching.text()}")
+    for role, found in document["covariance"].items():
+        if found:
+            say(f"Residuals of {role} points: {found['statement']}")
+    sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
+    say(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
+
+
+def _print_residuals(document: Mapping[str, Any]) -> None:
+    """Print the residuals of each point, and those that the other points predict."""
     wide = max([len(point["id"]) for point in document["points"]] + [5])
     say(f"\n{'point':<{wide}}  role     used    column       row   left out: col.    row")
     points, rest = _worst(document["points"])
@@ -85,38 +129,18 @@ def print_fit(result: FitResult) -> None:
         say(f"{point['id']:<{wide}}  {point['role']:<8} {'yes' if point['used'] else 'no':<4}{shown}")
     if rest:
         say(f"and {counted(rest, 'point')} with smaller residuals (--json has all)")
-    say("\nResiduals are measured minus predicted, in pixels; 'left out': had the point taken no part.")
-    against = refuted(document["notices"])
-    if against:
-        say(f"Accuracy unknown: {against}. {NO_SCALE}")
-    if document["raw_bias"] and document["parameters"]:
-        bias = document["raw_bias"]
-        say(f"Model as delivered: column {bias['col']:+.3f}, row {bias['row']:+.3f} on average")
+    say("\nResiduals are measured minus predicted, in pixels. 'left out': the other points predict this one.")
+
+
+def _print_rmses(document: Mapping[str, Any]) -> None:
+    """Print the RMSE of each role in pixels."""
     labels = {"control": "control", "check": "check", "loo": "leave-one-out", "matched": "matched"}
     for which, rmse in document["rmse"].items():
-        text = (
-            "no points"
-            if rmse is None
-            else (
-                f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}  "
-                f"({counted(rmse['n'], 'point')})"
-            )
-        )
+        text = "no points"
+        if rmse is not None:
+            sizes = f"column {rmse['col']:.3f}, row {rmse['row']:.3f}, both {rmse['total']:.3f}"
+            text = f"{sizes}  ({counted(rmse['n'], 'point')})"
         say(f"RMSE {labels[which]:<14} {text}")
-    if document["outlying"] and (rest := document["rmse_of_agreeing_checks"]):
-        say(f"RMSE of the check points that are not outlying: {rest['total']:.3f}  ({counted(rest['n'], 'point')})")
-    if result.matching:
-        say(f"Matching: {result.matching.text()}. {result.matching.floor()}")
-        if absolute := result.matching.absolute_text():
-            say(absolute)
-    if document["map_scale"] and not against:
-        say(f"Map scale: {document['map_scale']['statement']}")
-    for role, found in document["covariance"].items():
-        if found:
-            say(f"Residuals of {role} points: {found['statement']}")
-    sigma0 = "unknown" if document["sigma0"] is None else f"{document['sigma0']:.3g}"
-    say(f"Redundancy {document['redundancy']}, sigma0 {sigma0}")
-    print_warnings(document["warnings"])
 
 
 def _worst(points: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int]:
@@ -198,11 +222,14 @@ def print_models(models: list[dict[str, Any]]) -> None:
 
 
 def print_comparison(result: CompareResult, units: str) -> None:
-    """Print the table of a comparison with its recommendation; `units` are ``px`` or ``m``."""
+    """Print the recommendation of a comparison, then its table; `units` are ``px`` or ``m``."""
     compared, points = result.comparison, result.comparison.points
     wide = max([len(row.model) for row in compared.rows] + [5])
     axes = ("column", "row") if units == "px" else ("x", "y")
-    say(f"{counted(points.control, 'control point')}, {counted(points.check, 'check point')}; RMSE in {units}")
+    reason = compared.recommendation.reason
+    say(f"* Recommended: {reason}." if compared.recommended else f"No model is recommended: {reason}.")
+    print_notices({"warnings": compared.warnings, "notices": compared.notices})
+    say(f"\n{counted(points.control, 'control point')}, {counted(points.check, 'check point')}; RMSE in {units}")
     say(
         f"\n{'':<{wide}}  {'':>6} {'control (the fit)':^28}  {'check':^28}  {'left out':>8} {'condi-':>8}\n"
         f"{'model':<{wide}}  {'param.':>6} "
@@ -227,12 +254,8 @@ def print_comparison(result: CompareResult, units: str) -> None:
     for number, text in enumerate(map(as_typed, notes), 1):
         say(f"\n[{number}] {text}" if number == 1 else f"[{number}] {text}")
     for point in compared.left_out:
-        say(f"\nleft out of all models: {point.id} ({point.reason})")
-    reason = compared.recommendation.reason
-    say(f"\n* Recommended: {reason}." if compared.recommended else f"\nNo recommendation: {reason}.")
-    for name, path in result.files.items():
-        say(f"  {name:<10} {path}")
-    print_warnings(compared.warnings)
+        say(f"\nLeft out of all models: {point.id} ({point.reason})")
+    print_files(result.files)
 
 
 def _errors(rmse: Rmse | RmseOnGround | None) -> str:

@@ -144,7 +144,7 @@ def adjust(
     with together(folder, "block"):
         _write(files, report, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
-    text = Text.joined("\n", [*gathered.text, block_report.summary_text(report)])
+    text = Text.joined("\n", [block_report.summary_text(report), *gathered.text])
     return Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
 
 

@@ -89,10 +89,3 @@ def doubted(notices: Sequence[Mapping[str, Any]]) -> frozenset[str]:
     """Return the points of which notices of a document say that they contradict the others, and that count."""
     one = {notice["point"] for notice in notices if notice["code"] == "contradicting-point"}
     return frozenset(one.union(*(notice["points"] for notice in notices if notice["code"] == "checks-apart")))
-
-
-def texts_but(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *codes: str) -> list[str]:
-    """Return the warnings of a document, without those of the codes; documents of earlier versions have no notices."""
-    if not notices:
-        return list(warnings)
-    return [one["text"] for one in notices if one["code"] not in codes]

@@ -8,14 +8,14 @@ from typing import Any
 
 
 def flat(value: Any, name: str = "") -> Iterable[tuple[str, str]]:
-    """Yield the leaves of nested values as (path of keys, text); what is None or empty is left out."""
+    """Yield the leaves of nested values as (path of keys, text); what is None, off or empty is left out."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from flat(item, f"{name} · {key}" if name else str(key))
     elif isinstance(value, list):
         if value:
             yield name, ", ".join(str(item) for item in value)
-    elif value is not None:
+    elif value is not None and value is not False:
         yield name, str(value)
 
 
@@ -37,6 +37,11 @@ def metres(value: float) -> str:
 def size_m(value: float) -> str:
     """Return a size or an error in metres with two digits: 0.48 m, 2.5 m, 14 m."""
     return f"{float(f'{value:.2g}'):g} m"
+
+
+def area_km2(square_metres: float) -> str:
+    """Return an area in square kilometres with two digits: 7.4 km², 0.62 km², 120 km²."""
+    return f"{float(f'{square_metres / 1e6:.2g}'):,.15g} km²"
 
 
 def class_size(centimetres: int) -> str:

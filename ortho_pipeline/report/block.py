@@ -26,17 +26,24 @@ from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
 from ortho_pipeline.report.network.facts import found_network, placed, suffices_for, thinly_covered
-from ortho_pipeline.report.page.advice import WORDS, signals
+from ortho_pipeline.report.page.advice import WORDS, Signal, signal_lines, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
-from ortho_pipeline.report.records import NOT_TESTED, RpcRecord
+from ortho_pipeline.report.records import UNKNOWN, RpcRecord
+from ortho_pipeline.report.summary import (
+    HELD,
+    RoleErrors,
+    about_block,
+    error_lines,
+    error_table,
+    errors_of_block,
+)
 from ortho_pipeline.report.wording import (
     ENOUGH_CHECK_POINTS,
     FEW,
     NO_SCALE,
-    NONE_APART,
+    NOTHING_LEFT,
     NOTICED,
-    UNKNOWN,
     fitness,
     instead,
     refuted,
@@ -51,9 +58,7 @@ if TYPE_CHECKING:
 _DRAWN_RAYS, _LISTED = 400, 400
 #: What makes points of known ground a test.
 KEPT_OUT = "whose ground coordinates took no part"
-TIED = "their image measurements helped to tie the images"
-#: Ground that stays this close (m) to its given coordinates was held, not tested.
-_HELD = 0.0005
+TIED = "their image measurements tie the images"
 #: What the headline says of a block that only ties hold together.
 _NO_CHECKS = "there are no check points"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
@@ -105,11 +110,10 @@ def build_report(
 
 
 def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHeadline:
-    """Say how accurate the block is from the best evidence that there is: check points, else the fit of control.
+    """Say how accurate the block is from the best evidence that there is: check points.
 
-    How well ties agree is no evidence of it.
-    What matches say is `relative` to their reference; they are seen in one image each, and measured check points in two
-    or more come first.
+    Neither the fit of control points nor how well ties agree is evidence. Matches are `relative` to their reference;
+    they are seen in one image each, and measured check points in two or more come first.
     """
     to = ", relative to the reference" if relative else ""
     notes = [f"{adjustment.gauge[0].upper()}{adjustment.gauge[1:]}."]
@@ -129,15 +133,15 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
         return said(px(check.total), f"{what}, {KEPT_OUT}; {TIED}")
     control = merged(*(one.control for one in seen))
     if adjustment.object_rms.control and control:
-        notes.append(NONE_APART)
         if not adjustment.redundancy:
-            return said(NOT_TESTED, "nothing is left over to test the fit with")
-        what = f"RMSE of {counted(control.n, 'measurement')} of control points in the images{to}: the fit, not a test"
-        return said(px(control.total), what)
+            return said(UNKNOWN, NOTHING_LEFT)
+        fit = f"{px(control.total)} RMSE of {counted(control.n, 'measurement')} of control points in the images{to}"
+        notes.insert(0, f"The fit: {fit}. This does not test the accuracy.")
+        return said(UNKNOWN, _NO_CHECKS)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
     if sizes:
         agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {counted(len(sizes), 'ray')})."
-        notes.insert(0, f"{agree} That tests neither positions nor heights.")
+        notes.insert(0, f"{agree} This tests neither positions nor heights.")
     return said(UNKNOWN, _NO_CHECKS)
 
 
@@ -165,7 +169,7 @@ def verdict(report: BlockReport) -> str | None:
     if report.map_scale is not None:
         part = any(one["code"] == "points-cover-part" for one in report.notices)
         where = " in plan" + (", where there are points" if part else "")
-        said.append(f"{fitness(report.map_scale, where)} No scale is stated for heights.")
+        said.append(f"{fitness(report.map_scale, where)} This does not cover heights.")
     return " ".join(said) or None
 
 
@@ -191,7 +195,7 @@ def summary_text(report: BlockReport) -> str:
         lines.append(f"{label:<{wide}}  {found.rays:>6}{pairs}  {image.model} of {image.model_source}")
     for role, rms in (("control", adjustment.object_rms.control), ("check", adjustment.object_rms.check)):
         if rms:
-            if max(map(abs, (*rms.min, *rms.max))) < _HELD:
+            if max(map(abs, (*rms.min, *rms.max))) < HELD:
                 held = "held at the given coordinates, so no RMSE on the ground"
                 lines.append(f"{counted(rms.n, f'{role} point')}: {held}")
                 continue
@@ -204,9 +208,31 @@ def summary_text(report: BlockReport) -> str:
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
-    height = f", height {head.height}" if head.height else ""
-    lines += [f"{head.figure}{height}: {head.what}", *head.notes]
-    return Text.joined("\n", [*lines, *(Text("Warning: ", text) for text in report.warnings)])
+    said, errors = _signals_of(report), errors_of_block(report)
+    first = [*accuracy_lines(report, errors), *_notes(head, said), *error_lines(errors), *signal_lines(said)]
+    return Text.joined("\n", [*first, *lines])
+
+
+def accuracy_lines(report: BlockReport, errors: Sequence[RoleErrors]) -> list[str]:
+    """Return the accuracy of a block with CE90 and LE90, and what it is from."""
+    head, check = report.headline, next((one for one in errors if one.role == "check"), None)
+    if head.figure == UNKNOWN:
+        return [f"{head.figure}: {head.what}"]
+    if head.height is None or check is None or check.le90 is None:
+        return [f"Accuracy {head.figure}", f"{head.what[0].upper()}{head.what[1:]}."]
+    plan, height = (f"90 {metres(value)}" for value in (check.ce90, check.le90))
+    said = f"Accuracy {head.figure} in plan (CE{plan}), {head.height} in height (LE{height})"
+    return [said, f"{head.what[0].upper()}{head.what[1:]}."]
+
+
+def _signals_of(report: BlockReport) -> list[Signal]:
+    tested = report.headline.figure != UNKNOWN or refuted(report.notices) is not None
+    return signals(report.warnings, report.notices, tested=tested)
+
+
+def _notes(head: BlockHeadline, said: Sequence[Signal]) -> list[str]:
+    """Return the reservations of the headline without those that a notice states."""
+    return [note for note in head.notes if note not in NOTICED or not said]
 
 
 def height_lines(heights: HeightsRecord | None) -> list[str]:
@@ -275,17 +301,17 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
     provenance = {key: value for key, value in report.provenance.to_json().items() if key != "inputs"}
-    said = signals(
-        report.warnings,
-        report.notices,
-        tested=report.headline.figure != NOT_TESTED and report.headline.what != _NO_CHECKS,
-    )
+    said, errors = _signals_of(report), errors_of_block(report)
     return render(
         "report/block.html.j2",
         report=report,
         adjustment=adjustment,
         head=report.headline,
-        notes=[note for note in report.headline.notes if note not in NOTICED or not said],
+        about=about_block(report),
+        unknown=report.headline.figure == UNKNOWN,
+        errors=error_table(errors),
+        tested=next((one for one in errors if one.role == "check"), None),
+        notes=_notes(report.headline, said),
         verdict=verdict(report),
         marks=_marks(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
@@ -308,14 +334,14 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
 
 
 def _marks(report: BlockReport) -> list[str]:
-    """Say what the marks on the map of the network are, of what there is."""
+    """Return what the marks on the map of the network mean, of those that are there."""
     there = {point.role for point in report.adjustment.points}
-    kinds = {"control": "dots are control points", "check": "squares are check points", "tie": "small dots are ties"}
+    kinds = {"control": "dots: control points", "check": "squares: check points", "tie": "small dots: tie points"}
     said = [what for role, what in kinds.items() if role in there]
-    said += ["crosses are what was left out"] if report.adjustment.rejected else []
+    said += ["crosses: rejected points"] if report.adjustment.rejected else []
     weak = any(pair.weak for pair in report.network.pairs)
-    said += ["red lines join images whose relative position is uncertain"] if weak else []
-    return [*said, "in red rings what contradicts"] if doubted(report.notices) else said
+    said += ["red lines: pairs whose relative position is uncertain"] if weak else []
+    return [*said, "red rings: contradicting points"] if doubted(report.notices) else said
 
 
 def plot_rays(report: BlockReport, label: str, rays: Sequence[Ray]) -> Drawing | None:

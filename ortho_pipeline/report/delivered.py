@@ -11,7 +11,7 @@ from ortho_pipeline.estimation.records import Adjustment
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.options.texts import counted
-from ortho_pipeline.report.records import NOT_TESTED, Headline
+from ortho_pipeline.report.records import UNKNOWN, Headline
 from ortho_pipeline.report.wording import headline
 
 
@@ -24,7 +24,7 @@ def accuracy_before(scene: Scene) -> Headline:
         try:
             return (_of_block if "gauge" in scene.adjusted else _of_scene)(scene, scene.adjusted)
         except (KeyError, TypeError, ValueError):
-            text = "The model was adjusted before; its file does not say how well in a way that is understood here."
+            text = "The model was adjusted before, but this version cannot read how well from its file."
             return _untested(text)
     notes = "The model is used as it was delivered."
     if isinstance(scene.model, RPC):
@@ -32,8 +32,8 @@ def accuracy_before(scene: Scene) -> Headline:
     return _untested(notes)
 
 
-def _untested(*notes: str, what: str = "there were no ground control points") -> Headline:
-    return Headline(figure=NOT_TESTED, metres=None, what=what, notes=notes)
+def _untested(*notes: str, what: str = "there are no points") -> Headline:
+    return Headline(figure=UNKNOWN, metres=None, what=what, notes=notes)
 
 
 def _of_scene(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
@@ -54,20 +54,19 @@ def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
     image = AdjustedImage.read({name: one for name, one in adjusted.items() if name not in ("gauge", "sigma0")})
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""
     notes = (f"The block: {adjusted['gauge']}{sigma0}.", _source(scene))
-    kinds = (
-        (image.rms.back_projected.check, "of check points, whose ground coordinates took no part,"),
-        (image.rms.back_projected.control, "of control points (the fit, not a test)"),
-    )
-    for found, what in kinds:
-        if found:
-            said = f"RMSE of {counted(found.n, 'measurement')} {what} in this image, when it was adjusted in a block"
-            return Headline(figure=px(found.total), metres=None, what=said, notes=notes)
+    if check := image.rms.back_projected.check:
+        points = f"{counted(check.n, 'measurement')} of check points, whose ground coordinates took no part,"
+        what = f"RMSE of {points} in this image, when it was adjusted in a block"
+        return Headline(figure=px(check.total), metres=None, what=what, notes=notes)
     what = "the model was adjusted in a block without check points in this image"
+    if control := image.rms.back_projected.control:
+        fit = f"{px(control.total)} RMSE of {counted(control.n, 'measurement')} of control points in this image"
+        return _untested(f"The fit: {fit}. This does not test the accuracy.", *notes, what=what)
     if tie := image.rms.residuals.tie:
         agree = f"There the images agree to {px(tie.total)} (RMSE of {counted(tie.n, 'measurement')} of tie points)."
-        return _untested(f"{agree} That tests neither positions nor heights.", *notes, what=what)
+        return _untested(f"{agree} This tests neither positions nor heights.", *notes, what=what)
     return _untested(*notes, what=what)
 
 
 def _source(scene: Scene) -> str:
-    return f"That is what {Path(scene.model_source).name} says; no point was measured here to test it."
+    return f"This is from {Path(scene.model_source).name}; no point here tests it."

@@ -53,7 +53,8 @@ from ortho_pipeline.report.records import (
     SceneRecord,
     SceneReport,
 )
-from ortho_pipeline.report.wording import UNKNOWN, corrected, headline, refuted, summary_text
+from ortho_pipeline.report.summary import summary_text
+from ortho_pipeline.report.wording import corrected, headline, refuted
 from ortho_pipeline.surface.flat import FlatSurface
 
 if TYPE_CHECKING:
@@ -276,9 +277,9 @@ def with_layers(
     report = report.replaced(angles=angles)
     if accuracy is None:
         return report
-    head = report.headline
-    if head.figure == UNKNOWN:  # nor does the layer know of the error
+    if refuted(report.notices):  # nor does the layer know of the error
         return report.replaced(accuracy=accuracy)
+    head = report.headline
     return report.replaced(accuracy=accuracy, headline=head.replaced(notes=(accuracy.statement, *head.notes)))
 
 

@@ -93,6 +93,11 @@ def _evidence(fit: Fit) -> dict[Evidence, Array]:
     return found
 
 
+def ce90_of(errors: Array) -> float:
+    """Return the size that at most one in ten of errors ``(N, K)`` in metres exceeds; of few, the largest."""
+    return float(np.sort(np.linalg.norm(errors, axis=1))[len(errors) - 1 - len(errors) // 10])
+
+
 def judge(errors: Array, evidence: Evidence, pixel: float | None, survey: float = 0.0) -> MapScaleRecord:
     """Return the verdicts on errors ``(N, 2)`` in metres of at least one point.
 
@@ -101,7 +106,7 @@ def judge(errors: Array, evidence: Evidence, pixel: float | None, survey: float 
     pixel = None if pixel is None else float(f"{pixel:.2g}")
     squares = (errors**2).sum(axis=1)
     count, rmse = len(squares), float(np.sqrt(squares.mean()))
-    ce90 = float(np.sqrt(np.sort(squares)[count - 1 - count // 10]))
+    ce90 = ce90_of(errors)
     limited: Limit | None = None if pixel is None else ("pixel" if pixel / PIXEL > rmse / POSITION else "accuracy")
     paper = usual_scale(max(rmse / POSITION, (pixel or 0.0) / PIXEL))
     nmas = next((scale for scale in SCALES if ce90 <= nmas_limit(scale) * (1 + 1e-9)), None)

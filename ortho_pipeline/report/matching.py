@@ -12,7 +12,7 @@ from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.estimation.records import Adjustment, Count, Pair
 from ortho_pipeline.files.json.records import Record
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Code of the notice of an adjustment to matches: its figures are no absolute ones.
 RELATIVE = "relative-to-reference"
@@ -48,10 +48,10 @@ class MatchComponents(Record):
         """Say what there is of each part."""
         said = []
         if self.matching > 0:
-            said.append(f"{self.matching:.3g} times the variance that least-squares matching states")
+            said.append(f"{self.matching:.3g} times the variance from least-squares matching")
         if self.height_m > 0:
-            said.append(f"heights off by {metres(self.height_m)}")
-        said.append(f"{px(self.other_px)} per axis of what is neither")
+            said.append(f"height errors of {metres(self.height_m)}")
+        said.append(f"other errors of {px(self.other_px)} per axis")
         return ", ".join(said)
 
 
@@ -113,25 +113,29 @@ class MatchingRecord(Record):
     def floor(self) -> str:
         """Say what the figures of matches leave out."""
         if self.reference_sigma_m is None:
-            return "How accurate the reference itself is was not stated; it is not in the figure."
+            return Text(
+                "This figure does not include the error of the reference image (state it with ",
+                Setting("match.reference_sigma"),
+                ").",
+            )
         return (
-            f"The reference's own {metres(self.reference_sigma_m)} per axis are not in the figure, of which they are "
-            "the floor; the sigmas of the parameters and the raster of accuracy have them."
+            f"This figure does not include the error of the reference image ({metres(self.reference_sigma_m)} per "
+            "axis). The sigmas of the parameters and the accuracy raster do."
         )
 
     def absolute_text(self) -> str | None:
-        """Say what points that somebody measured tell; None without any that took no part."""
+        """Return the accuracy at measured points that took no part in the adjustment; None without any."""
         if self.absolute is None:
             return None
         ground = "" if self.absolute.m is None else f" ({metres(self.absolute.m)})"
         points = counted(self.absolute.n, "measured point")
-        return f"Absolute: {px(self.absolute.px)}{ground} RMSE at {points} that took no part."
+        return f"Absolute: {px(self.absolute.px)}{ground} RMSE at {points} that took no part in the adjustment."
 
     def text(self) -> str:
         """Say in a line what was matched."""
         names = ", ".join(one.rpartition("/")[2] for one in self.references)
-        fields = f"in {share(self.coverage.share)} of the fields of the image"
-        return f"{self.kept} of {self.tried} matches with {names}, {fields}"
+        fields = f"in {share(self.coverage.share)} of the image"
+        return f"{self.kept} of {self.tried} matches with {names} kept, {fields}"
 
 
 def is_relative(adjustment: Adjustment) -> bool:

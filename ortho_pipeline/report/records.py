@@ -96,8 +96,8 @@ class SceneRecord(Record):
 # -- accuracy --------------------------------------------------------------------------------------------------------
 
 
-#: The figure of what nothing tests.
-NOT_TESTED = "Not tested"
+#: In place of a figure: nothing tests the result, or an error makes the figure untrue.
+UNKNOWN = "Accuracy unknown"
 
 
 class Headline(Record):

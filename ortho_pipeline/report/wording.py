@@ -4,53 +4,51 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeGuard
 
-from ortho_pipeline.display.notices import Notice, texts_but
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import (
     class_size,
     metres,
-    plain_size,
     px,
-    share,
-    short,
-    signed,
     size_m,
-    size_text,
 )
 from ortho_pipeline.estimation.blunders import contradicting
-from ortho_pipeline.estimation.records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
-from ortho_pipeline.options.texts import Text, counted
+from ortho_pipeline.estimation.records import Adjustment, Rmse, RmseOnGround, RmsesOnGround
+from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
-from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline, MapScaleRecord, SceneReport
+from ortho_pipeline.report.records import UNKNOWN, Headline, MapScaleRecord, SceneReport
 
 #: ASPRS Positional Accuracy Standards (2023): no claim of accuracy below this number of check points.
 ENOUGH_CHECK_POINTS = 30
 #: From so many measured points on their figure leads before that of matches.
 _LEADING = 3
-#: In place of a figure that an error makes untrue, and of the sentence on map scales.
-UNKNOWN = "Accuracy unknown"
-NO_SCALE = "No map scale can be stated until this error is corrected."
+#: In place of a map scale that an error makes untrue.
+NO_SCALE = "No map scale until this error is corrected."
 #: Errors that make a figure untrue, besides those that say by how much.
 _UNTRUE = {
-    "reference-made-of-scene": "the reference seems to be made of the scene itself, so the matches test nothing",
+    "reference-made-of-scene": "the reference seems to be made from this scene, so the matches test nothing",
     "model-elsewhere": "the delivered model and the points are several images apart",
     "undecided-contradiction": "points contradict each other, and the block does not tell which one is wrong",
 }
 #: Notes of headlines that a notice says too, with what to do.
-FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: an indication, not a claim of accuracy (ASPRS 2023)."
-
-NONE_APART = "No check points were kept apart."
-NOTICED = (FEW, NONE_APART)
+FEW = f"Fewer than {ENOUGH_CHECK_POINTS} check points: the accuracy is indicative (ASPRS 2023)."
+NO_CHECK_POINTS = "There are no check points."
+NOTICED = (FEW, NO_CHECK_POINTS)
+#: Why the accuracy is unknown where control points determine the parameters and no more.
+NOTHING_LEFT = "no point is left to test the fit"
+#: The points that an accuracy is from.
+Evidence = Literal["matched", "check", "delivered", "loo"]
 
 
 def few_check_points(count: int) -> Notice:
     """Return the notice that there are too few check points for a claim of accuracy."""
-    few = f"{counted(count, 'check point')}: fewer than the" if count else "no check points, and"
-    asks = "that ASPRS 2023 asks for" if count else "are what ASPRS 2023 asks for"
-    text = f"{few} {ENOUGH_CHECK_POINTS} {asks} before accuracy is claimed"
+    text = (
+        f"{counted(count, 'check point')}: fewer than the {ENOUGH_CHECK_POINTS} that ASPRS 2023 asks for"
+        if count
+        else f"there are no check points; ASPRS 2023 asks for {ENOUGH_CHECK_POINTS}"
+    )
     return Notice("few-check-points", text, count=count, enough=ENOUGH_CHECK_POINTS)
 
 
@@ -76,32 +74,51 @@ def headline(
         Where points were matched: their figures are relative to the reference.
     """
     if not adjustment.points:
-        return before or Headline(figure=NOT_TESTED, metres=None, what="there were no ground control points", notes=())
+        return before or Headline(figure=UNKNOWN, metres=None, what="there are no points", notes=())
     rmse, ground = adjustment.rmse, rmse_m or RmsesOnGround(control=None, check=None, loo=None)
-    notes = [*_fit_notes(adjustment), *_outlying_notes(adjustment)]
+    notes = [*fit_notes(adjustment), *_outlying_notes(adjustment)]
     if matching is not None and matching.relative is not None:
         return _of_matches(matching, matching.relative, notes)
-    to = ", relative to the reference" if is_relative(adjustment) else ""
-    if check := rmse.check:
-        what = f"RMSE at {counted(check.n, 'check point')} that took no part in the adjustment{to}"
-        if check.n < ENOUGH_CHECK_POINTS:
+    evidence, to = evidence_of(adjustment), ", relative to the reference" if is_relative(adjustment) else ""
+    if evidence == "check" and rmse.check:
+        what = f"RMSE at {counted(rmse.check.n, 'check point')} that took no part in the adjustment{to}"
+        if rmse.check.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
-        return _headline(check, ground.check, what, notes)
-    if rmse.control and not adjustment.parameters:
+        return _headline(rmse.check, ground.check, what, notes)
+    if evidence == "delivered" and rmse.control:
         points = counted(rmse.control.n, "point")
         what = (
-            f"RMSE at {points} of the model as it was adjusted before: a test only if to others"
+            f"RMSE at {points} of a model that was adjusted before; a test only if it was adjusted to other points"
             if adjusted
-            else f"RMSE at {points} of the model as delivered, none of which it was adjusted to"
+            else f"RMSE at {points} of the model as delivered, which was not adjusted to them"
         )
         return _headline(rmse.control, ground.control, what, notes)
-    notes.append(NONE_APART)
-    if rmse.loo and adjustment.redundancy:
-        notes.append("An error that all control points share would not show.")
-        what = f"RMSE when each of {counted(rmse.loo.n, 'control point')} is left out in turn{to}"
+    notes.append(NO_CHECK_POINTS)
+    if evidence == "loo" and rmse.loo:
+        notes.append("An error common to all control points cannot be detected.")
+        what = f"RMSE of {counted(rmse.loo.n, 'control point')}, each left out in turn{to}"
         return _headline(rmse.loo, ground.loo, what, notes)
-    what = "nothing is left over to test the fit with"
-    return Headline(figure=NOT_TESTED, metres=None, what=what, notes=tuple(notes))
+    return Headline(figure=UNKNOWN, metres=None, what=NOTHING_LEFT, notes=tuple(notes))
+
+
+def evidence_of(adjustment: Adjustment, matching: MatchingRecord | None = None) -> Evidence | None:
+    """Return which points the accuracy is from; None where nothing tests the result.
+
+    Control points test a model only if it was not adjusted to them, or if each is left out in turn.
+    """
+    rmse = adjustment.rmse
+    if matching is not None and matching.relative is not None and not _leads(matching.absolute):
+        return "matched" if rmse.matched else "check"
+    if rmse.check:
+        return "check"
+    if rmse.control and not adjustment.parameters:
+        return "delivered"
+    return "loo" if rmse.loo and adjustment.redundancy else None
+
+
+def _leads(absolute: Tested | None) -> TypeGuard[Tested]:
+    """Tell whether so many points were measured that their figure leads before that of matches."""
+    return absolute is not None and absolute.n >= _LEADING
 
 
 def verdict(report: SceneReport) -> str:
@@ -110,9 +127,9 @@ def verdict(report: SceneReport) -> str:
         return NO_SCALE
     found = report.map_scale
     if found is None:
-        if report.headline.figure == NOT_TESTED:
-            return "No map scale can be stated: there are no check points."
-        return "No map scale can be stated: no check point was measured, so the accuracy is relative to the reference."
+        if report.headline.figure == UNKNOWN:
+            return "No map scale: there are no check points."
+        return "No map scale: without measured check points the accuracy is relative to the reference."
     return fitness(found)
 
 
@@ -138,7 +155,7 @@ def refuted(notices: Iterable[Mapping[str, Any]]) -> str | None:
 def instead(figure: str, what: str, notices: Iterable[Mapping[str, Any]]) -> tuple[str, str] | None:
     """Return what a headline says in place of a figure that an error makes untrue, and a note; None where none does."""
     against = refuted(notices)
-    if against is None or figure in (NOT_TESTED, UNKNOWN):
+    if against is None or figure == UNKNOWN:
         return None
     return against, f"Do not rely on this figure: {figure}, {what}."
 
@@ -182,12 +199,12 @@ def runner_up(report: SceneReport) -> str | None:
     told = (
         []
         if nearest in comparison.recommendation.reason.replace(chosen, "")
-        else [f"{nearest} comes next with {px(sizes[nearest])}"]
+        else [f"{nearest} is next with {px(sizes[nearest])}"]
     )
     told += [] if plain is None or plain == nearest else [f"{plain} as supplied has {px(sizes[plain])}"]
     said = [f"{' and '.join(told)}."] if told else []
     if checked:
-        said.append("The check points had a part in this choice, and are no independent test of it.")
+        said.append("The check points were used for this choice, so they do not test it independently.")
     return " ".join(said) or None
 
 
@@ -215,7 +232,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows = [
         (
             "RMSE in plan",
-            "at most 0.25 mm in the map",
+            "at most 0.25 mm at map scale",
             f"{found.rmse:.4g} m",
             scale_text(usual_scale(found.rmse / POSITION)),
         )
@@ -224,17 +241,17 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
         rows.append(
             (
                 "Pixel size",
-                "at most 0.1 mm in the map; the larger of image and ortho",
+                "at most 0.1 mm at map scale; the larger of image and ortho",
                 size_m(found.pixel),
                 scale_text(usual_scale(found.pixel / PIXEL)),
             )
         )
-    survey = f", {found.survey:.4g} m of the check points themselves" if found.survey else ""
+    survey = f", check points themselves {found.survey:.4g} m" if found.survey else ""
     needs = "" if found.claim else f" (a claim needs {ENOUGH_CHECK_POINTS} check points)"
     rows.append(
         (
             "ASPRS 2023, horizontal class",
-            "RMSE, with that of the check points themselves, up to the next cm",
+            "RMSE including the error of the check points, rounded up to 1 cm",
             f"{found.rmse:.4g} m{survey}",
             f"{class_size(found.class_cm)}{needs}",
         )
@@ -242,7 +259,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows.append(
         (
             "NMAS 1947",
-            "nine of ten points within 1/30 inch in the map, 1/50 from 1:20,000 on; pixels do not count",
+            "90 % of the points within 1/30 inch at map scale (1/50 inch from 1:20,000)",
             f"{found.ce90:.4g} m",
             scale_text(found.nmas_scale),
         )
@@ -256,9 +273,9 @@ def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) ->
     From three measured points on these lead: matches do not know where the reference lies.
     """
     said, absolute = matching.absolute_text(), matching.absolute
-    cells = "in cells of the image that took no part in the adjustment, relative to the reference"
-    held_out = f"RMSE at {counted(relative.n, 'match', 'matches')} {cells}"
-    if absolute is None or absolute.n < _LEADING:
+    apart = "that took no part in the adjustment"
+    held_out = f"RMSE at {counted(relative.n, 'match', 'matches')} {apart}, relative to the reference"
+    if not _leads(absolute):
         if said:
             notes = [f"{said} {FEW}", *notes]
         return Headline(
@@ -271,7 +288,7 @@ def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) ->
     notes = [f"Relative: {px(relative.px)}{ground} {held_out}.", matching.floor(), *notes]
     if absolute.n < ENOUGH_CHECK_POINTS:
         notes.insert(0, FEW)
-    what = f"RMSE at {counted(absolute.n, 'measured point')} that took no part in the adjustment, which was to matches"
+    what = f"RMSE at {counted(absolute.n, 'measured point')} {apart} to matches"
     on_ground = None if absolute.m is None else metres(absolute.m)
     return Headline(figure=px(absolute.px), metres=on_ground, what=what, notes=tuple(notes))
 
@@ -281,13 +298,13 @@ def _headline(rmse: Rmse, ground: RmseOnGround | None, what: str, notes: Iterabl
     return Headline(figure=px(rmse.total), metres=on_ground, what=what, notes=tuple(notes))
 
 
-def _fit_notes(adjustment: Adjustment) -> list[str]:
-    """Say what was left out, and how well the control points are fitted."""
+def fit_notes(adjustment: Adjustment) -> list[str]:
+    """Say which points were left out, and how well the model fits its own control points."""
     notes = []
     if lost := len(adjustment.rejected):
         notes.append(
-            f"{counted(lost, 'control point')} left out and not counted. If several points that you trust are left "
-            "out, the model does not suit the scene."
+            f"{counted(lost, 'control point')} left out. If you trust several of them, the model does not suit the "
+            "scene."
         )
     control, parameters = adjustment.rmse.control, len(adjustment.parameters)
     if control and parameters:
@@ -295,8 +312,8 @@ def _fit_notes(adjustment: Adjustment) -> list[str]:
         notes.append(
             f"The fit: {px(control.total)} RMSE at {points}, redundancy {adjustment.redundancy}."
             if adjustment.redundancy
-            else f"No redundancy: {points} for {counted(parameters, 'parameter')} fit exactly, "
-            "which says nothing about accuracy."
+            else f"No redundancy: {counted(parameters, 'parameter')} always fit {points} exactly. This proves nothing "
+            "about accuracy."
         )
     return notes
 
@@ -305,64 +322,7 @@ def _outlying_notes(adjustment: Adjustment) -> list[str]:
     """Say which check points contradict the others, and what the figure would be without them."""
     names = [one.id for one in adjustment.outlying if one.role == "check"]
     if not names or refuted(adjustment.notices):
-        return []  # the verdict and a notice say it
+        return []  # the verdict and a notice state it
     said = f"Probably wrong, but counted: check point{'s' if len(names) > 1 else ''} {', '.join(names)}"
     rest = adjustment.rmse_of_agreeing_checks
     return [f"{said}; without {px(rest.total)} at {counted(rest.n, 'check point')}." if rest else f"{said}."]
-
-
-def summary_text(report: SceneReport) -> str:
-    """Return the report as a screenful of text, without colours."""
-    adjustment, scene, head = report.adjustment, report.scene, report.headline
-    rows = [("scene", f"{scene.name}, {size_text(scene.size)} px, {scene.sensor} ({scene.model_source})")]
-    if raw := adjustment.raw_bias:
-        rows.append(("raw bias", f"{_bias(raw)} (measured minus delivered model, {counted(raw.n, 'point')})"))
-    if adjustment.parameters:
-        values = [f"{name} {_parameter(entry)}" for name, entry in adjustment.parameters.items()]
-        rows.append(("model", f"{adjustment.model}: {', '.join(values)}"))
-    else:
-        rows.append(("model", adjustment.model))
-    if report.matching:
-        rows.append(("matching", report.matching.text()))
-    ground = f" ({head.metres})" if head.metres else ""
-    rows.append(("accuracy", f"{head.figure.removeprefix('Accuracy ')}{ground}: {head.what}"))
-    rows += [("", note) for note in head.notes]
-    if report.map_scale or refuted(report.notices):
-        rows.append(("map scale", report.map_scale.statement if report.map_scale else NO_SCALE))
-    for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):
-        if found and found.verdict == "systematic":
-            rows.append(("pattern", f"{role} points: {found.statement}"))
-    rows += [("left out", f"{one.id}: {one.reason}") for one in adjustment.rejected]
-    if report.surface:
-        rows.append(("heights", _surface_text(report.surface)))
-    if ortho := report.ortho:
-        steps = " x ".join(short(step) for step in ortho.resolution)
-        rows.append(("ortho", f"{size_text(ortho.size)} px of {steps} {ortho.unit}, {ortho.crs_label}"))
-    if warp := report.warp:
-        by = f" (GDAL's {warp.transformer} transformer)" if warp.transformer else ""
-        rows.append(("warp", f"{px(warp.max_error_px)} at worst from the exact model{by}"))
-        if warp.hidden_share is not None:
-            filled = "" if warp.filled_share is None else f"; {share(warp.filled_share)} from another ortho"
-            rows.append(("visible", f"{share(1.0 - warp.hidden_share)} of what the image reaches{filled}"))
-    if read := report.provenance.network_bytes:
-        rows.append(("network", f"{plain_size(read)} read"))
-    # The headline and the rows above have said these already.
-    others = texts_but(report.warnings, report.notices, "left-out", "no-redundancy", "few-check-points")
-    rows += [("warning", text) for text in others]
-    return Text.joined("\n", (Text(f"{key:<10}", value) for key, value in rows))
-
-
-def _bias(raw: Bias) -> str:
-    return f"column {signed(raw.col)} px, row {signed(raw.row)} px"
-
-
-def _parameter(entry: Parameter) -> str:
-    return f"{short(entry.value, '+')} ±{short(entry.sigma)}"
-
-
-def _surface_text(surface: FlatGround | Dem) -> str:
-    if isinstance(surface, FlatGround):
-        return f"flat ground at {metres(surface.constant_height)} above the ellipsoid"
-    covered = "" if surface.coverage is None else f", covers {share(surface.coverage)} of the scene"
-    items = f"{counted(len(surface.items), 'item')} of " if surface.items else ""
-    return f"{items}{Path(surface.path).name}, heights above {surface.vertical_label}{covered}"

@@ -45,15 +45,15 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
     assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
-    assert "<h1>2 of 4 scenes ready; 1 failed, 1 not tested</h1>" in page
-    assert "june: of those ready 2 tested at check points, RMSE 0.20 to 3.00 px." in page
+    assert ">2 of 4 scenes ready; 1 failed, 1 of unknown accuracy</p>" in page
+    assert "2 tested at check points: RMSE 0.40 to 6.00 m." in page
     # What to look at stands in the row, gravest first, and that nothing tests a scene is the first of all.
-    assert "Nothing tests how accurate this is." in rows[1]
-    assert "only check, or an orthoimage" in rows[1]
+    assert "No point tests the accuracy of this result." in rows[1]
+    assert "Add check points, or an orthoimage" in rows[1]
     assert "Look." in rows[2]
     assert "<th>tested at</th>" in page
     write_run_page(tmp_path / "part.html", "june", [{**scene("late"), "status": "missing", "facts": {}}])
-    assert "nobody has made this scene yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
+    assert "this scene is not made yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
     assert "Give a DEM." in rows[0]
     assert page.count("<script") == 1
     assert 'href="scenes/a%20b_report.html"' in rows[3]
@@ -79,12 +79,12 @@ def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_pat
     write_run_page(tmp_path / "index.html", "june", [formal, untested, apart])
     rows = re.findall(r"<tr[ >].*?</tr>", (tmp_path / "index.html").read_text().split("<tbody>")[1], re.DOTALL)
     assert '<li class="stop">' in rows[0]
-    assert "Settle this first.</b> 3 of 6" in rows[0]
+    assert "Error:</b> 3 of 6" in rows[0]
     # Before what nothing tests, and out of the span of RMSEs.
     assert ["untested" in rows[1], '<li class="look">' in rows[2], "6 check points<" in rows[2]] == [True] * 3
     page = (tmp_path / "index.html").read_text()
-    assert "<h1>1 of 3 scenes ready; 1 to settle first, 1 not tested</h1>" in page
-    assert "of those ready 1 tested at check points, RMSE 0.20 px." in page
+    assert ">1 of 3 scenes ready; 1 with errors, 1 of unknown accuracy</p>" in page
+    assert "1 tested at check points: RMSE 0.40 m." in page
 
 
 def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):

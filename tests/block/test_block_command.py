@@ -343,11 +343,11 @@ def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) ->
     assert (head["figure"], head["height"]) == ("Accuracy unknown", None)
     page = (tmp_path / "out" / "block_report.html").read_text()
     assert '<p class="figure">Accuracy unknown</p>' in page
-    assert "Nothing tests how accurate this is." in page
+    assert "No point tests the accuracy of this result." in page
     # Nor is it the figure of an ortho that is made with such a model.
     saved = SceneOptions(model=tmp_path / "out" / "aft_BAND_model.json")
     delivered = accuracy_before(open_scene(stereo.images[0], saved))
-    assert delivered.figure == "Not tested"
+    assert delivered.figure == "Accuracy unknown"
     assert delivered.notes[0].startswith("There the images agree to 0.")
 
 
@@ -385,7 +385,7 @@ def test_nothing_is_claimed_of_a_fit_to_control_alone(stereo: Stereo, tmp_path: 
     few = tmp_path / "few.csv"
     few.write_text("\n".join(lines[:3] + [line for line in lines if line.startswith(("p0,", "p1,", "p2,"))]) + "\n")
     alone = run("adjust", images[0], "--points", few, "--correction", "affine", "-o", tmp_path)
-    assert "Not tested: nothing is left over to test the fit with" in alone
+    assert "Accuracy unknown: no point is left to test the fit" in alone
 
 
 def test_correction_none_only_intersects(stereo: Stereo, tmp_path: Path) -> None:

@@ -103,6 +103,6 @@ def test_a_damaged_record_is_not_understood_and_no_error(tiny, tmp_path, adjustm
     scene = open_scene(tiny.image, SceneOptions(model=tmp_path / "m.json"))
     assert dict(scene.adjusted or {}) == adjustment
     head = accuracy_before(scene)
-    assert head.figure == "Not tested"
+    assert head.figure == "Accuracy unknown"
     assert "adjusted before" in head.notes[0]
     assert accuracy_before(dataclasses.replace(scene, adjusted=None)).notes[0].startswith("The model is used as")

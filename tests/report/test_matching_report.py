@@ -252,7 +252,7 @@ def test_the_page_needs_nothing_and_stays_small(tmp_path: Path) -> None:
     assert page.count("<script") == 1
     # Each chip has words for those who do not see it.
     assert page.count('aria-label="Scene at m') == page.count('aria-label="Reference at m') == 32
-    assert "The 24 of 500 matches with the largest residuals" in page
+    assert "24 of 500 matches: those with the largest residuals" in page
     assert "8 of 100 rejected" in page
 
 

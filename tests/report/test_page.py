@@ -33,8 +33,8 @@ from ortho_pipeline.report.page import locator
 from ortho_pipeline.report.page.advice import WORDS, advised, signals
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import degrees, plot_ortho
-from ortho_pipeline.report.records import NOT_TESTED, MapScaleRecord, SceneReport
-from ortho_pipeline.report.wording import NO_SCALE, UNKNOWN, few_check_points, fitness, scale_rules, verdict
+from ortho_pipeline.report.records import UNKNOWN, MapScaleRecord, SceneReport
+from ortho_pipeline.report.wording import NO_SCALE, few_check_points, fitness, scale_rules, verdict
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
@@ -212,7 +212,7 @@ def test_the_gravest_notice_comes_first():
         ),
         (measured(), r"^Good enough for maps at 1:[\d,]+\. The "),
         (measured(check=0), r"^Good enough for maps at 1:"),
-        (measured().select(np.arange(18) < 1), r"^No map scale can be stated: there are no check points"),
+        (measured().select(np.arange(18) < 1), r"^No map scale: there are no check points"),
     ],
 )
 def test_verdict_says_the_scale_and_what_sets_its_limit(points, said):
@@ -250,7 +250,7 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
     assert said.adjustment.notices[0]["rest"] == pytest.approx(0.5, abs=0.5)
     assert re.search(rf'class="unsettled">Not settled: 0\.\d+ px without {", ".join(names)}<', page)
     assert page.count('class="doubted"') == wrong
-    assert ("off in different ways" if wrong == 3 else f"Measure {names[0]} again") in page
+    assert ("Their errors differ" if wrong == 3 else f"Measure {names[0]} again") in page
 
 
 def test_a_scale_says_what_sets_its_limit():
@@ -280,7 +280,7 @@ def test_a_scale_that_pixels_limit_names_the_pixel_and_what_the_error_would_allo
     assert rows["RMSE in plan"] == ("0.4794 m", "1:2,000")
     assert rows["Pixel size"] == ("2.5 m", "1:25,000")
     assert rows["ASPRS 2023, horizontal class"] == (
-        "0.4794 m, 0.14 m of the check points themselves", "50 cm (a claim needs 30 check points)",
+        "0.4794 m, check points themselves 0.14 m", "50 cm (a claim needs 30 check points)",
     )  # fmt: skip
 
 
@@ -300,13 +300,13 @@ def test_places_of_points_are_in_the_json(tmp_path):
 
 def test_a_scene_that_nothing_tests_is_not_said_to_be_fine(tmp_path):
     tested = made(measured())
-    head = tested.headline.replaced(figure=NOT_TESTED)
+    head = tested.headline.replaced(figure=UNKNOWN)
     empty = tested.replaced(headline=head, warnings=(), notices=())
     report.write_report_html(empty, tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "Nothing to complain of" not in page
+    assert "No warnings" not in page
     assert '<li class="look">' in page
-    assert "Nothing tests how accurate this is." in page
+    assert "No point tests the accuracy of this result." in page
     assert [one.text for one in signals((), [{"code": "no-redundancy", "text": "none left"}], tested=False)] == [
         "None left"
     ]
@@ -327,7 +327,7 @@ def test_the_legend_of_the_map_and_the_notices_have_no_check_points_where_there_
         report.write_report_html(made(measured(check=checks)), path, ortho=b"a picture")
         legend = re.findall(r'<span class="legend">(.*?)</span>\.', path.read_text(encoding="utf-8"))[0]
         assert re.findall(r'class="dot (\w+)"', legend) == ["control", "check"][: 1 + bool(checks)]
-    assert few_check_points(0) == "no check points, and 30 are what ASPRS 2023 asks for before accuracy is claimed"
+    assert few_check_points(0) == "there are no check points; ASPRS 2023 asks for 30"
 
 
 def test_the_map_of_the_world_is_whole_at_the_antimeridian():

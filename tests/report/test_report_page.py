@@ -157,7 +157,7 @@ def test_pages_of_matches_and_mosaics_fit_every_screen(browser, tmp_path):
 def test_first_screens_of_blocks_runs_and_comparisons_answer_a_fresh_reader(made, block, run, browser):
     """How good, by what evidence, what is wrong, what next: seen before scrolling."""
     seen = {
-        block: (".figure", ".what", ".verdict", ".signals li .to-do", "svg[data-plot=network]", ".facts dd"),
+        block: (".figure", ".what", ".verdict", ".signals li .to-do", "svg[data-plot=network]", "table.errors"),
         run: ("h1", "tr.failed .remedy", "tbody img"),
         made["compare"].files["html"]: (".figure", ".what", ".verdict strong", ".signals li .to-do"),
     }

@@ -52,15 +52,15 @@ def test_no_output_shows_a_figure_that_an_error_makes_untrue(outputs, tiny):
     assert f"which moves the ortho by {notice['moved_m']:.2f} m" in head["what"]
     assert head["notes"][0].startswith(f"Do not rely on this figure: {rmse}")
     page = (out / "tiny" / "tiny_report.html").read_text()
-    first = page[page.index('<p class="figure">') : page.index('<dl class="facts">')]
+    first = page[page.index('<p class="figure') : page.index('<dl class="facts">')]
     assert first.index("Accuracy unknown") < first.index(why[4:]) < first.index(NO_SCALE) < first.index(rmse)
     assert "Map scales" not in page
     # The run: its terminal, its record and its page.
     row = next(line for line in printed.splitlines() if line.startswith("tiny "))
-    assert row.split()[3:6] == ["-", "-", "-"]
-    assert f"Error: accuracy unknown: {why}" in printed
+    assert row.split()[2:6] == ["-", "-", "accuracy", "unknown:"]
+    assert f"Error: tiny: accuracy unknown: {why}" in printed
     assert json.loads((out / "run.json").read_text())["scenes"][0]["facts"]["headline"] == head
-    assert "unknown: see the error" in (out / "index.html").read_text()
+    assert "accuracy unknown: see the error" in (out / "index.html").read_text()
     item = json.loads((out / "tiny" / "tiny_stac.json").read_text())
     assert not [name for name in item["properties"] if name.startswith("accuracy:")]
     # `ortho rectify` in the terminal.

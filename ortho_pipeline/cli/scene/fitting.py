@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from ortho_pipeline.cli.machine.browser import open_option, page_of, require_page, show_page
 from ortho_pipeline.cli.options import (
     image_argument,
     json_option,
@@ -54,6 +55,7 @@ def fit(
 @match_options
 @scene_options
 @surface_options
+@open_option
 @json_option
 def compare(
     image: str,
@@ -73,10 +75,12 @@ def compare(
     """
     from ortho_pipeline import commands
 
+    require_page("-o DIR", folder)
     command = click.get_current_context().meta["command"]
     result = commands.compare(
         image, points, models=models, folder=folder, scene=scene, surface=surface, match=match, command=command
     )
     if as_json:
-        return print_json(result.to_json())
+        print_json(result.to_json())
+        return show_page(page_of(result.files))
     return print_comparison(result, units)

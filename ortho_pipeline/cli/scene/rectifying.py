@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from ortho_pipeline.cli.machine.browser import open_option
 from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import (
     dry_run_option,
@@ -44,6 +45,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
 @scene_options
 @surface_options
 @output_options
+@open_option
 @json_option
 def rectify(
     image: str,

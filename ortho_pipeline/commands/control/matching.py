@@ -199,6 +199,10 @@ class Matched:
         sigma = self.options.reference_sigma
         return [
             (
+                "accuracy",
+                f"{px(record.sigma_px)} (median of the matches), relative to the reference: {record.components.text()}",
+            ),
+            (
                 "reference",
                 ", ".join(Path(level).name for level in self.references)
                 + (f", accuracy {metres(sigma)} per axis" if sigma else ", accuracy not stated"),
@@ -211,13 +215,9 @@ class Matched:
             ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),
             (
-                "model off",
+                "shift",
                 f"column {column:+.2f} px, row {row:+.2f} px (measured minus delivered model), "
                 f"{metres(record.shift_m)}",
-            ),
-            (
-                "accuracy",
-                f"{px(record.sigma_px)} (median of the matches), relative to the reference: {record.components.text()}",
             ),
         ]
 

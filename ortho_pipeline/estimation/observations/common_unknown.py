@@ -38,7 +38,7 @@ class CommonUnknown:
     points : int
         Number of control points that share the error.
     value : (k,)
-        Estimate in standard deviations: of known ground stated minus true ground, east and north; 0 without information.
+        Estimate in standard deviations, 0 without information. Of known ground: stated minus true, east and north.
     told : (k, k)
         Information from other points and from priors; that of its own standard deviation is I.
     """

@@ -1,4 +1,4 @@
-"""What there is to say of a mosaic: its document and its words."""
+"""The record of a mosaic, and its summary in words."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def mosaic_document(
     owners: Owners | None = None,
     clamped: float = 0.0,
 ) -> dict[str, Any]:
-    """Return what there is to say of a mosaic as JSON values; docs/mosaic.md says what each is."""
+    """Return the record of a mosaic as JSON values, which docs/mosaic.md explains."""
     measured = [seam for seam in seams if seam["patches"]]
     lengths = [math.hypot(*seam["median_px"]) for seam in measured]
     worst = max(zip(lengths, measured, strict=True), key=lambda pair: pair[0], default=None)
@@ -69,13 +69,13 @@ def _seamlines(placed: Mosaic, owners: Owners) -> dict[str, Any]:
 
 
 def summary_text(document: Mapping[str, Any]) -> str:
-    """Return what there is to say of a mosaic as a few lines."""
+    """Return the result of a mosaic as a few lines."""
     width, height = document["size"]
     lines = [f"mosaic: {width} x {height} px of {counted(len(document['on_top_first']), 'scene')}"]
     if balance := document["balance"]:
         lines.append(f"balance: {balance_text(balance)}")
     if seamlines := document["seamlines"]:
-        lines.append(f"seamlines: {share(seamlines['moved_share'])} of the mosaic from another scene than by its order")
+        lines.append(f"seam lines: {share(seamlines['moved_share'])} of the mosaic changed its scene")
     if document["seams"]:
         text = f"seams: {document['seams_measured']} of {len(document['seams'])} measured"
         if document["worst_seam"]:
@@ -88,17 +88,17 @@ def summary_text(document: Mapping[str, Any]) -> str:
 
 
 def balance_text(balance: Mapping[str, Any]) -> str:
-    """Return what a balance comes to."""
+    """Return the result of a balance in words."""
     before, after = (" / ".join(short(value) for value in balance[when]) for when in ("before", "after"))
-    said = f"cells of the overlaps differ by {after} instead of {before} (RMS of each band)"
-    said += f"; {share(balance['outlying_share'])} of {counted(balance['cells'], 'cell')} disagree and do not count"
+    said = f"overlaps differ by {after} (before: {before}; RMS of each band)"
+    said += f"; {share(balance['outlying_share'])} of {counted(balance['cells'], 'cell')} excluded as outliers"
     if balance["clamped_share"]:
-        said += f"; {share(balance['clamped_share'])} of the pixels did not fit their type and were clamped"
+        said += f"; {share(balance['clamped_share'])} of the pixels exceeded their type and were clamped"
     return said
 
 
 def along(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """Return what all seams together come to before and after; nothing where they were not looked at."""
+    """Return the differences along all seams before and after; nothing if they were not measured."""
     found = [[seam[when] for seam in document["seams"] if seam.get(when)] for when in ("before", "after")]
     return [(_together(found[0]), _together(found[1]))] if all(found) else []
 
@@ -122,8 +122,8 @@ def along_text(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """Return how scenes differ along the seams, before and after."""
     said = []
     if before["rms"] is not None and after["rms"] is not None:
-        worst = f"{short(after['largest_rms'])} at the worst place"
-        said.append(f"{short(after['rms'])} in brightness (RMS; {worst}; before {short(before['rms'])})")
+        worst = f"largest {short(after['largest_rms'])}"
+        said.append(f"{short(after['rms'])} in brightness (RMS; {worst}; before: {short(before['rms'])})")
     if before["rmse_px"] is not None and after["rmse_px"] is not None:
-        said.append(f"{after['rmse_px']:.2f} px in place (before {before['rmse_px']:.2f} px)")
-    return f"along the seams scenes differ by {' and '.join(said) if said else 'what nothing tells'}"
+        said.append(f"{after['rmse_px']:.2f} px in position (before: {before['rmse_px']:.2f} px)")
+    return f"along the seams scenes differ by {' and '.join(said)}" if said else "along the seams nothing was measured"

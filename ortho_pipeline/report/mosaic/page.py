@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ortho_pipeline.files import staged, write_text
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.mosaic.document import summary_text
+from ortho_pipeline.report.summary import processed
 from ortho_pipeline.warp.mosaic import Owners
 
 #: Cells per side of the drawing of the seams, at most; seams that the page lists.
@@ -29,6 +31,8 @@ def write_page(
     page = render(
         "report/mosaic.html.j2",
         document=document,
+        name=Path(path).name.removesuffix(".html"),
+        about={"Processed": processed()},
         unit={"metre": " m", "degree": "°"}.get(parse_crs(document["crs"]).axis_info[0].unit_name, ""),
         lines=summary_text(document).split("\n")[1:],
         picture=base64.b64encode(png).decode(),

@@ -1,4 +1,4 @@
-"""What to do about a notice, and how much it matters: the traffic lights of a page."""
+"""What to do about a notice, and how grave it is: an error, a warning or a note."""
 
 from __future__ import annotations
 
@@ -12,106 +12,112 @@ Level = Literal["stop", "look", "know"]
 
 _STOP: dict[str, str] = {
     "reference-displaced": Text(
-        "Let the measured points control beside the matches (",
+        "Use the measured points as control together with the matches (",
         Setting("match.gcps_as", "control"),
-        "), and state how accurate the reference is (",
+        "). State the accuracy of the reference (",
         Setting("match.reference_sigma"),
         ").",
     ),
-    "heights-disagree": "Find out which height datum points and DEM have, state both, and make it again.",
-    "model-elsewhere": "Check that image, points and their CRS belong together, and that columns and rows are not "
-    "swapped.",
-    "reference-made-of-scene": "Take another reference: one that was not made of this scene.",
-    "unstable": "Add points, or take a correction with fewer parameters.",
-    "checks-apart": "Measure those named again, in the image and at their source, before the model or the control is "
-    "changed.",
-    "undecided-contradiction": "Measure the points named again; one of them is wrong.",
-    "only-a-start": "Add control points or a reference to match with before the ortho is used.",
-    "rpc-elsewhere": "Check that the RPC belongs to this image, and is not that of a crop or of another scene.",
-    "sparse-ortho": "Check the extent that was asked for and the validity mask of the image.",
-    "metadata-contradict": "Find out which of the two is right before the ortho is used; ask who delivered the scene.",
+    "heights-disagree": Text(
+        "Find out the height datums of points and DEM. State both (",
+        Setting("points.vertical"),
+        ", ",
+        Setting("surface.vertical"),
+        ") and repeat the job.",
+    ),
+    "model-elsewhere": "Check image, points, CRS, and the order of columns and rows.",
+    "reference-made-of-scene": "Use another reference, one that was not made from this scene.",
+    "unstable": "Add points, or use a simpler correction.",
+    "checks-apart": "Measure the named points again, in the image and at their source. Do this before you change "
+    "model or control.",
+    "undecided-contradiction": "Measure the named points again; one of them is wrong.",
+    "only-a-start": "Add control points or a reference before you use the ortho.",
+    "rpc-elsewhere": "Check that the RPC belongs to this image, and not to a crop or another scene.",
+    "sparse-ortho": "Check the extent and the mask of the image.",
+    "metadata-contradict": "Find out which one is right before you use the ortho. Ask the supplier of the scene.",
 }
 _LOOK: dict[str, str] = {
-    "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the "
-    "ortho there.",
+    "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "
+    "there.",
     "bands-disagree": Text(
-        "Match again with bands that agree and look like the scene (",
+        "Choose bands that agree and look like the scene (",
         Setting("match.reference_bands"),
         "): visible bands for a panchromatic scene.",
     ),
-    "left-out": "Look at it in the image and at its coordinates: measure it again, or delete it from the file of "
-    "points.",
-    "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
-    "contradicting-point": "Look at it in the image and at its coordinates, and measure it again; take it out only "
-    "if its source is found wrong.",
-    "no-projection": "Give the points a height, and check their CRS.",
+    "left-out": "Check the point in the image and at its source. Measure it again or delete it.",
+    "more-left-out": "Check points and model: they do not belong together.",
+    "contradicting-point": "Measure the point again. Delete it only if its source is wrong.",
+    "no-projection": "Add the heights of the points, and check their CRS.",
     "takes-no-part": "Measure these points in one more image.",
-    "outside-of-image": "Check whether these were measured in another image or in a crop of this one.",
-    "one-mark-twice": "Keep one of each pair: they count as two proofs of the same thing.",
-    "images-not-given": "Give these images too, or take them out of the file of points.",
+    "outside-of-image": "Check whether the points belong to another image or to a crop of this one.",
+    "one-mark-twice": "Keep one of each pair.",
+    "images-not-given": "Add these images, or remove their points.",
     "no-intersection": "Measure these points again.",
-    "few-check-points": "Keep more points apart as check points before accuracy is claimed to others.",
-    "no-redundancy": "Add points: so far the residuals prove nothing.",
-    "control-covers-part": "Add control points in the empty part, or do not rely on the ortho there.",
-    "weak-join": "Give a more accurate DEM, control points, or another view of the place.",
-    "uncertain-at-edge": "Add control points near the corners, or take a correction with fewer parameters.",
-    "inseparable-parameters": "Take a correction with fewer parameters, or let prune remove them.",
-    "unsuited-model": "Take a model that the sensor suggests, unless you know better.",
-    "search-by-default": "State how accurate the delivered model is, if you know it.",
-    "points-cover-part": "Add ties there (they can be found by matching), and control near the corners of the block.",
-    "block-in-parts": "Measure points that images of both parts show, or adjust the parts by themselves.",
-    "few-ties": "Measure some ties by hand between these images.",
-    "no-matches": "Give this image control points, or a reference that resembles it more.",
-    "dem-datum-by-name": "State the height datum of the DEM, so that nothing rests on its name.",
-    "dem-items-overlap": "Give a list of the items that shall count, if others than the latest ones are meant.",
-    "dem-covers-part": "Give a DEM that covers the scene: what lies outside of it has no value or a guessed height.",
-    "accuracy-in-part": "State the accuracy of what is named, so that the figures include it.",
-    "memory-exceeded": "Allow more memory, or take the engine of ortho-pipeline.",
-    "rpc-approximate": "Use the model file or the ortho, and not the RPC, where this error matters.",
-    "maybe-a-crop": "If it is a crop, state the column and row of its corner in the original image.",
-    "no-pushbroom": "Take the RPC, or ask for complete metadata.",
-    "rpc-and-rigorous-differ": "Compare both at check points, and keep the better.",
-    "bands-differ": "Rectify the bands one by one where this difference matters.",
-    "unchecked-product": "Check the result at points that you know before you rely on it.",
-    "rpc-not-used": "Repair or remove the RPC file beside the image.",
-    "rpcs-differ": "Check which of the RPCs belongs to this image, and remove the other.",
-    "damaged-metadata": "Ask for the metadata again.",
+    "few-check-points": "Reserve more check points before you claim accuracy.",
+    "no-redundancy": "Add points. Until then the residuals prove nothing.",
+    "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
+    "weak-join": "Use a more accurate DEM, control points, or another view of the place.",
+    "uncertain-at-edge": "Add control points near the corners, or use a simpler correction.",
+    "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
+    "unsuited-model": "Use a model that the sensor suggests.",
+    "search-by-default": Text("State the accuracy of the delivered model with ", Setting("match.search"), "."),
+    "points-cover-part": "Add ties there (matching finds them), and control near the corners of the block.",
+    "block-in-parts": "Measure common points, or adjust the parts separately.",
+    "few-ties": "Measure some ties between these images.",
+    "no-matches": "Give this image control points or a more similar reference.",
+    "dem-datum-by-name": Text("State the height datum of the DEM with ", Setting("surface.vertical"), "."),
+    "dem-items-overlap": "To use other items, list them in a file.",
+    "dem-covers-part": "Use a larger DEM. Outside the DEM the ortho has no value, or its height is a guess.",
+    "accuracy-in-part": "State the missing accuracies, so that the figures include them.",
+    "memory-exceeded": Text("Increase ", Setting("output.memory"), ", or use ", Setting("output.engine", "ortho"), "."),
+    "rpc-approximate": "Use the model file or the ortho where this error matters.",
+    "maybe-a-crop": Text(
+        "If it is a crop, state the column and row of its first pixel with ", Setting("scene.crop_offset"), "."
+    ),
+    "no-pushbroom": "Use the RPC, or get complete metadata.",
+    "rpc-and-rigorous-differ": "Compare both at check points, and use the better one.",
+    "bands-differ": "Rectify the bands separately if this difference matters.",
+    "unchecked-product": "Check the result at known points.",
+    "rpc-not-used": "Repair or delete the RPC file.",
+    "rpcs-differ": "Find the RPC that belongs to this image, and remove the other one.",
+    "damaged-metadata": "Get the metadata again.",
     "maybe-cut-off": "Copy the file again.",
-    "processing-level": "Check that the product has not been resampled to a map before.",
-    "from-sensor": "Read it before the ortho is used.",
+    "processing-level": "Check that the product was not resampled to a map.",
+    "from-sensor": "Read this before you use the ortho.",
 }
 _KNOW: dict[str, str] = {
-    "control-without-height": "Nothing, if heights come from elsewhere; else give the points heights.",
-    "unstated-sigma": "State how accurate the points are, if you know it.",
-    "parameters-removed": "Nothing: what the points could not tell was left out.",
-    "relative-to-reference": "Measure some check points if the position has to be right, and not only consistent.",
-    "dem-sigma-by-default": "State how accurate the DEM is, if you know it.",
-    "dem-sigma-estimated": "State how accurate the DEM is, if you know it.",
-    "heights-left-out": "Nothing: a DEM of the bare ground does not show roofs and trees.",
-    "correction-by-matches": "Nothing, unless you know which correction suits the sensor.",
-    "dem-datum-overridden": "Make sure that the datum stated is the right one.",
-    "no-rpc": "Use the ortho or the model file; programs that need an RPC cannot have one.",
-    "crop-stated": "Nothing, if the offset is right.",
-    "crop-noted": "Nothing.",
-    "crop-kept": "Nothing.",
-    "nothing-adjusted": "Adjust a correction, such as a shift.",
-    "rigorous-left-out": "Nothing, if the RPC is the model that you want.",
-    "part-left-out": "Rectify the other parts as scenes of their own.",
-    "radar-on-a-plane": "Give a DEM.",
-    "no-rpc-text": "Nothing.",
-    "gcps-beside-rpc": "Tell users of other programs, which may prefer these points to the RPC.",
-    "piece-left-out": "Nothing, if this piece is the one that you want.",
+    "control-without-height": "Add heights if you have them.",
+    "unstated-sigma": Text("State the accuracy of the points with ", Setting("points.ground_sigma"), "."),
+    "parameters-removed": "Nothing to do: the points did not justify these parameters.",
+    "relative-to-reference": "Measure check points if the absolute position matters.",
+    "dem-sigma-by-default": Text("State the accuracy of the DEM with ", Setting("surface.sigma"), "."),
+    "dem-sigma-estimated": Text("If you know the accuracy of the DEM, state it with ", Setting("surface.sigma"), "."),
+    "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
+    "correction-by-matches": "Nothing to do, unless you know a better correction.",
+    "dem-datum-overridden": "Check that your datum is right.",
+    "no-rpc": "Use the ortho or the model file.",
+    "crop-stated": "Check the offset.",
+    "crop-noted": "Nothing to do.",
+    "crop-kept": "Nothing to do.",
+    "nothing-adjusted": Text("Choose a correction, such as ", Setting("points.correction", "shift"), "."),
+    "rigorous-left-out": "Nothing to do, if you want the RPC.",
+    "part-left-out": "Rectify the other parts separately.",
+    "radar-on-a-plane": Text("Give a DEM (", Setting("surface.dem"), ")."),
+    "no-rpc-text": "Nothing to do.",
+    "gcps-beside-rpc": "Tell users of other programs: these may use the points instead of the RPC.",
+    "piece-left-out": "Nothing to do, if you want this piece.",
 }
 _LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _LOOK), ("know", _KNOW))
+_NOTHING = "Nothing to do"
 #: Of a code that this version does not know.
-_UNKNOWN = "Read it before the ortho is used."
+_UNKNOWN = "Read this before you use the ortho."
 #: The levels in words, the gravest first.
-WORDS: dict[Level, str] = {"stop": "Settle this first", "look": "To look at", "know": "To know"}
+WORDS: dict[Level, str] = {"stop": "Error", "look": "Warning", "know": "Note"}
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A notice as a page shows it: what it says, how much it matters, and what to do."""
+    """A notice as people read it: its text, how grave it is, and what to do."""
 
     level: Level
     text: str
@@ -121,54 +127,73 @@ class Signal:
 #: Of a result that no point tests.
 UNTESTED = Signal(
     "look",
-    "Nothing tests how accurate this is.",
-    "Give points of known ground that only check, or an orthoimage of the place to match with.",
+    "No point tests the accuracy of this result.",
+    "Add check points, or an orthoimage of the same place to match with.",
 )
 
 
 def advised(code: str) -> tuple[Level, str]:
-    """Return how much a notice of a code matters, and what to do about it."""
-    for level, found in _LEVELS:
-        if code in found:
-            return level, found[code]
+    """Return how grave a notice of a code is, and what to do about it."""
+    for level, remedies in _LEVELS:
+        if code in remedies:
+            return level, remedies[code]
     return "look", _UNKNOWN
 
 
 def signals(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *, tested: bool = True) -> list[Signal]:
     """Return the notices of a document, the gravest first; of earlier versions, which have no codes, the texts.
 
-    Of a result that is not `tested` that is the first thing to look at.
+    If the result is not `tested`, that is the first warning.
     """
     if not notices:
         notices = [{"code": "from-sensor", "text": text} for text in warnings]
-    found = [Signal(*_of(one)) for one in notices]
-    # No redundancy says it too, and why.
-    if not tested and not any(one["code"] == "no-redundancy" for one in notices):
+    found = [Signal(*_signal(one)) for one in notices]
+    # These notices say it too, and why.
+    codes = {one["code"] for one in notices}
+    if not tested and not codes & {"no-redundancy"}:
         found.insert(0, UNTESTED)
     order = list(WORDS)
     return sorted(found, key=lambda one: order.index(one.level))
+
+
+def signal_lines(found: Sequence[Signal]) -> list[Text]:
+    """Return notices as lines for the terminal; what several of them have to do stands once, below the last."""
+    lines: list[Text] = []
+    for number, one in enumerate(found):
+        lines.append(Text(f"{WORDS[one.level]}: ", one.text))
+        if one.to_do not in [other.to_do for other in found[number + 1 : number + 2]]:
+            lines += [] if one.to_do.startswith(_NOTHING) else [Text("  Remedy: ", one.to_do)]
+    return lines
+
+
+def _signal(notice: Mapping[str, Any]) -> tuple[Level, str, str]:
+    level, to_do = advised(notice["code"])
+    if notice["code"] == "few-check-points" and not notice.get("count", 1):
+        to_do = to_do.replace("Reserve more check points", "Reserve some check points")
+    if notice["code"] == "checks-apart":
+        to_do = _about_checks(notice, to_do)
+    return level, _sentence(notice["text"]), to_do
 
 
 def _about_checks(notice: Mapping[str, Any], to_do: str) -> str:
     """Return what to do about check points that contradict the control, by what their errors look like."""
     off, beyond = notice.get("off", 0), notice.get("beyond_control", 0)
     if off == 1:
-        to_do = to_do.replace("those named", str(notice["points"][0])).replace("their source", "its source")
+        to_do = to_do.replace("the named points", str(notice["points"][0])).replace("their source", "its source")
     if notice.get("alike"):
-        to_do += " They are all off by about the same: check their CRS, their height datum and from where pixels count."
+        to_do += " All have about the same error: check their CRS, height datum and pixel origin."
     elif off > 1:
-        to_do += " They are off in different ways, as single mistakes are."
+        to_do += " Their errors differ, so they are probably single mistakes."
     if beyond:
-        who = "It lies" if off == 1 else ("They lie" if beyond == off else f"{beyond} of them lie")
-        to_do += f" {who} outside of the area of the control points, where the model may be poor: add control there."
+        who = "It is" if off == 1 else ("They are" if beyond == off else f"{beyond} of them are")
+        to_do += f" {who} outside the area of the control points, where the model may be poor: add control there."
     return to_do
 
 
-def _of(notice: Mapping[str, Any]) -> tuple[Level, str, str]:
-    level, to_do = advised(notice["code"])
-    if notice["code"] == "few-check-points" and not notice.get("count", 1):
-        to_do = to_do.replace("Keep more points", "Keep some points")
-    if notice["code"] == "checks-apart":
-        to_do = _about_checks(notice, to_do)
-    text = str(notice["text"])
-    return level, text[:1].upper() + text[1:], to_do
+def _sentence(text: str) -> Text:
+    """Return a text with a capital, unless it begins with a name; the options that it names stay known."""
+    whole = Text(text)
+    first, *rest = whole.parts or ("",)
+    if isinstance(first, str) and first.split(" ")[0].isalpha():
+        return Text(first[:1].upper() + first[1:], *rest)
+    return whole

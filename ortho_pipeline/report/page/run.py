@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ortho_pipeline.display.numbers import fixed, px
+from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files import write_text
@@ -21,32 +21,33 @@ from ortho_pipeline.options.texts import counted
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.page.advice import WORDS, Signal, signals
 from ortho_pipeline.report.page.behaviour import policy, script
+from ortho_pipeline.report.records import UNKNOWN
+from ortho_pipeline.report.summary import processed, sensors_text
 from ortho_pipeline.report.wording import refuted
 
 #: Longer side of a thumbnail, px, and how many scenes have one: a page of thousands would be no page.
 _SIDE, _MOST = 88, 300
 #: Of a scene that no run has finished.
-_NOT_MADE = {"message": "nobody has made this scene yet", "file": None, "field": None, "remedy": "run it"}
+_NOT_MADE = {"message": "this scene is not made yet", "file": None, "field": None, "remedy": "run it"}
 #: The evidence that scenes are ordered by, the best first.
 EVIDENCE = {
     "check": ("check point", "check points"),
-    "matched": ("held-out match", "held-out matches"),
-    "loo": ("control point left out in turn", "control points left out in turn"),
-    "control": ("control point: the fit", "control points: the fit"),
+    "matched": ("match (relative)", "matches (relative)"),
+    "loo": ("control point, left out in turn", "control points, each left out in turn"),
+    "control": ("point of the delivered model", "points of the delivered model"),
 }
 
 
 #: What a scene may be other than ready, the worst first.
-STATES = {"failed": "failed", "stop": "to settle first", "untested": "not tested"}
+STATES = {"failed": "failed", "stop": "with errors", "untested": "of unknown accuracy"}
 
 
 @dataclass(frozen=True)
 class SceneRow:
     """A scene of the page; `page` is the address of its report from here, `rmse` px of the best `evidence` there is.
 
-    `signal` is the gravest of its notices, if it is to be looked at; `state` is ``failed``, ``stop`` (something is to
-    be settled first), ``untested`` or ``ready``; `tested_at` the evidence in words;
-    `untrue` tells that an error makes its figures untrue.
+    `signal` is the gravest of its errors and warnings; `state` is ``failed``, ``stop`` (with errors), ``untested`` or
+    ``ready``; `tested_at` the evidence in words.
     """
 
     name: str
@@ -56,7 +57,6 @@ class SceneRow:
     evidence: str | None
     rmse: float | None
     metres: float | None
-    untrue: bool = False
     signal: Signal | None = None
     thumbnail: str | None = None
 
@@ -72,13 +72,7 @@ class SceneRow:
     @property
     def tested_at(self) -> str:
         """The evidence in words, with the number of points."""
-        if self.untrue:
-            return "unknown: see the error"
-        if self.evidence is None:
-            return "not tested"
-        one, many = EVIDENCE[self.evidence]
-        number = (self.facts.get("rmse_points") or {}).get(self.evidence)
-        return many if number is None else counted(number, one, many)
+        return tested_at(self.facts)
 
 
 def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]]) -> None:
@@ -111,27 +105,35 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
         head=_headline(states, len(rows)),
         levels=WORDS,
         said=_summary(rows),
+        about=_about(rows),
     )
     write_text(path, page)
 
 
 def _headline(states: Mapping[str, int], count: int) -> str:
-    """Say of how many scenes what holds; every scene counts once."""
+    """Say how many scenes are ready, and how many are not; every scene counts once."""
     others = [f"{states[state]} {what}" for state, what in STATES.items() if states.get(state)]
     ready = f"{states.get('ready', 0)} of {counted(count, 'scene')} ready"
     return f"{ready}; {', '.join(others)}" if others else f"{counted(count, 'scene')}, all ready"
 
 
 def _summary(rows: Sequence[SceneRow]) -> str:
-    """Say how accurate the scenes are that are ready, by what evidence."""
+    """Say how accurate the scenes are that are ready, and from which points."""
     ready = [row for row in rows if row.state == "ready"]
     parts = []
     for kind, (_, name) in EVIDENCE.items():
-        sizes = [row.rmse for row in ready if row.evidence == kind and row.rmse is not None]
+        sizes = [row.metres for row in ready if row.evidence == kind and row.metres is not None]
         if sizes:
-            span = px(sizes[0]) if len(sizes) == 1 else f"{fixed(min(sizes))} to {px(max(sizes))}"
-            parts.append(f"{len(sizes)} tested at {name}, RMSE {span}")
-    return f"of those ready {'; '.join(parts)}." if parts else "none is ready."
+            span = metres(sizes[0]) if len(sizes) == 1 else f"{min(sizes):.2f} to {metres(max(sizes))}"
+            parts.append(f"{len(sizes)} tested at {name}: RMSE {span}")
+    return f"{'; '.join(parts)}." if parts else "no scene is ready."
+
+
+def _about(rows: Sequence[SceneRow]) -> dict[str, str]:
+    """Return when the page was made, how many scenes there are, and their sensors."""
+    sensors = sensors_text((str(row.facts["sensor"]) for row in rows if row.facts.get("sensor")), ())
+    texts = {"Processed": processed(), "Scenes": str(len(rows)), "Sensor": sensors}
+    return {key: text for key, text in texts.items() if text}
 
 
 def _is_of(path: Path, key: str) -> bool:
@@ -143,14 +145,12 @@ def _is_of(path: Path, key: str) -> bool:
 
 
 def _row(scene: Mapping[str, Any], folder: Path) -> SceneRow:
-    facts, error, found = scene["facts"], scene["error"], None
+    facts, error = scene["facts"], scene["error"]
     if not error and not facts:
         error = _NOT_MADE
-    rmses, metres = facts.get("rmse_px") or {}, facts.get("rmse_m") or {}
-    # A figure that an error makes untrue is not shown.
-    untrue = not error and refuted(facts.get("notices") or ()) is not None
-    if not error and not untrue:
-        found = next((kind for kind in EVIDENCE if rmses.get(kind) is not None), None)
+    found = None if error else evidence_in(facts)
+    rmses, on_ground = facts.get("rmse_px") or {}, facts.get("rmse_m") or {}
+    tested = found is not None or refuted(facts.get("notices") or ()) is not None
     page = scene["files"].get("html")
     return SceneRow(
         name=scene["name"],
@@ -159,10 +159,27 @@ def _row(scene: Mapping[str, Any], folder: Path) -> SceneRow:
         page=None if page is None or error else quote(os.path.relpath(page, folder)),
         evidence=found,
         rmse=None if found is None else rmses[found],
-        metres=None if found is None else metres.get(found),
-        untrue=untrue,
-        signal=None if error else _gravest(facts, tested=untrue or found is not None),
+        metres=None if found is None else on_ground.get(found),
+        signal=None if error else _gravest(facts, tested=tested),
     )
+
+
+def evidence_in(facts: Mapping[str, Any]) -> str | None:
+    """Return which points tell the accuracy of a scene, by the facts of a run; None where it is unknown."""
+    if refuted(facts.get("notices") or ()) or (facts.get("headline") or {}).get("figure") == UNKNOWN:
+        return None
+    rmses = facts.get("rmse_px") or {}
+    return next((kind for kind in EVIDENCE if rmses.get(kind) is not None), None)
+
+
+def tested_at(facts: Mapping[str, Any]) -> str:
+    """Return the points that tell the accuracy of a scene, in words with their number."""
+    kind = evidence_in(facts)
+    if kind is None:
+        why = "see the error" if refuted(facts.get("notices") or ()) else "no check points"
+        return f"accuracy unknown: {why}"
+    number, (one, many) = (facts.get("rmse_points") or {}).get(kind), EVIDENCE[kind]
+    return many if number is None else counted(number, one, many)
 
 
 def _gravest(facts: Mapping[str, Any], *, tested: bool) -> Signal | None:

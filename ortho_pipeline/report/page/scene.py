@@ -17,13 +17,21 @@ from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.gallery.chips import gallery
 from ortho_pipeline.report.gallery.plots import residuals_by_axis
 from ortho_pipeline.report.gallery.points import point_chips
-from ortho_pipeline.report.page.advice import WORDS, signals
+from ortho_pipeline.report.page.advice import WORDS
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import place_of, plot_locator
 from ortho_pipeline.report.page.ortho_map import LONGEST_ARROW, plot_ortho
 from ortho_pipeline.report.plots import plots
-from ortho_pipeline.report.records import NOT_TESTED, Provenance, SceneReport
-from ortho_pipeline.report.wording import NOTICED, runner_up, scale_rules, unsettled, verdict
+from ortho_pipeline.report.records import UNKNOWN, Provenance, SceneReport
+from ortho_pipeline.report.summary import (
+    about,
+    circular_error,
+    error_table,
+    errors_of_points,
+    first_notes,
+    signals_of,
+)
+from ortho_pipeline.report.wording import fit_notes, runner_up, scale_rules, unsettled, verdict
 
 if TYPE_CHECKING:
     from ortho_pipeline.imaging.matching import Matches
@@ -55,14 +63,18 @@ def write_report_html(
     png = ortho if isinstance(ortho, bytes) or ortho is None else preview_png(ortho, side=_SIDE)
     adjustment, code = report.adjustment, script()
     over_ortho, where = plot_ortho(report) if png else None, plot_locator(place_of(report))
-    said = signals(report.warnings, report.notices, tested=report.headline.figure != NOT_TESTED)
+    said = signals_of(report)
     page = render(
         "report/report.html.j2",
         report=report,
         adjustment=adjustment,
         head=report.headline,
-        # What is a notice stands among them, with what to do.
-        notes=[note for note in report.headline.notes if note not in NOTICED or not said],
+        about=about(report),
+        unknown=report.headline.figure == UNKNOWN,
+        ce90=circular_error(report),
+        errors=error_table(errors_of_points(report)),
+        notes=first_notes(report, said),
+        fit_notes=fit_notes(adjustment),
         verdict=verdict(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         unsettled=unsettled(report),
@@ -111,5 +123,5 @@ def _running(name: str) -> str:
 
 def _brief(provenance: Provenance) -> dict[str, Any]:
     """Return the provenance without what the page shows in tables of its own."""
-    shown = ("inputs", "surface", "model_source")
+    shown = ("inputs", "surface", "model_source", "image", "sensor")
     return {key: value for key, value in provenance.to_json().items() if key not in shown}
