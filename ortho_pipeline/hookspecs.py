@@ -77,6 +77,11 @@ class Piece:
         its pixels lie beside those of the scene by the ground alone (`sees_apart`).
     scale : float
         Width of one of its pixels in those of the scene; another than 1 where colours are coarser than panchromatic.
+
+    Examples
+    --------
+    >>> Piece("po_1_red.tif", scale=4.0).sees_apart  # without a model of its own
+    False
     """
 
     path: str | PathLike[str]
@@ -123,6 +128,14 @@ class Scene:
         Model families (`ortho models`) that do not suit this product, each with what to say where it is fitted.
     adjusted : mapping, optional
         What the model was adjusted by before: the section ``adjustment`` of the model file that it comes from.
+
+    Examples
+    --------
+    >>> scene = op.open_scene("sample_data/scene.tif")
+    >>> scene
+    <scene scene.tif: 1000 x 1000, sensor rpc, models rpc>
+    >>> scene.fit(op.read_points("sample_data/gcps.geojson"), "shift").param_names
+    ('col_shift', 'row_shift')
     """
 
     sensor: str
@@ -250,6 +263,11 @@ class Sensor:
         Where the metadata of an image are looked for, if a product is an image and one file beside it
         (`Scene.model_source`): a copy there makes another image of the same pixels such a product, as `ortho register`
         does.
+
+    Examples
+    --------
+    >>> Sensor("tinysat", "TinySat level 1A scenes", lambda dataset: False, op.open_scene).fallback
+    False
     """
 
     name: str
@@ -283,6 +301,11 @@ class Format:
         Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance in
         pixels between the file and the model. Raises `InputError` for a model that the format cannot express. If it
         fails, the host removes the file.
+
+    Examples
+    --------
+    >>> Format("corners", "ground of the four corners", "_corners.json", lambda export, path: 0.0).ending
+    '_corners.json'
     """
 
     name: str
@@ -313,6 +336,11 @@ class Subcommand:
         What each is for, and its command line (``ortho coverage ...``): they end the command's help.
     group : str
         The heading of ``ortho --help`` under which it is listed.
+
+    Examples
+    --------
+    >>> Subcommand("coverage", "Show which part of IMAGE the DEM covers.", "ortho_coverage.command:coverage").group
+    'More commands'
     """
 
     name: str

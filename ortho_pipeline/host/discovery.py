@@ -251,6 +251,11 @@ def open_scene(
         If the file cannot be opened, no sensor or several recognise it, or an option is not the sensor's.
     PluginError
         If a plugin broke the contract.
+
+    Examples
+    --------
+    >>> op.open_scene("sample_data/scene.tif").model_source
+    'sample_data/scene_RPC.TXT'
     """
     return Host.discover().open_scene(
         path, sensor, options, allow_network=allow_network, roots=roots, crop_offset=crop_offset

@@ -56,6 +56,9 @@ def open_dataset(
 ) -> gdal.Dataset:
     """Open a raster for reading.
 
+    >>> open_dataset("sample_data/scene.tif").RasterXSize
+    1000
+
     Parameters
     ----------
     path : path
@@ -390,6 +393,12 @@ class RasterSource:
     ------
     InputError
         If a file cannot be used, differs in size from the first, or has no such band.
+
+    Examples
+    --------
+    >>> source = RasterSource("sample_data/scene.tif")
+    >>> source.count, source.read(0, 0, 4, 2).shape
+    (1, (1, 2, 4))
     """
 
     def __init__(
