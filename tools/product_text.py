@@ -52,6 +52,21 @@ _STYLED = (
 _LABELS = ("title", "alt", "placeholder", "aria-label", "data-label")
 
 
+#: Files whose commands are examples: tests/cli/test_examples.py and tests/cli/test_first_use.py run these.
+EXAMPLES = (
+    "ortho_pipeline/cli/survey/examples.py",
+    "ortho_pipeline/cli/survey/first_use.py",
+    "ortho_pipeline/commands/survey/pipeline_file.py",
+)
+#: Beginnings of commands: programs of GDAL anywhere, words that are also plain English after a quote or a verb.
+_COMMAND = re.compile(
+    r"(?P<opened>[`'\"(])?(?<![\w.-])(?P<command>"
+    r"(?:gdal_\w+(?:\.py)?|gdal(?:warp|addo|info|buildvrt)|pip install|python3? -m|pyproj sync|projsync)\b"
+    r"|(?:(?<=[`'\"(])|(?<=take )|(?<=use )|(?<=run )|(?<=see )|(?<=with ))ortho (?=[a-z]))"
+)
+_CLOSING = {"(": r"\)", "`": "`", "'": "'", '"': '"', None: r"[,;)\n]|:(?=\s|$)"}
+
+
 class Shown(NamedTuple):
     """A text that the product shows.
 
@@ -83,6 +98,12 @@ class Shown(NamedTuple):
         lines = self.text.splitlines() if self.kind in ("message", "remedy", "notice", "text") else [self.text]
         return [sentence for line in lines for sentence in words.sentences(line)]
 
+    def commands(self) -> list[str]:
+        """Return the commands that it tells a person to run; helps and examples have none."""
+        if self.kind in ("help", "docs") or self.path in EXAMPLES:
+            return []
+        return commands(self.text)
+
     def long_sentences(self) -> list[str]:
         """Return its sentences that are longer than 19 of 20 may be."""
         return [sentence for sentence in self.sentences() if words.length(sentence) > words.NEARLY_ALL]
@@ -110,6 +131,15 @@ def paragraphs(page: str) -> Iterator[tuple[int, str]]:
     page = words.FENCED.sub(lambda found: _lines(found[0]), page)
     for found in re.finditer(r"(?:^.*\S.*\n?)+", page, flags=re.MULTILINE):
         yield _line(page, found.start()), found[0]
+
+
+def commands(text: str) -> list[str]:
+    """Return the commands in a text: each up to the quote that ends it, or to the next comma, colon or line."""
+    found = []
+    for start in _COMMAND.finditer(text):
+        rest = text[start.start("command") :]
+        found.append(re.split(_CLOSING[start["opened"]], rest, maxsplit=1)[0].strip().rstrip("."))
+    return found
 
 
 # -- Python ----------------------------------------------------------------------------------------------------------
