@@ -112,7 +112,10 @@ def _described(thing: Any) -> list[str]:
     found = [_prose(pieces[0])]
     for heading, body in zip(pieces[1::2], pieces[2::2], strict=True):
         found.append(f"**{heading}**")
-        if heading in ("Examples", "Notes"):
+        if heading == "Examples":
+            found.append(f"```python\n{body.strip()}\n```")
+            continue
+        if heading == "Notes":
             found.append(_prose(body))
             continue
         # After the entries prose may go on: a line at the margin that is no name with a type.

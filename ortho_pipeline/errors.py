@@ -50,6 +50,14 @@ class OrthoError(Exception):
     ----------
     choices : tuple of (Setting, str)
         Alternative options, each with its meaning. The command line prints one command for each.
+
+    Examples
+    --------
+    >>> try:
+    ...     op.open_scene("missing.tif")
+    ... except op.OrthoError as error:
+    ...     print(error.file, error.remedy, sep=": ")
+    missing.tif: check the path
     """
 
     choices: tuple[tuple[Any, str], ...] = ()
@@ -114,7 +122,20 @@ def of_option(name: str) -> Iterator[None]:
 
 
 def reads(remedy: str, field: str | None = None) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
-    """Decorate a function whose first argument is the file that it reads: complete its errors (see `completed`)."""
+    """Decorate a function whose first argument is the file that it reads: complete its errors (see `completed`).
+
+    Examples
+    --------
+    >>> @reads("give a table with a header")
+    ... def read_table(path):
+    ...     raise InputError("this is no table")
+    >>> try:
+    ...     read_table("gcps.csv")
+    ... except InputError as error:
+    ...     print(error)
+    gcps.csv: this is no table
+      Remedy: give a table with a header
+    """
 
     def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
         @functools.wraps(function)
@@ -137,7 +158,14 @@ def _rebuild(
 
 
 class InputError(OrthoError):
-    """The input is wrong. The message says what to do."""
+    """The input is wrong. The message says what to do.
+
+    Examples
+    --------
+    >>> print(InputError("the file has 2 columns", file="gcps.csv", remedy="give id, x, y and h"))
+    gcps.csv: the file has 2 columns
+      Remedy: give id, x, y and h
+    """
 
 
 class TooFewPoints(InputError):
@@ -149,11 +177,29 @@ class DegeneratePoints(InputError):
 
 
 class CrsError(InputError):
-    """A coordinate reference system, or a transformation between two, is missing or wrong."""
+    """A coordinate reference system, or a transformation between two, is missing or wrong.
+
+    Examples
+    --------
+    >>> try:
+    ...     parse_crs("EPSG:0")
+    ... except CrsError as error:
+    ...     print(error.message)
+    'EPSG:0' is not a coordinate system
+    """
 
 
 class DatumError(InputError):
-    """A height datum is unknown, contradictory, or its geoid grid is not installed."""
+    """A height datum is unknown, contradictory, or its geoid grid is not installed.
+
+    Examples
+    --------
+    >>> try:
+    ...     Vertical.parse("sea level")
+    ... except DatumError as error:
+    ...     print(error.message)
+    'sea level' is not a height datum
+    """
 
 
 class CoverageError(InputError):
@@ -161,7 +207,13 @@ class CoverageError(InputError):
 
 
 class ModelError(OrthoError):
-    """The computation failed although the input looked right."""
+    """The computation failed although the input looked right.
+
+    Examples
+    --------
+    >>> print(ModelError("the camera looks away from the ground", field="exterior"))
+    exterior: the camera looks away from the ground
+    """
 
 
 class NotConverged(ModelError):
@@ -169,7 +221,13 @@ class NotConverged(ModelError):
 
 
 class PluginError(OrthoError):
-    """A plugin broke the contract of `ortho_pipeline.plugin`."""
+    """A plugin broke the contract of `ortho_pipeline.plugin`.
+
+    Examples
+    --------
+    >>> print(PluginError("its sensor has no name", field="tinysat"))
+    tinysat: its sensor has no name
+    """
 
 
 class StorageError(OrthoError):

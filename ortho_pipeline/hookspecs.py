@@ -76,6 +76,11 @@ class Piece:
         not 1.
     scale : float
         Width of its pixels in pixels of the scene; not 1 if, for example, colours are coarser than panchromatic.
+
+    Examples
+    --------
+    >>> Piece("po_1_red.tif", scale=4.0).sees_apart  # without a model of its own
+    False
     """
 
     path: str | PathLike[str]
@@ -122,6 +127,14 @@ class Scene:
         Model families (`ortho models`) that do not suit this product, each with its warning.
     adjusted : mapping, optional
         The earlier adjustment of the model: the section ``adjustment`` of its model file.
+
+    Examples
+    --------
+    >>> scene = op.open_scene("sample_data/scene.tif")
+    >>> scene
+    <scene scene.tif: 1000 x 1000, sensor rpc, models rpc>
+    >>> scene.fit(op.read_points("sample_data/gcps.geojson"), "shift").param_names
+    ('col_shift', 'row_shift')
     """
 
     sensor: str
@@ -250,6 +263,11 @@ class Sensor:
     metadata_beside : callable(image) -> Path, optional
         Where an image has its metadata, if a product is one image and one file beside it (`Scene.model_source`). With a
         copy there, another image of the same pixels is such a product too (`ortho register` does this).
+
+    Examples
+    --------
+    >>> Sensor("tinysat", "TinySat level 1A scenes", lambda dataset: False, op.open_scene).fallback
+    False
     """
 
     name: str
@@ -283,6 +301,11 @@ class Format:
         Writes the model of an `ortho_pipeline.plugin.Export` to the new file `path`. Returns the largest distance
         between file and model in pixels. Raises `InputError` if the format cannot express the model. If it fails, the
         host removes the file.
+
+    Examples
+    --------
+    >>> Format("corners", "ground of the four corners", "_corners.json", lambda export, path: 0.0).ending
+    '_corners.json'
     """
 
     name: str
@@ -313,6 +336,11 @@ class Subcommand:
         Purpose and command line (``ortho coverage ...``) of each example at the end of the help.
     group : str
         Heading of ``ortho --help`` for this command.
+
+    Examples
+    --------
+    >>> Subcommand("coverage", "Show which part of IMAGE the DEM covers.", "ortho_coverage.command:coverage").group
+    'More commands'
     """
 
     name: str

@@ -24,8 +24,10 @@ PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("samp
 OPTIONS = doctest.NORMALIZE_WHITESPACE
 
 
-#: Tutorials are run by tests/test_tutorials.py.
-WITH_PYTHON = [page for page in PAGES if ">>> " in page.read_text() and page.parent.name != "tutorials"]
+#: Tutorials are run by tests/test_tutorials.py, docstrings (docs/reference) by tests/test_docstrings.py.
+WITH_PYTHON = [
+    page for page in PAGES if ">>> " in page.read_text() and page.parent.name not in ("tutorials", "reference")
+]
 
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.name)
@@ -165,6 +167,7 @@ def test_every_public_name_has_a_page_of_its_docstring(tmp_path):
                 r"^- `(\w+)`", page.partition("**Parameters**")[2].partition("**R")[0], re.MULTILINE
             )
             assert set(documented) <= set(inspect.signature(thing).parameters)
+    assert "\n**Examples**\n\n```python\n>>> notice = " in (tmp_path / "Notice.md").read_text()
 
 
 def test_changes_stand_by_version():

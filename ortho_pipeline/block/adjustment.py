@@ -90,6 +90,14 @@ def adjust(
     TooFewPoints, DegeneratePoints
         If parameters are not determined; the message names image and parameters.
     NotConverged
+
+    Examples
+    --------
+    >>> points = op.read_block_points("sample_data/cartosat/points.csv")
+    >>> models = {name: op.open_scene(f"sample_data/cartosat/{name}").model for name in points.images}
+    >>> shifts = {name: op.ImageCorrection.identity(model, "shift", (0, 0)) for name, model in models.items()}
+    >>> op.adjust(shifts, points).gauge
+    'the datum is that of 9 control points'
     """
     chosen = models_of(models, points)
     unknown = sorted(set(exclude) - set(points.ids))

@@ -49,6 +49,11 @@ def read_block_points(
     ------
     InputError, CrsError, DatumError
         Names file and line, and what to do: for statements of one point that contradict each other, too.
+
+    Examples
+    --------
+    >>> op.read_block_points("sample_data/cartosat/points.csv")
+    <69 points: 9 control, 60 check; 138 rays in 2 images; sample_data/cartosat/points.csv>
     """
     rays = read_block_table(path)
     shift = origin_shift(path, rays, pixel_origin)

@@ -72,6 +72,12 @@ class BlockPoints:
     groups : ndarray (M,) of int, optional
         As in `Points`: from 0 on where a measurement shares errors with those of neighbours in its image, else -1. None
         where none does.
+
+    Examples
+    --------
+    >>> points = op.read_block_points("sample_data/cartosat/points.csv")
+    >>> len(points), points.rays, len(points.in_image("BANDF.tif"))
+    (69, 138, 69)
     """
 
     ids: tuple[str, ...]

@@ -59,6 +59,11 @@ class Listing:
         Sorted.
     special : frozenset of str
         Those of them that are neither plain files nor folders: links, pipes, devices.
+
+    Examples
+    --------
+    >>> Listing(["SCENE.TIF", "scene_RPC.TXT", "dem.tif"]).beginning("scene")
+    ['SCENE.TIF', 'scene_RPC.TXT']
     """
 
     def __init__(self, names: Iterable[str], special: Iterable[str] = ()) -> None:
@@ -97,6 +102,11 @@ def listing(folder: AnyPath) -> Listing:
     ------
     OSError
         If it cannot be listed.
+
+    Examples
+    --------
+    >>> listing("sample_data").named("SCENE.TIF")
+    ['scene.tif']
     """
     if isinstance(folder, VsiPath):
         return Listing(one.name for one in folder.iterdir())

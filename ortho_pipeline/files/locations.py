@@ -473,6 +473,9 @@ def place(name: AnyPath) -> Any:
 
     Both know names, siblings and content by the methods of `pathlib.Path`: what is written for a folder on disk works
     in an archive as well. `files.read_bounded` reads either with a limit.
+
+    >>> place("/vsizip/order.zip/po_1_pan.tif").with_suffix(".txt").name
+    'po_1_pan.txt'
     """
     text = os.fspath(name)
     return VsiPath(text) if text.startswith("/vsi") else Path(text)

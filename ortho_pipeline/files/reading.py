@@ -32,6 +32,11 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
     ------
     InputError
         If it cannot be read, or is a pipe or a device, which may never end; with field and remedy as `told`.
+
+    Examples
+    --------
+    >>> read_bounded("sample_data/gcps.csv", 5)
+    b'#CRS: '
     """
     try:
         if isinstance(path, VsiPath):
@@ -51,7 +56,13 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
 
 
 def decoded(data: bytes) -> str:
-    """Return text that ought to be UTF-8 but may be Latin-1: what is read of it is ASCII, its names need not be."""
+    """Return text that ought to be UTF-8 but may be Latin-1: what is read of it is ASCII, its names need not be.
+
+    Examples
+    --------
+    >>> decoded("Büyüksalih".encode("latin-1"))
+    'Büyüksalih'
+    """
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -72,6 +83,11 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
     ------
     InputError
         Names the line, for what is not JSON in UTF-8, ``NaN``, ``Infinity`` and numbers beyond those of a computer.
+
+    Examples
+    --------
+    >>> parse_json('{"gain": 0.5}', "scene.json", "copy the file again")
+    {'gain': 0.5}
     """
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
@@ -93,7 +109,13 @@ def parse_json(data: str | bytes, file: object, remedy: str, *, unique: bool = F
 
 
 def read_json(path: str | os.PathLike[str], limit: int, remedy: str, *, unique: bool = False) -> Any:
-    """Return the JSON document in a file of at most `limit` bytes, as `parse_json` does."""
+    """Return the JSON document in a file of at most `limit` bytes, as `parse_json` does.
+
+    Examples
+    --------
+    >>> sorted(read_json("sample_data/truth.json", 1_000_000, "copy the file again"))
+    ['about', 'camera', 'noise', 'points', 'rpc', 'seeds', 'terrain']
+    """
     data = read_bounded(path, limit, remedy=remedy)
     if len(data) > limit:
         raise InputError(f"this file is larger than the limit of {limit // 1_000_000} MB", file=path, remedy=remedy)

@@ -418,7 +418,14 @@ def _unwritable(path: Path, error: OSError, remedy: str = _REMEDY) -> InputError
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write `text` as UTF-8 to `path`, whole or not at all."""
+    """Write `text` as UTF-8 to `path`, whole or not at all.
+
+    Examples
+    --------
+    >>> write_text(out / "corners.json", "[]")
+    >>> (out / "corners.json").read_text()
+    '[]'
+    """
     with whole_or_nothing(path, side_cars=False) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -37,6 +37,12 @@ class XmlFields:
     InputError
         If the file cannot be read, is too large or no well-formed XML; later for each field that is missing or no
         value.
+
+    Examples
+    --------
+    >>> write_text(out / "scene.xml", "<scene><gain>0.5 0.7</gain></scene>")
+    >>> XmlFields(out / "scene.xml").numbers("gain", 2)
+    [0.5, 0.7]
     """
 
     def __init__(

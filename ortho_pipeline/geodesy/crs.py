@@ -12,11 +12,9 @@ from __future__ import annotations
 
 import functools
 import json
-import logging
 import os
 import re
 import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,16 +23,15 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 from pyproj.exceptions import CRSError, ProjError
-from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
+from pyproj.transformer import Transformer
 
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
-from ortho_pipeline.geodesy.missing_grids import grid_of_message, grid_remedy, unavailable_grids
+from ortho_pipeline.geodesy.missing_grids import grid_of_message, grid_remedy, unavailable_grids, warn_of_better
 from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 #: Where systems keep PROJ's grids; wheels of pyproj look into none of these.
 SYSTEM_FOLDERS = ("/usr/share/proj", "/usr/local/share/proj", "/opt/homebrew/share/proj", f"{sys.prefix}/share/proj")
@@ -81,6 +78,11 @@ def parse_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     ------
     CrsError
         If it is not a coordinate system, or names a file by its path.
+
+    Examples
+    --------
+    >>> parse_crs("EPSG:32633").name
+    'WGS 84 / UTM zone 33N'
     """
     if isinstance(text, pyproj.CRS):
         return text
@@ -146,7 +148,11 @@ def utm_crs(lon: float, lat: float) -> pyproj.CRS:
 
 
 def same_crs(first: pyproj.CRS, second: pyproj.CRS) -> bool:
-    """Tell whether two systems are one, whatever the order of their axes (x is always first here)."""
+    """Tell whether two systems are one, whatever the order of their axes (x is always first here).
+
+    >>> same_crs(parse_crs("EPSG:4326"), parse_crs("OGC:CRS84"))
+    True
+    """
     return bool(first == second or first.equals(second, ignore_axis_order=True))
 
 
@@ -410,7 +416,7 @@ class GroundTransform:
         if arrived.any():
             self._checked = True
             if not self.target.is_geocentric and transformer.accuracy < 0:
-                _warn_of_better(transformer, self.source, self.target, after[arrived][0])
+                warn_of_better(transformer, self.source, self.target, after[arrived][0])
             return
         sample = before[finite][:1]
         try:
@@ -457,36 +463,14 @@ def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> Orth
     )
 
 
-def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, sample: Array) -> None:
-    """Log that a more exact transformation exists whose grid is not installed (``only_best`` lets some of them pass).
-
-    A negative accuracy of `used` says that PROJ chooses among several operations by position.
-    """
-    lon, lat = Transformer.from_crs(target.to_2d(), 4326, always_xy=True).transform(*sample[:2])
-    if not (abs(lon) <= 180 and abs(lat) <= 90):
-        return
-    area = AreaOfInterest(lon, lat, lon, lat)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)
-    if not group.best_available and group.unavailable_operations:
-        better = group.unavailable_operations[0]
-        grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
-        log.warning(
-            "%s -> %s: using a transformation accurate to %.1f m. A better one (%.1f m) needs the grid %s, "
-            "which is not installed",
-            source.name,
-            target.name,
-            used.get_last_used_operation().accuracy,
-            better.accuracy,
-            grid,
-        )
-
-
 #: By the texts that systems are made of: a CRS writes its WKT to be hashed.
 _made_once = functools.lru_cache(maxsize=64)(GroundTransform)
 
 
 def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
-    """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one."""
+    """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one.
+
+    >>> ground_transform("EPSG:4979", "EPSG:32633")(np.array([[15.0, 41.9, 150.0]])).round(1).tolist()
+    [[500000.0, 4638673.4, 150.0]]
+    """
     return _made_once(*(one if isinstance(one, str) else one.srs for one in (source, target)))

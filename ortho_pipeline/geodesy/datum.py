@@ -105,6 +105,6 @@ def dem_unit(text: str, declared: DeclaredVertical | None) -> float:
         raise DatumError(
             f"the units of the heights differ: {text!r} in the band, {axis:.6g} m in the CRS",
             field="unit",
-            remedy="correct one of them (gdal_edit.py -units m dem.tif, or assign another CRS)",
+            remedy="correct the unit of the band (`gdal_edit.py -units m FILE`), or assign another CRS",
         )
     return axis or stated or 1.0

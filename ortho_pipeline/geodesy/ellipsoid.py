@@ -19,7 +19,14 @@ EARTH_RATE = 7.292115e-5
 
 
 def geocentric(ground: Array) -> Array:
-    """Convert lon, lat (degrees), ellipsoidal height ``(N, 3)`` on WGS84 to ECEF metres ``(N, 3)``."""
+    """Convert lon, lat (degrees), ellipsoidal height ``(N, 3)`` on WGS84 to ECEF metres ``(N, 3)``.
+
+    Examples
+    --------
+    >>> geocentric(np.array([[0.0, 0.0, 100.0], [90.0, 0.0, 0.0]])).round(3) + 0.0
+    array([[6378237.,       0.,       0.],
+           [      0., 6378137.,       0.]])
+    """
     lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
     prime_vertical = SEMI_MAJOR / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
     level = (prime_vertical + ground[:, 2]) * np.cos(lat)
@@ -31,6 +38,11 @@ def geodetic(ecef: Array) -> Array:
     """Convert ECEF metres ``(N, 3)`` to lon, lat (degrees), ellipsoidal height ``(N, 3)``, to 1e-9 m.
 
     Bowring's formula, used three times: good from the sea floor to beyond satellites, poles included; NaN stays NaN.
+
+    Examples
+    --------
+    >>> geodetic(np.array([[0.0, 6378237.0, 0.0]])).round(3)
+    array([[ 90.,   0., 100.]])
     """
     x, y, z = ecef.T
     level = np.hypot(x, y)
@@ -47,7 +59,13 @@ def geodetic(ecef: Array) -> Array:
 
 
 def enu_from_ecef(ground: Array) -> Array:
-    """Return the east, north and up axes at lon, lat (degrees) in ECEF as rows of rotations ``(N, 3, 3)``."""
+    """Return the east, north and up axes at lon, lat (degrees) in ECEF as rows of rotations ``(N, 3, 3)``.
+
+    Examples
+    --------
+    >>> enu_from_ecef(np.array([[90.0, 0.0, 0.0]]))[0, 2].round(3)  # up, at 90 degrees east on the equator
+    array([0., 1., 0.])
+    """
     lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
     sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
     east = np.stack([-sin_lon, cos_lon, np.zeros_like(lon)], axis=1)
@@ -135,7 +153,13 @@ def rotation_of_angles(omega: float, phi: float, kappa: float) -> Array:
 
 
 def angles_of_rotation(matrix: Array) -> tuple[float, float, float]:
-    """Return omega, phi, kappa of a rotation ``(3, 3)`` from ground to camera axes; phi within 90 degrees."""
+    """Return omega, phi, kappa of a rotation ``(3, 3)`` from ground to camera axes; phi within 90 degrees.
+
+    Examples
+    --------
+    >>> angles_of_rotation(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))[2]  # kappa: a quarter turn
+    1.5707963267948966
+    """
     omega = np.arctan2(-matrix[2, 1], matrix[2, 2])
     phi = np.arctan2(matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
     kappa = np.arctan2(-matrix[1, 0], matrix[0, 0])
@@ -151,6 +175,11 @@ def orbital_from_ecef(position: Array, velocity: Array) -> Array:
     ----------
     position, velocity : (3,)
         In ECEF, metres and metres per second; the velocity is that relative to the turning Earth.
+
+    Examples
+    --------
+    >>> orbital_from_ecef(np.array([7e6, 0.0, 0.0]), np.array([0.0, 0.0, 7500.0]))[2] + 0.0  # down
+    array([-1.,  0.,  0.])
     """
     down = -position / np.linalg.norm(position)
     inertial = velocity + EARTH_RATE * np.array([-position[1], position[0], 0.0])

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import warnings
 from typing import Any
 
-from pyproj.transformer import TransformerGroup
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from pyproj.transformer import AreaOfInterest, Transformer, TransformerGroup
+
+log = logging.getLogger(__name__)
 
 
 def grid_of_message(message: str) -> str | None:
@@ -31,3 +37,29 @@ def unavailable_grids(source: Any, target: Any) -> list[str]:
     return [
         grid.short_name for operation in group.unavailable_operations for grid in operation.grids if not grid.available
     ]
+
+
+def warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, sample: NDArray[np.float64]) -> None:
+    """Log that a more exact transformation exists whose grid is not installed (``only_best`` lets some of them pass).
+
+    A negative accuracy of `used` says that PROJ chooses among several operations by position.
+    """
+    lon, lat = Transformer.from_crs(target.to_2d(), 4326, always_xy=True).transform(*sample[:2])
+    if not (abs(lon) <= 180 and abs(lat) <= 90):
+        return
+    area = AreaOfInterest(lon, lat, lon, lat)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)
+    if not group.best_available and group.unavailable_operations:
+        better = group.unavailable_operations[0]
+        grid = ", ".join(grid.short_name for grid in better.grids if not grid.available)
+        log.warning(
+            "%s -> %s: using a transformation accurate to %.1f m. A better one (%.1f m) needs the grid %s, "
+            "which is not installed",
+            source.name,
+            target.name,
+            used.get_last_used_operation().accuracy,
+            better.accuracy,
+            grid,
+        )

@@ -26,6 +26,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
+from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.opening.drivers import DRIVERS
@@ -55,6 +56,9 @@ def open_dataset(
     siblings: bool = True,
 ) -> gdal.Dataset:
     """Open a raster for reading.
+
+    >>> open_dataset("sample_data/scene.tif").RasterXSize
+    1000
 
     Parameters
     ----------
@@ -101,7 +105,7 @@ def open_pixels(
             file=block.path,
             field="block size",
             remedy=Text(
-                "tile it (gdal_translate -co TILED=YES in.tif out.tif), or for an image increase ",
+                f"tile it: `gdal_translate -co TILED=YES {converted(block.path, 'tiled')}`; or for an image increase ",
                 Setting("output.memory", "MB"),
             ),
         )
@@ -173,7 +177,7 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
         raise InputError(
             f"the header states {width} x {height} pixels in blocks of {block} bytes",
             file=name,
-            remedy="the file is damaged, or must be tiled first (gdal_translate -co TILED=YES in.tif out.tif)",
+            remedy=f"copy the file again, or tile it: `gdal_translate -co TILED=YES {converted(name, 'tiled')}`",
         )
 
 
@@ -204,8 +208,7 @@ class Grid:
 
     Examples
     --------
-    >>> import pyproj
-    >>> grid = Grid(pyproj.CRS(32636), 500_000.0, 4_100_000.0, 2.0, 2.0, 100, 50)
+    >>> grid = Grid(parse_crs("EPSG:32636"), 500_000.0, 4_100_000.0, 2.0, 2.0, 100, 50)
     >>> grid.extent
     (500000.0, 4099900.0, 500200.0, 4100000.0)
     """
@@ -294,7 +297,8 @@ class _RasterFile:
             raise InputError(
                 "this GDAL reads signed bytes wrongly, as 0 to 255",
                 file=self.path,
-                remedy="convert them to 16 bits (gdal_calc.py, or gdal_translate -ot Int16 with GDAL 3.7)",
+                remedy=f"convert them to 16 bits: `gdal_calc.py -A {typed(self.path)} --type=Int16 "
+                "--calc='A.astype(int8).astype(int16)' --outfile=int16.tif`",
             )
         self.dtype = np.result_type(*(numpy_type(band.DataType) for band in bands))
         self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)
@@ -390,6 +394,11 @@ class RasterSource:
     ------
     InputError
         If a file cannot be used, differs in size from the first, or has no such band.
+
+    Examples
+    --------
+    >>> RasterSource("sample_data/scene.tif").read(0, 0, 4, 2).shape
+    (1, 2, 4)
     """
 
     def __init__(

@@ -45,6 +45,13 @@ class Surface(abc.ABC):
         Value in a void: NaN for the first two, a height for the others.
     sigma : float, Surface or None
         Standard deviation (m) of the heights, or a surface that has one at each place. None if unknown.
+
+    Examples
+    --------
+    >>> dem = op.open_dem("sample_data/dem.tif")
+    >>> points = op.read_points("sample_data/gcps.csv")
+    >>> dem.heights(points.ground[:2, :2], points.crs).round(1).tolist()
+    [1027.8, 945.3]
     """
 
     fill: str | float

@@ -72,6 +72,12 @@ def open_dem(
     InputError, DatumError, CrsError
         If it cannot be opened, its height datum is unknown or contradicts `vertical`, a geoid grid is missing, or
         it has no usable georeference.
+
+    Examples
+    --------
+    >>> dem = op.open_dem("sample_data/dem.tif", fill="nearest")
+    >>> [round(height, 1) for height in dem.height_range]
+    [700.0, 1191.9]
     """
     access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)

@@ -16,6 +16,7 @@ from osgeo import gdal
 from pyproj.exceptions import CRSError
 
 from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.raster.source import first_line, open_pixels
@@ -25,6 +26,8 @@ from ortho_pipeline.surface.base import Array
 SANE_HEIGHTS = (-500.0, 9000.0)
 #: No DEM has samples that are nearer to each other (m); work along a ray is counted in samples.
 _FINEST = 1e-3
+#: Option of gdal_edit.py for a geotransform.
+_CORNERS = "-a_ullr WEST NORTH EAST SOUTH"
 
 Affine = tuple[float, float, float, float, float, float]
 
@@ -187,7 +190,7 @@ class DemFile:
                 f"this DEM has no {missing}",
                 file=self.path,
                 field=missing,
-                remedy="set it with gdal_edit.py -a_srs / -a_ullr",
+                remedy=self._set("-a_srs EPSG:CODE" if reference is None else _CORNERS),
             )
         crs, plane = self._crs(reference.ExportToWkt(["FORMAT=WKT2_2018"]))
         x, a, b, y, c, d = transform
@@ -196,14 +199,14 @@ class DemFile:
                 f"the geotransform {transform} of this DEM is degenerate",
                 file=self.path,
                 field="geotransform",
-                remedy="set it with gdal_edit.py -a_ullr",
+                remedy=self._set(_CORNERS),
             )
         if gdal.DataTypeIsComplex(dataset.GetRasterBand(1).DataType):
             raise InputError(
                 "the pixels of this DEM are complex numbers, not heights",
                 file=self.path,
                 field="band 1",
-                remedy="extract the real part with gdal_calc.py",
+                remedy=f"extract the real part: `gdal_translate -ot Float32 {converted(self.path, 'real')}`",
             )
         # GDAL counts from the corner of the first pixel; heights belong to the centres.
         centre = (x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d)
@@ -213,7 +216,7 @@ class DemFile:
                 f"the samples of this DEM would be {grid.sample_size:.1g} m apart",
                 file=self.path,
                 field="geotransform",
-                remedy="set the true one with gdal_edit.py -a_ullr",
+                remedy=self._set(_CORNERS),
             )
         return crs, grid
 
@@ -226,8 +229,12 @@ class DemFile:
                 f"the CRS of this DEM cannot be used ({getattr(error, 'message', error)})",
                 file=self.path,
                 field="CRS",
-                remedy="set a CRS with a known datum with gdal_edit.py -a_srs",
+                remedy=self._set("-a_srs EPSG:CODE"),
             ) from error
+
+    def _set(self, option: str) -> str:
+        """Return the remedy for a georeference that is missing or wrong."""
+        return f"set the right one: `gdal_edit.py {option} {typed(self.path)}`"
 
     def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
         """Return the heights ``(height, width)`` of a window inside the file in metres; NaN for voids."""

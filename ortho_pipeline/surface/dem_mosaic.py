@@ -23,8 +23,9 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.errors import CrsError, DatumError, InputError, completed
 from ortho_pipeline.files.locations import Location
+from ortho_pipeline.files.shell import typed_pattern
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.options.texts import counted
 from ortho_pipeline.surface.base import Array
@@ -40,7 +41,6 @@ _OFF_GRID, _SAME_STEP = 0.01, 1e-6
 _MOST_BETWEEN = 12
 #: Samples of an arc that says to be the whole circle.
 _CIRCLE = 360.0
-_WARP = "resample them to one grid (gdalwarp in1.tif in2.tif out.tif), or leave out the files that do not belong"
 
 
 class Samples(Protocol):
@@ -253,7 +253,10 @@ def open_mosaic(name: str, paths: Sequence[str], access: Mapping[str, Any]) -> D
     for one in samples:
         placed.append((one, *one.place(), one.unit))
         one.close()
-    return laid_out(name, placed)
+    # Gaps between the files are voids, not heights of 0.
+    warp = f"`gdalwarp -r bilinear -dstnodata -9999 {typed_pattern(name)} dem.tif`"
+    with completed(remedy=f"resample them to one grid: {warp}; or leave out the files that do not belong"):
+        return laid_out(name, placed)
 
 
 def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, str]]) -> DemMosaic:
@@ -267,7 +270,7 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
                 "DEM",
                 file=other.path,
                 field="height datum",
-                remedy="leave one of the two out, or bring them to one datum and unit (gdalwarp -t_srs)",
+                remedy="leave out one of the two: a DEM has one height datum and one unit",
             )
     layers: dict[float, list[tuple[Samples, SampleGrid]]] = {}
     for samples, _, own, _ in placed:
@@ -287,7 +290,6 @@ def _refuse_other_system(
             f"this file is in {its_crs.name!r}, but {first.path} is in {crs.name!r}",
             file=other.path,
             field="CRS",
-            remedy=_WARP,
         )
     (_, a, b, _, c, d), (_, own_a, own_b, _, own_c, own_d) = grid.crs_from_pixel, its_grid.crs_from_pixel
     if b or c or own_b or own_c or abs(own_d / d - 1) > 1e-6 or own_a * a < 0:
@@ -295,7 +297,6 @@ def _refuse_other_system(
             f"the rows of this file differ in direction or spacing from those of {first.path}",
             file=other.path,
             field="geotransform",
-            remedy=_WARP,
         )
 
 
@@ -335,7 +336,6 @@ def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) ->
         f"the columns of this file do not match those of {other.path}",
         file=one.path,
         field="geotransform",
-        remedy=_WARP,
     )
 
 
@@ -357,7 +357,7 @@ def _whole_grid(name: str, grids: Sequence[SampleGrid], between: int) -> SampleG
         columns = round(_CIRCLE / abs(dx))
     size = bottom * columns
     if not 0 < size <= 1e13:
-        raise CrsError(f"these files span {bottom} x {columns} samples", file=name, field="extent", remedy=_WARP)
+        raise CrsError(f"these files span {bottom} x {columns} samples", file=name, field="extent")
     return replace(grids[0], shape=(bottom, columns), crs_from_pixel=(x, dx, 0.0, y, 0.0, dy))
 
 
@@ -375,7 +375,6 @@ def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> 
                 "the samples of this file are not on the grid of the other files",
                 file=samples.path,
                 field="geotransform",
-                remedy=_WARP,
             )
         parts.append(Part(samples, round(column), round(row), grid.shape))
     circle = round(_CIRCLE / abs(step)) if whole.crs.is_geographic else 0

@@ -13,6 +13,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.json.records import Count, Record
+from ortho_pipeline.files.shell import converted
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
@@ -99,7 +100,7 @@ class WarpJob:
                 remedy=Text(
                     "use ",
                     Setting("output.resampling", "nearest"),
-                    ", or convert the pixels first (gdal_translate -ot Float64)",
+                    f", or convert the pixels: `gdal_translate -ot Float64 {converted(self.source.path, 'float')}`",
                 ),
             )
         if self.source.palette and self.resampling != "nearest":
@@ -110,7 +111,7 @@ class WarpJob:
                 remedy=Text(
                     "use ",
                     Setting("output.resampling", "nearest"),
-                    ", or expand the palette first (gdal_translate -expand rgb)",
+                    f", or expand the palette: `gdal_translate -expand rgb {converted(self.source.path, 'rgb')}`",
                 ),
             )
 

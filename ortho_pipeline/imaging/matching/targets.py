@@ -13,6 +13,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, InputError, completed
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options.texts import counted
@@ -150,7 +151,8 @@ class Reference:
                 f"the reference has no {missing}, so its position is unknown",
                 file=source.path,
                 field="reference",
-                remedy="give an orthoimage (GeoTIFF with its CRS), or set it with gdal_edit.py -a_srs and -a_ullr",
+                remedy="give an orthoimage (GeoTIFF with its CRS), or set its place: "
+                f"`gdal_edit.py -a_srs EPSG:CODE -a_ullr WEST NORTH EAST SOUTH {typed(source.path)}`",
             )
         forward = np.array([[transform[1], transform[2]], [transform[4], transform[5]]])
         with np.errstate(all="ignore"):

@@ -24,6 +24,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, place, within
+from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.opening.drivers import (
@@ -35,7 +36,7 @@ from ortho_pipeline.raster.opening.drivers import (
     remove_network_drivers,
     require_driver,
 )
-from ortho_pipeline.raster.opening.references import NAMES_OF, PLAIN_VRT, Named, crs_texts, products_of_volume
+from ortho_pipeline.raster.opening.references import NAMES_OF, Named, crs_texts, products_of_volume, to_one_file
 from ortho_pipeline.stores.beside import ask_beside
 
 gdal.UseExceptions()
@@ -48,7 +49,6 @@ _CRS_SIDE_CARS = (".aux.xml", ".prj", ".hdr")
 _TEXT_SIDE_CAR = re.compile(r"\.(rpb|imd|eph|att|geo|tab|wld|\w{1,3}w)|[_.]?rpc\.(txt|xml)|_metadata\.txt")
 _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
-_OUTSIDE = ", put the files into one folder, or convert them to one file (gdal_translate in out.tif)"
 
 
 def open_seen(
@@ -146,7 +146,7 @@ class _Gate:
             return
         self._seen.add(key)
         if len(self._seen) > _MANY:
-            raise InputError(f"this raster refers to more than {_MANY} files", file=by, remedy=PLAIN_VRT)
+            raise InputError(f"this raster refers to more than {_MANY} files", file=by, remedy=to_one_file(by))
         name = str(path)
         self._see_texts_beside(path)
         kind = identified(name, DRIVERS)
@@ -157,7 +157,7 @@ class _Gate:
                 f"({first or kind or 'with another driver'})",
                 file=by,
                 field=field,
-                remedy="remove it, or convert it to GeoTIFF (gdal_translate in out.tif)",
+                remedy=f"remove it, or convert it to GeoTIFF: `gdal_translate {converted(path, 'copy')}`",
             )
         if kind in REFERRING:
             self._see_named(path, kind, chain | {key})
@@ -249,7 +249,7 @@ class _Gate:
                         f"the sidecar file {other!r} is not a plain raster",
                         file=path,
                         field=other,
-                        remedy="remove it; gdaladdo makes new overviews",
+                        remedy=f"remove it, and make new overviews: `gdaladdo -ro {typed(path)}`",
                     )
                 # Overviews of an HFA file in .rrd are read by that driver alone, and are not rasters of their own.
                 if rest != ".rrd":
@@ -314,7 +314,12 @@ class _Gate:
             f"this file refers to {name[:200]!r}, which is outside its own folder",
             file=by,
             field=field,
-            remedy=Text("allow a folder that contains both with ", Setting("scene.roots", root), _OUTSIDE),
+            remedy=Text(
+                "allow a folder that contains both with ",
+                Setting("scene.roots", root),
+                ", put the files into one folder, or ",
+                to_one_file(by),
+            ),
         )
 
     # -- what GDAL tells ---------------------------------------------------------------------------------------------
@@ -334,7 +339,7 @@ class _Gate:
                 "the geotransform of this raster is not finite",
                 file=path,
                 field="geotransform",
-                remedy="set the right one with gdal_edit.py -a_ullr",
+                remedy=f"set the right one: `gdal_edit.py -a_ullr WEST NORTH EAST SOUTH {typed(path)}`",
             )
         kind = dataset.GetDriver().ShortName
         for name in _listed(dataset):

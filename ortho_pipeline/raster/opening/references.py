@@ -5,6 +5,7 @@ They are read without opening what they name.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import VsiPath
+from ortho_pipeline.files.shell import converted
 
 #: Headers beyond this are not read.
 _MAX_HEADER = 5_000_000
@@ -49,7 +51,11 @@ _VRT_TEXTS = frozenset(
 #: What holds the text of a coordinate system in VRTs, side-cars of GDAL and of Esri, and DIMAP, in lower case.
 _CRS_NAMES = frozenset({"srs", "projection", "wkt", "horizontal_cs_code", "horizontal_cs_name"})
 _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
-PLAIN_VRT = "convert it to a file first (gdal_translate in.vrt out.tif)"
+
+
+def to_one_file(path: str | os.PathLike[str]) -> str:
+    """Return the remedy for a raster whose files cannot be told from its header."""
+    return f"convert it to one file: `gdal_translate {converted(path, 'copy')}`"
 
 
 @dataclass(frozen=True)
@@ -67,9 +73,7 @@ def _header(path: Any, limit: int = _MAX_HEADER) -> str:
     if not path.is_file():
         raise InputError("this is not a file", file=path, remedy="put a file there, or remove it")
     if path.stat().st_size > limit:
-        raise InputError(
-            "the header is larger than 5 MB", file=path, remedy="convert it to one file (gdal_translate in out.tif)"
-        )
+        raise InputError("the header is larger than 5 MB", file=path, remedy=to_one_file(path))
     data = path.read_bytes().partition(b"\0")[0]
     try:
         return data.decode("utf-8")
@@ -117,7 +121,7 @@ def _names_of_vrt(path: Any) -> Iterator[Named]:
                     f"only plain VRTs are opened; {child[1]} {' '.join(values)[:40]} is not allowed",
                     file=path,
                     field=child[1][:80],
-                    remedy=PLAIN_VRT,
+                    remedy=to_one_file(path),
                 )
             if name == "sourcefilename":
                 yield _source(child, path, band)
@@ -131,7 +135,7 @@ def _source(node: Any, path: Any, band: str) -> Named:
     relative = [text.strip() for name, one in _parts(node) if name == "relativetovrt" for text in _value(one)]
     if len(texts) != 1 or len(relative) > 1 or not set(relative) <= {"0", "1"}:
         raise InputError(
-            "a source of this VRT has no plain file name", file=path, field="SourceFilename", remedy=PLAIN_VRT
+            "a source of this VRT has no plain file name", file=path, field="SourceFilename", remedy=to_one_file(path)
         )
     return Named(texts[0], "SourceFilename", relative=relative == ["1"], raw=band == "raw")
 
@@ -207,7 +211,7 @@ def _names_of_ers(path: Any) -> Iterator[Named]:
                 "DataFile has no plain value",
                 file=path,
                 field="DataFile",
-                remedy="make one file of it (gdal_translate)",
+                remedy=to_one_file(path),
             )
         yield Named(named[1].strip('"'), "DataFile", raw=raw)
     yield Named(Path(path.name).stem, "DataFile", raw=raw)
@@ -218,17 +222,13 @@ def _names_of_isis3(path: Any) -> Iterator[Named]:
     data = _beginning(path, _MAX_HEADER)
     end = re.search(rb"\r?\n(END|End)\r?\n", data + (b"\n" if len(data) < _MAX_HEADER else b""))
     if end is None and len(data) >= _MAX_HEADER:
-        raise InputError(
-            "the label is larger than 5 MB", file=path, remedy="convert it to GeoTIFF (gdal_translate in out.tif)"
-        )
+        raise InputError("the label is larger than 5 MB", file=path, remedy=to_one_file(path))
     text = data.decode("latin-1")
     raw = "geotiff" not in text.lower()
     for match in re.finditer(r"\^core", text, re.IGNORECASE):
         named = re.compile(r"""\s*=\s*("[^"'\r\n]*"|(?!/\*)[^"'\s(#]+)\s""").match(text + "\n", match.end())
         if named is None:
-            raise InputError(
-                "^Core has no plain value", file=path, field="^Core", remedy="convert it to GeoTIFF (gdal_translate)"
-            )
+            raise InputError("^Core has no plain value", file=path, field="^Core", remedy=to_one_file(path))
         yield Named(named[1].strip('"'), "^Core", raw=raw)
 
 
@@ -248,7 +248,7 @@ def _names_of_pcidsk(path: Any) -> Iterator[Named]:
             "the channels of this PCIDSK file are in other files",
             file=path,
             field="IHi.2",
-            remedy="convert it to one file (gdal_translate in.pix out.tif)",
+            remedy=to_one_file(path),
         )
     yield from ()
 

@@ -29,7 +29,10 @@ _MOST_ITEMS = 10_000
 #: Two items that share more than this part of the smaller one show the same ground; neighbours share rims.
 _SAME_GROUND = 0.5
 _SHOWN = 6
-_CHOOSE = "give a FeatureCollection file of the items that belong together, or resample them to one grid (gdalwarp)"
+_CHOOSE = (
+    "give a FeatureCollection file of the items that belong together, or resample them to one grid: "
+    "`gdalwarp -r bilinear -dstnodata -9999 FILES dem.tif`"
+)
 Placed = tuple[Samples, pyproj.CRS, SampleGrid, str]
 
 
