@@ -188,9 +188,9 @@ class Vertical:
             return _vertical_of_code(plain.upper())
         if Path(plain).suffix.lower() in _GRID_SUFFIXES:
             path = Path(plain)
-            found = cls(str(path.resolve()) if path.exists() else plain)
-            vertical_transformer(found.name)
-            return found
+            grid = cls(str(path.resolve()) if path.exists() else plain)
+            vertical_transformer(grid.name)
+            return grid
         raise DatumError(f"{plain!r} is not a height datum", field="vertical", remedy=f"give {VERTICAL_FORMS}")
 
     @classmethod
@@ -252,8 +252,8 @@ class Vertical:
         refuse_absurd(shift, self.name)
         if not self.name.startswith("EPSG:"):
             refuse_unread(transformer, lon, lat, shift, self.name)
-        asked = np.isfinite(lon) & np.isfinite(lat)
-        if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
+        known = np.isfinite(lon) & np.isfinite(lat)
+        if known.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
             # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.
             missing = unavailable_grids(_compound(self.name), "EPSG:4979")
             if missing:
@@ -489,4 +489,4 @@ _made_once = functools.lru_cache(maxsize=64)(GroundTransform)
 
 def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
     """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one."""
-    return _made_once(*(one if isinstance(one, str) else one.srs for one in (source, target)))
+    return _made_once(*(crs if isinstance(crs, str) else crs.srs for crs in (source, target)))

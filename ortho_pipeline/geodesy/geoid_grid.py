@@ -111,13 +111,13 @@ def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, sh
         If it is so at one of a few positions without a height, which are tried.
     """
     lost = np.flatnonzero(np.isnan(shift) & np.isfinite(lon) & np.isfinite(lat))
-    for one in lost[:: max(1, len(lost) // _TRIED)]:
+    for k in lost[:: max(1, len(lost) // _TRIED)]:
         try:
-            transformer.transform(lon.flat[one], lat.flat[one], 0.0, errcheck=True)
+            transformer.transform(lon.flat[k], lat.flat[k], 0.0, errcheck=True)
         except ProjError:
             continue
         raise DatumError(
-            f"the geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, although the grid covers it",
+            f"the geoid grid cannot be read at {lon.flat[k]:.6g} {lat.flat[k]:.6g}, although the grid covers it",
             file=file,
             field="vertical",
             remedy="the file is cut off or damaged: copy it again",

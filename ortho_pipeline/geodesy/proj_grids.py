@@ -42,8 +42,8 @@ def grids() -> list[dict[str, Any]]:
         row: dict[str, Any] = {"datum": name, "crs": code, "found": True, "grid": None, "path": None}
         try:
             definition = vertical_transformer(code).definition
-            found = re.search(r"grids=(\S+)", definition)
-            row["grid"] = found.group(1) if found else None
+            match = re.search(r"grids=(\S+)", definition)
+            row["grid"] = match.group(1) if match else None
         except DatumError as error:
             grid = re.search(r"geoid grid (\S+),", error.message)
             row.update(found=False, grid=grid.group(1) if grid else None, remedy=error.remedy)
@@ -90,7 +90,7 @@ def fetch_grid(name: str) -> Path:
     store = Objects(get_proj_endpoint(), allow_network=True)
     try:
         listed = parse_json(store.read(_LIST, _LIST_BYTES)[0], store.of(_LIST), "try again later")
-        facts = next(one["properties"] for one in listed["features"] if one["properties"]["name"] == name)
+        facts = next(feature["properties"] for feature in listed["features"] if feature["properties"]["name"] == name)
         digest = str(facts["sha256sum"])
     except FileNotFoundError as error:
         raise StorageError(
@@ -124,5 +124,5 @@ def _fetch(store: Objects, path: Path, digest: str) -> None:
 
 def fetch_missing() -> list[dict[str, Any]]:
     """Fetch the grids of the common height datums that are not there; return the name and the path of each."""
-    wanted = [row["grid"] for row in grids() if not row["found"] and row["grid"]]
-    return [{"grid": name, "path": str(fetch_grid(name))} for name in wanted]
+    missing = [row["grid"] for row in grids() if not row["found"] and row["grid"]]
+    return [{"grid": name, "path": str(fetch_grid(name))} for name in missing]

@@ -65,13 +65,13 @@ class Intensity:
         if len(known) < 2:
             return (int(known[0]) + 1 if len(known) else 1,)
         samples = list(itertools.islice(self._samples(), _WINDOWS))
-        found = contents(np.stack(samples, axis=1)[known]) if samples else np.zeros(len(known))
-        if not found.any():
+        content = contents(np.stack(samples, axis=1)[known]) if samples else np.zeros(len(known))
+        if not content.any():
             # A raster of one value, or none where it was looked at: bands from its whole spectrum.
             spread = np.linspace(0, len(known) - 1, min(most, len(known)))
             return tuple((known[np.round(spread).astype(int)] + 1).tolist())
-        best = np.argsort(-found, kind="stable")[:most]
-        return tuple(sorted((known[best[found[best] >= _WORTH * found.max()]] + 1).tolist()))
+        best = np.argsort(-content, kind="stable")[:most]
+        return tuple(sorted((known[best[content[best] >= _WORTH * content.max()]] + 1).tolist()))
 
     @cached_property
     def enlarged(self) -> bool:
@@ -89,11 +89,11 @@ class Intensity:
             left, top = int(across * (self.width - width + 1)), int(down * (self.height - height + 1))
             pixels = self.source.read(left, top, width, height)
             valid = self.source.read_valid(left, top, pixels)
-            found = pixels.astype(np.float32)
+            values = pixels.astype(np.float32)
             if valid is not None:
-                found[~valid] = np.nan
-            if np.isfinite(found).mean(axis=(1, 2)).max() > 0.5:
-                yield found
+                values[~valid] = np.nan
+            if np.isfinite(values).mean(axis=(1, 2)).max() > 0.5:
+                yield values
 
     def read(self, left: int, top: int, width: int, height: int, factor: int = 1) -> NDArray[np.float32]:
         """Return intensities ``(height, width)`` of means of `factor` x `factor` pixels; NaN where not valid.
@@ -169,7 +169,7 @@ def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
     range. Classes and what was enlarged have few. Noise has many, and is not correlated with its neighbour; so the bits
     are multiplied by that correlation.
     """
-    found = np.zeros(len(bands))
+    content = np.zeros(len(bands))
     full = np.isfinite(bands).mean(axis=(1, 2, 3))
     for number in np.flatnonzero((full > 0) & (full >= _FULL * full.max())).tolist():
         band = bands[number]
@@ -183,8 +183,8 @@ def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
         for step in steps:
             counts = np.unique(np.rint(step), return_counts=True)[1] / max(len(step), 1)
             alike = 1.0 - float((step**2).mean()) / (2 * variance) if len(step) and variance > 0 else 0.0
-            found[number] += max(alike, 0.0) * float(-(counts * np.log2(counts)).sum()) / len(steps)
-    return found
+            content[number] += max(alike, 0.0) * float(-(counts * np.log2(counts)).sum()) / len(steps)
+    return content
 
 
 def enlarged(windows: NDArray[np.float32]) -> bool:

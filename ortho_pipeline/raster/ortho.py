@@ -287,8 +287,8 @@ class RasterWriter:
         code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
         with gdal_errors(self.path), contextlib.ExitStack() as failed:
             driver, where = ("MEM", "") if path is None else ("GTiff", str(path))
-            given = [] if path is None else [f"{k}={v}" for k, v in options.items()]
-            dataset = gdal.GetDriverByName(driver).Create(where, grid.width, grid.height, profile.count, code, given)
+            creation = [] if path is None else [f"{k}={v}" for k, v in options.items()]
+            dataset = gdal.GetDriverByName(driver).Create(where, grid.width, grid.height, profile.count, code, creation)
             failed.callback(abandon, dataset)
             dataset.SetProjection(grid.crs.to_wkt())
             dataset.SetGeoTransform(grid.geotransform)

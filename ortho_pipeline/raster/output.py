@@ -156,16 +156,16 @@ def check_written(
     InputError
         If it was not written whole.
     """
-    told: dict[str, Any] = {"file": path, "remedy": "check the free disk space"}
+    context: dict[str, Any] = {"file": path, "remedy": "check the free disk space"}
     try:
         dataset = gdal.OpenEx(os.fspath(written), gdal.OF_RASTER, allowed_drivers=["GTiff"], sibling_files=[])
         if size is not None and (dataset.RasterXSize, dataset.RasterYSize) != size:
-            raise InputError("the output was not written whole", **told)
+            raise InputError("the output was not written whole", **context)
         end = written.stat().st_size
         for band in _images(dataset):
             blocks = _blocks(band)
             if any(offset + count > end or not (count or sparse) for offset, count, _, _ in blocks):
-                raise InputError("the output was not written whole", **told)
+                raise InputError("the output was not written whole", **context)
             # The last in the file, and some from everywhere.
             sample = {max(blocks), *blocks[:: max(1, len(blocks) // _SAMPLES)]}
             width, height = band.GetBlockSize()
@@ -174,7 +174,7 @@ def check_written(
                     left, top = column * width, row * height
                     band.ReadRaster(left, top, min(width, band.XSize - left), min(height, band.YSize - top))
     except RuntimeError as error:
-        raise InputError(f"the output cannot be read back ({first_line(error)})", **told) from error
+        raise InputError(f"the output cannot be read back ({first_line(error)})", **context) from error
 
 
 # -- whole files ------------------------------------------------------------------------------------------------------
@@ -199,12 +199,12 @@ def require_whole(path: str | os.PathLike[str], **access: Any) -> None:
         dataset = open_dataset(path, **access)
     except InputError:
         return
-    told: dict[str, Any] = {"file": path, "remedy": "copy or download it again"}
+    context: dict[str, Any] = {"file": path, "remedy": "copy or download it again"}
     if dataset.GetDriver().ShortName == "GTiff":
         end = os.path.getsize(path)
         for band in _images(dataset):
             if any(offset + count > end for offset, count, _, _ in _blocks(band)):
-                raise InputError("the file is truncated: it ends before its pixels do", **told)
+                raise InputError("the file is truncated: it ends before its pixels do", **context)
         return
     band = dataset.GetRasterBand(dataset.RasterCount)
     width, height = band.GetBlockSize()
@@ -213,7 +213,7 @@ def require_whole(path: str | os.PathLike[str], **access: Any) -> None:
         band.ReadRaster(left, top, band.XSize - left, band.YSize - top)
     except RuntimeError as error:
         raise InputError(
-            f"the file is damaged: its last pixels cannot be read ({first_line(error)})", **told
+            f"the file is damaged: its last pixels cannot be read ({first_line(error)})", **context
         ) from error
 
 
@@ -233,13 +233,13 @@ def _images(dataset: gdal.Dataset) -> Iterator[gdal.Band]:
 def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
     """Return offset and count of bytes, column and row of each block; an absent one has 0 bytes at 0."""
     width, height = band.GetBlockSize()
-    found = []
+    blocks = []
     for row in range(math.ceil(band.YSize / height)):
         for column in range(math.ceil(band.XSize / width)):
             place = f"{column}_{row}"
             offset, count = (band.GetMetadataItem(f"BLOCK_{what}_{place}", "TIFF") for what in ("OFFSET", "SIZE"))
-            found.append((int(offset or 0), int(count or 0), column, row))
-    return found
+            blocks.append((int(offset or 0), int(count or 0), column, row))
+    return blocks
 
 
 # -- creation options --------------------------------------------------------------------------------------------------
@@ -260,11 +260,11 @@ _LAYOUT = frozenset(
 _PLAIN_VALUE = re.compile(r"[\w.,+-]{1,80}")
 
 
-def checked_options(driver: str, given: dict[str, str], threads: int, side: int = 512) -> dict[str, str]:
+def checked_options(driver: str, chosen: dict[str, str], threads: int, side: int = 512) -> dict[str, str]:
     """Return lossless defaults, a `side` of blocks, under what the user gave; what no driver knows is an error."""
-    given = {key.upper(): value for key, value in given.items()}
+    chosen = {key.upper(): value for key, value in chosen.items()}
     known = _known_options(driver)
-    for key, value in given.items():
+    for key, value in chosen.items():
         if key not in known:
             meant = difflib.get_close_matches(key, known, 1)
             raise InputError(
@@ -293,14 +293,14 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
     defaults = {"BIGTIFF": "IF_SAFER"}
     if driver == "GTiff":
         defaults |= {"TILED": "YES", "BLOCKXSIZE": str(side), "BLOCKYSIZE": str(side)}
-        if given.get("TILED", "YES").upper() == "NO":
+        if chosen.get("TILED", "YES").upper() == "NO":
             defaults = {"BIGTIFF": "IF_SAFER"}
     else:
         defaults |= {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6", "NUM_THREADS": str(max(1, threads))}
-        if given.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
+        if chosen.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
             defaults.pop("PREDICTOR")
             defaults.pop("LEVEL")
-    return defaults | given
+    return defaults | chosen
 
 
 def _known_options(driver: str) -> dict[str, Any]:

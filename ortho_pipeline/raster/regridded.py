@@ -88,10 +88,10 @@ class Regridded:
     def require(self, profile: Profile) -> None:
         """Raise an `InputError` unless it has the bands and the type of an ortho of this profile."""
         own = f"{counted(self._source.count, 'band')} of {self._source.dtype}"
-        wanted = f"{counted(profile.count, 'band')} of {profile.dtype}"
-        if own != wanted:
+        needed = f"{counted(profile.count, 'band')} of {profile.dtype}"
+        if own != needed:
             raise InputError(
-                f"this ortho has {own}, but {wanted} is needed to fill gaps",
+                f"this ortho has {own}, but {needed} is needed to fill gaps",
                 file=self.path,
                 remedy=Text(
                     "make it with the same bands and type (",
@@ -122,13 +122,13 @@ class Regridded:
     def _resampled(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         count = self._source.count
         try:
-            found = self._warped.ReadAsArray(left, top, width, height)
+            stack = self._warped.ReadAsArray(left, top, width, height)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
             ) from error
-        pixels = found[:count]
-        valid = np.broadcast_to(found[-1] >= _ENOUGH, pixels.shape).copy()
+        pixels = stack[:count]
+        valid = np.broadcast_to(stack[-1] >= _ENOUGH, pixels.shape).copy()
         if pixels.dtype.kind == "f":
             valid &= ~np.isnan(pixels)
         return pixels, valid

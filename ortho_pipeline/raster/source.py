@@ -147,9 +147,9 @@ def _refuse_pipes(path: Path) -> None:
     """Raise an `InputError` if metadata or a sidecar of an image is a pipe or a device: GDAL would wait for ever."""
     folder = path if path.is_dir() else path.parent
     with contextlib.suppress(OSError):
-        found = listing(folder)
-        related = {name for name in found.special if path.stem in name}
-        related |= found.special.intersection(found.matching(_SIDE_CARS))
+        files = listing(folder)
+        related = {name for name in files.special if path.stem in name}
+        related |= files.special.intersection(files.matching(_SIDE_CARS))
         for name in related - {path.name}:
             kind = 0
             with contextlib.suppress(OSError):  # a link that leads nowhere: there is nothing to read
@@ -179,8 +179,8 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
 
 def _in_archive(name: str) -> str:
     archive = Location(name).archive if name.startswith("/vsi") else Path(name)
-    found = members(archive) if archive is not None else []
-    return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
+    names = members(archive) if archive is not None else []
+    return f"name the image in it: {', '.join(names)}" if names else "name the image in it: /vsizip/FILE.zip/IMAGE"
 
 
 def first_line(error: BaseException, of: object = "") -> str:
@@ -325,8 +325,8 @@ class _RasterFile:
 
     def read(self, left: int, top: int, out: NDArray[Any]) -> None:
         """Fill `out` ``(count, height, width)`` with a window that lies inside the raster."""
-        given = {"buf_obj": out, "band_list": list(self.numbers)}
-        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], **given)
+        arguments = {"buf_obj": out, "band_list": list(self.numbers)}
+        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], **arguments)
 
     def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
         """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""

@@ -73,8 +73,8 @@ def ask_beside(*paths: AnyPath | None, allow_network: bool = False) -> None:
     InputError
         If the network is not allowed.
     """
-    given = (path for path in paths if path is not None and Location(path).is_far)
-    far = {os.fspath(located(path, allow_network=allow_network)) for path in given}
+    far_paths = (path for path in paths if path is not None and Location(path).is_far)
+    far = {os.fspath(located(path, allow_network=allow_network)) for path in far_paths}
     new = [VsiPath(name) for name in sorted(far - _known)]
     if not new:
         return

@@ -64,16 +64,16 @@ def folder() -> Path:
     InputError
         If there is none, or its path is relative: it would be a folder in the working folder.
     """
-    given = os.environ.get(FOLDER)
-    found = Path(given) if given else cache_folder()
-    if found is None or not found.is_absolute():
-        wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
+    text = os.environ.get(FOLDER)
+    path = Path(text) if text else cache_folder()
+    if path is None or not path.is_absolute():
+        wrong = f"{FOLDER} has a relative path" if text else "there is no home folder"
         raise InputError(
             f"downloaded files cannot be cached ({wrong})",
             field=FOLDER,
             remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
         )
-    return found
+    return path
 
 
 def kept(
@@ -118,9 +118,9 @@ def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Cal
 def records() -> Iterator[CachedFile]:
     """Yield what is kept, by name."""
     for path in sorted(folder().glob(f"*/[!.]*{_RECORD}")):
-        found = _read(path)
-        if found is not None:
-            yield found
+        record = _read(path)
+        if record is not None:
+            yield record
 
 
 def clear() -> tuple[int, int]:
@@ -151,8 +151,8 @@ def _agrees(path: Path, address: str) -> bool:
 def _read(path: Path) -> CachedFile | None:
     """Return the record of a kept file; None where it is none, so that the file is fetched again."""
     try:
-        given = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
-        record = CachedFile(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
+        fields = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
+        record = CachedFile(path.with_name(path.name.removesuffix(_RECORD)), **{name: fields[name] for name in _FIELDS})
     except (InputError, KeyError, TypeError):
         return None
     kinds = all(type(getattr(record, name)) in kinds for name, kinds in _FIELDS.items())

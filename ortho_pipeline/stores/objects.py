@@ -151,8 +151,8 @@ class Objects:
         """Yield names and sizes of the objects whose names begin so; a plain web server lists none."""
         with self._errors(prefix):
             for chunk in self._store.list(prefix or None):
-                for one in chunk:
-                    yield one["path"], one["size"]
+                for item in chunk:
+                    yield item["path"], item["size"]
 
     def stated(self, name: str) -> tuple[int, str]:
         """Return the size of an object and the tag that its store gives this version (empty if it gives none).
@@ -211,9 +211,9 @@ class Objects:
             return self._put_if(name, data, content, "create" if new else {self._version: replacing})
         for _ in range(_ATTEMPTS):
             with self._errors(name):
-                made = self._store.put(name, data, attributes=self._note(content), chunk_size=PART, max_concurrency=4)
-                if self._encrypted or (made["e_tag"] or "").strip('"') in content.tags:
-                    return replace(content, version=made[self._version], tag=made["e_tag"] or "")
+                result = self._store.put(name, data, attributes=self._note(content), chunk_size=PART, max_concurrency=4)
+                if self._encrypted or (result["e_tag"] or "").strip('"') in content.tags:
+                    return replace(content, version=result[self._version], tag=result["e_tag"] or "")
                 stored = self._store.head(name)
             wrong = _difference(content, stored, ours=True)
             if not wrong and _TAG.fullmatch(stored["e_tag"] or "") is None:
@@ -241,10 +241,10 @@ class Objects:
             wrong, failed = "", None
             try:
                 with self._errors(name):
-                    made = self._store.put(name, data, attributes=self._note(content), mode=mode, use_multipart=False)
-                stated = {"size": content.size, "e_tag": made["e_tag"]}
+                    result = self._store.put(name, data, attributes=self._note(content), mode=mode, use_multipart=False)
+                stated = {"size": content.size, "e_tag": result["e_tag"]}
                 if self._encrypted or not (wrong := _difference(content, stated, ours=True)):
-                    return replace(content, version=made[self._version])
+                    return replace(content, version=result[self._version])
             except StorageError as error:
                 failed = error
             with contextlib.suppress(FileNotFoundError):
@@ -376,9 +376,9 @@ def _noted_difference(content: Content, stated: Mapping[str, Any], attributes: M
 
 
 def _status(error: Exception) -> str:
-    found = re.search(r"status code: (\d{3})", str(error))
-    if found:
-        return f"HTTP status {found[1]}"
+    match = re.search(r"status code: (\d{3})", str(error))
+    if match:
+        return f"HTTP status {match[1]}"
     return "cannot connect" if "connect" in str(error) else "the connection failed"
 
 
@@ -389,25 +389,25 @@ def _store_of(address: str) -> Any:
     scheme = address.partition("://")[0]
     if scheme == "http" or os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes"):
         options["allow_http"] = True
-    given = _SETTINGS[scheme]() if scheme in _SETTINGS else {}
-    if given.get("endpoint", given.get("base_url", "")).startswith("http://"):
+    settings = _SETTINGS[scheme]() if scheme in _SETTINGS else {}
+    if settings.get("endpoint", settings.get("base_url", "")).startswith("http://"):
         options["allow_http"] = True
     make: Any = store.from_url  # one signature for each kind of store
-    return make(address, client_options=options, retry_config=RETRIES, **given)
+    return make(address, client_options=options, retry_config=RETRIES, **settings)
 
 
 def _s3_settings() -> dict[str, Any]:
     """Return what the names of GDAL and of Amazon's clients say and `obstore` does not read itself."""
-    given: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_S3_ENDPOINT")
     if endpoint:
         plain = os.environ.get("AWS_HTTPS", "YES").upper() in ("NO", "FALSE", "0")
-        given["endpoint"] = endpoint if "://" in endpoint else f"http{'' if plain else 's'}://{endpoint}"
+        settings["endpoint"] = endpoint if "://" in endpoint else f"http{'' if plain else 's'}://{endpoint}"
     if _key_management():
-        given["checksum_algorithm"] = "SHA256"
+        settings["checksum_algorithm"] = "SHA256"
     if os.environ.get("AWS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
-        given["skip_signature"] = True
-    return given
+        settings["skip_signature"] = True
+    return settings
 
 
 def _azure_settings() -> dict[str, Any]:
@@ -424,13 +424,13 @@ def _azure_settings() -> dict[str, Any]:
 
 def _google_settings() -> dict[str, Any]:
     """Return what the names of GDAL say and `obstore` does not read itself."""
-    given: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     endpoint = os.environ.get("CPL_GS_ENDPOINT")
     if endpoint:
-        given["base_url"] = endpoint.rstrip("/")
+        settings["base_url"] = endpoint.rstrip("/")
     if os.environ.get("GS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
-        given["skip_signature"] = True
-    return given
+        settings["skip_signature"] = True
+    return settings
 
 
 #: Settings of the clients of stores, by scheme.

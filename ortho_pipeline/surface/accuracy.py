@@ -100,11 +100,11 @@ class DemAccuracy:
     def by_slope(self) -> list[tuple[float, float | None, HeightErrors]]:
         """Return lower and upper limit (degrees, None: no limit) and the differences of each class of slope."""
         edges = [0.0, *SLOPES, np.inf]
-        found = []
+        rows = []
         for low, high in itertools.pairwise(edges):
             inside = (self.slopes >= low) & (self.slopes < high) & np.isfinite(self.differences)
-            found.append((low, None if np.isinf(high) else high, HeightErrors.of(self.differences[inside])))
-        return found
+            rows.append((low, None if np.isinf(high) else high, HeightErrors.of(self.differences[inside])))
+        return rows
 
     def gross(self) -> list[str]:
         """Return the points whose difference is far from all others."""
@@ -209,11 +209,11 @@ def summary(document: dict[str, Any]) -> str:
         return f"{errors['count']:>6}" + "".join(f"{'-' if v is None else f'{v:.2f}':>9}" for v in values)
 
     lines = [f"{'slope':<12}{'points':>6}{'mean':>9}{'RMSE':>9}{'median':>9}{'NMAD':>9}{'LE90':>9}{'largest':>9}  (m)"]
-    for one in document["by_slope"]:
-        low, high = one["slope_deg"]
-        if one["count"]:
+    for row in document["by_slope"]:
+        low, high = row["slope_deg"]
+        if row["count"]:
             name = f"over {low:g}°" if high is None else f"{low:g}-{high:g}°"
-            lines.append(f"{name:<12}{cells(one)}")
+            lines.append(f"{name:<12}{cells(row)}")
     lines.append(f"{'all':<12}{cells(document['overall'])}")
     lines.append("DEM minus check height; of slopes without points there is no line")
     if document["without_height"]:

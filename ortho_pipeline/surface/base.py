@@ -200,7 +200,7 @@ def positions(xy: ArrayLike) -> Array:
     InputError
         If they have another shape.
     """
-    found = np.asarray(xy, dtype=float)
-    if found.ndim != 2 or found.shape[1] < 2:
-        raise InputError(f"expected positions of shape (N, 2), not {found.shape}")
-    return found[:, :2]
+    points = np.asarray(xy, dtype=float)
+    if points.ndim != 2 or points.shape[1] < 2:
+        raise InputError(f"expected positions of shape (N, 2), not {points.shape}")
+    return points[:, :2]

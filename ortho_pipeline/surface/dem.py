@@ -140,14 +140,14 @@ class TileCache:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        made = make()
+        array = make()
         with self._lock:
             if key not in self._kept:
-                self._kept[key] = made
-                self._held += made.nbytes
+                self._kept[key] = array
+                self._held += array.nbytes
             while self._held > self._size and len(self._kept) > 1:
                 self._held -= self._kept.popitem(last=False)[1].nbytes
-        return made
+        return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class DemSurface(Surface):
         object.__setattr__(self, "_tiles", TileCache(self.cache_bytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return DemSurface, tuple(getattr(self, one.name) for one in fields(self) if one.init)
+        return DemSurface, tuple(getattr(self, item.name) for item in fields(self) if item.init)
 
     # -- what it is --------------------------------------------------------------------------------------------------
 
@@ -289,8 +289,8 @@ class DemSurface(Surface):
 
     def _places(self, xy: ArrayLike, crs: str | pyproj.CRS | None) -> tuple[Array, Array]:
         plan = positions(xy)
-        found = self.samples_at(plan) if crs is None else self.sampler(crs)(_on_ellipsoid(plan))
-        return found[:, 0], found[:, 1]
+        samples = self.samples_at(plan) if crs is None else self.sampler(crs)(_on_ellipsoid(plan))
+        return samples[:, 0], samples[:, 1]
 
     def _interpolated(self, u: Array, v: Array, filled: bool) -> Array:
         """Return heights ``(N,)`` at sample coordinates; NaN outside."""

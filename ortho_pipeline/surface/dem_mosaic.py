@@ -85,15 +85,15 @@ def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
         return None  # a pattern of assets in a STAC document
     if not glob.has_magic(text) or os.path.exists(text) or "://" in text or text.startswith("/vsi"):
         return None
-    found = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
-    if not 0 < len(found) <= _MOST_FILES:
+    paths = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
+    if not 0 < len(paths) <= _MOST_FILES:
         raise InputError(
-            f"{counted(len(found), 'file')} of this pattern",
+            f"{counted(len(paths), 'file')} of this pattern",
             file=text,
             field="surface.dem",
             remedy="give a DEM, or a pattern of the files that make one",
         )
-    return found
+    return paths
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class ResolutionLayer:
     @functools.cached_property
     def _boxes(self) -> NDArray[np.int64]:
         """Left, top, right, bottom ``(4, N)`` of the parts."""
-        rows = [(one.column, one.row, one.column + one.shape[1], one.row + one.shape[0]) for one in self.parts]
+        rows = [(part.column, part.row, part.column + part.shape[1], part.row + part.shape[0]) for part in self.parts]
         return np.array(rows, dtype=np.int64).T
 
     def within(self, left: int, top: int, width: int, height: int) -> Iterator[tuple[Part, int]]:
@@ -250,9 +250,9 @@ def open_mosaic(name: str, paths: Sequence[str], access: Mapping[str, Any]) -> D
     """
     samples = [DemFile(path, access) for path in paths]
     placed: list[tuple[Samples, pyproj.CRS, SampleGrid, str]] = []
-    for one in samples:
-        placed.append((one, *one.place(), one.unit))
-        one.close()
+    for file in samples:
+        placed.append((file, *file.place(), file.unit))
+        file.close()
     return laid_out(name, placed)
 
 
@@ -275,8 +275,8 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
         layers.setdefault(steps[0] if steps else own.crs_from_pixel[1], []).append((samples, own))
     # The finest last: it counts where it has heights.
     members = [layers[step] for step in sorted(layers, key=abs, reverse=True)]
-    whole = _whole_grid(name, [grid for _, _, grid, _ in placed], _between_columns(members))
-    return DemMosaic(name, crs, whole, unit, tuple(_layer(whole, theirs) for theirs in members))
+    grid_of_all = _whole_grid(name, [grid for _, _, grid, _ in placed], _between_columns(members))
+    return DemMosaic(name, crs, grid_of_all, unit, tuple(_layer(grid_of_all, theirs) for theirs in members))
 
 
 def _refuse_other_system(
@@ -330,10 +330,10 @@ def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) ->
         on = np.abs(offsets * count - np.rint(offsets * count)) <= slack * count
         if (even & on).all():
             return count
-    one, other = members[-1][0][0], members[0][0][0]
+    finest, other = members[-1][0][0], members[0][0][0]
     raise CrsError(
         f"the columns of this file do not match those of {other.path}",
-        file=one.path,
+        file=finest.path,
         field="geotransform",
         remedy=_WARP,
     )

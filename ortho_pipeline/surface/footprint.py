@@ -128,7 +128,7 @@ class Footprint:
         if not isinstance(surface, DemSurface):
             return  # flat ground is everywhere
         file = surface.provenance.get("path")
-        wanted = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
+        choice = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
                 self.beyond,
@@ -138,7 +138,7 @@ class Footprint:
                     "check the height datum and unit of the DEM (",
                     Setting("surface.vertical"),
                     ") and the position of the scene, or ",
-                    wanted,
+                    choice,
                 ),
             )
         if not self.complete and surface.fill == "error":
@@ -147,7 +147,7 @@ class Footprint:
                 file=file,
                 remedy=Text(
                     "give a DEM that covers the whole scene, or ",
-                    wanted,
+                    choice,
                     ", nearest, or an ellipsoidal height in metres",
                 ),
             )
@@ -164,17 +164,17 @@ class Footprint:
                 "the nearest height of the DEM",
                 file=file,
                 field="surface.fill",
-                remedy=Text("give a larger DEM, or ", wanted),
+                remedy=Text("give a larger DEM, or ", choice),
             )
 
     def notes(self) -> list[Notice]:
         """Return a notice if the DEM does not cover the scene as a whole, or only with heights beyond the model."""
-        said = [f"{self.beyond}: these places have no pixels"] if self.beyond else []
+        texts = [f"{self.beyond}: these places have no pixels"] if self.beyond else []
         if self.coverage < 1.0:
             what = "has no pixels in the ortho" if self.surface.fill in ("error", "mask") else "was filled"
             inside = f" ({counted(self.voids, 'sample')} without a height inside it)" if self.voids else ""
-            said.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the rest {what}")
-        return [Notice("dem-covers-part", "; ".join(said), coverage=self.coverage)] if said else []
+            texts.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the rest {what}")
+        return [Notice("dem-covers-part", "; ".join(texts), coverage=self.coverage)] if texts else []
 
     def fitted(self, model: SensorModel) -> SensorModel:
         """Return the model, meant for the heights here and a margin, where its own range is no more than a guess."""
@@ -194,14 +194,14 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
         If no border pixel meets the ground.
     """
     surface = facing(model, surface, width, height)
-    found, met, projects = _laid(model, surface, width, height)
-    if not len(found.reach):
+    footprint, met, projects = _laid(model, surface, width, height)
+    if not len(footprint.reach):
         raise _nowhere(model, surface)
-    found = replace(found, beyond=_beyond(model, surface, found))
+    footprint = replace(footprint, beyond=_beyond(model, surface, footprint))
     if not isinstance(surface, DemSurface):
-        return found
+        return footprint
     unmet = bool((projects & ~met).any())
-    ring = found.ring
+    ring = footprint.ring
     if surface.fill not in ("error", "mask"):  # what fills the rest has no say in how much there is
         surface = surface.with_fill("mask")
         bare, met, projects = _laid(model, surface, width, height)
@@ -211,7 +211,7 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
     # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
     fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
     covered = sampled if fine else min(own, sampled)
-    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
+    return replace(footprint, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
 
 
 def _laid(
@@ -252,14 +252,14 @@ def _nowhere(model: SensorModel, surface: Surface) -> InputError:
     )
 
 
-def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
+def _beyond(model: SensorModel, surface: Surface, footprint: Footprint) -> str:
     """Say that the surface has heights under a scene at which its model does not project; nothing if it has not."""
     low, high = model.height_limits
     if not (math.isfinite(low) or math.isfinite(high)):
         return ""
-    lowest, highest = found.heights
+    lowest, highest = footprint.heights
     with contextlib.suppress(CoverageError):
-        lowest, highest = surface.range_under(found.reach, model.crs)
+        lowest, highest = surface.range_under(footprint.reach, model.crs)
     if low <= lowest and highest <= high:
         return ""
     return (
@@ -361,7 +361,7 @@ def two_digits(value: float) -> float:
 
 def choose_grid(
     model: SensorModel,
-    found: Footprint,
+    footprint: Footprint,
     size: tuple[int, int],
     *,
     crs: pyproj.CRS | None = None,
@@ -373,7 +373,7 @@ def choose_grid(
 
     Parameters
     ----------
-    found : Footprint
+    footprint : Footprint
         Where the scene lies.
     size : (int, int)
         Columns and rows of the image.
@@ -393,11 +393,11 @@ def choose_grid(
     width, height = size
     crs = crs or output_crs(model, width, height)
     if resolution is None:
-        resolution = two_digits(ground_sample_distance(model, crs, width, height, found.middle))
+        resolution = two_digits(ground_sample_distance(model, crs, width, height, footprint.middle))
     step = (resolution, resolution) if isinstance(resolution, int | float) else (resolution[0], resolution[1])
     if extent is not None:
         return Grid.of_extent(crs, extent, step, align=align)
-    ground = _continuous(ground_transform(model.crs, crs)(found.reach), crs)
+    ground = _continuous(ground_transform(model.crs, crs)(footprint.reach), crs)
     if not np.isfinite(ground).any():
         raise InputError(
             f"the scene is outside the area of {crs.name!r}", field="output.crs", remedy="choose another CRS"
@@ -405,7 +405,7 @@ def choose_grid(
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     if (np.array(step) > (high - low)[:2]).all():
         unit = crs.axis_info[0].unit_name
-        usual = f"{two_digits(ground_sample_distance(model, crs, width, height, found.middle)):.12f}".rstrip("0")
+        usual = f"{two_digits(ground_sample_distance(model, crs, width, height, footprint.middle)):.12f}".rstrip("0")
         raise InputError(
             f"a resolution of {step[0]:g} means {step[0]:g} {unit}s in {crs.name!r}; "
             "the whole scene is smaller than one pixel",
@@ -415,7 +415,7 @@ def choose_grid(
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
 
-def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
+def scene_pixels(model: SensorModel, footprint: Footprint, grid: Grid) -> float:
     """Return how many pixels of a grid the scene covers, or a few more: those within the hull of what it may reach.
 
     Raises
@@ -425,7 +425,7 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     """
     import shapely
 
-    ground = _continuous(ground_transform(model.crs, grid.crs)(found.reach), grid.crs)
+    ground = _continuous(ground_transform(model.crs, grid.crs)(footprint.reach), grid.crs)
     ground = ground[np.isfinite(ground).all(axis=1), :2]
     xmin, ymin, xmax, ymax = grid.extent
     if grid.crs.is_geographic and len(ground):

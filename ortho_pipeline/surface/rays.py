@@ -148,7 +148,7 @@ class _Ray:
         the terrain lies within it. None if the rays miss the DEM.
         """
         low, high = self.model.height_range
-        found = None
+        window_and_heights = None
         for _ in range(4):
             window = self._window(low, high)
             if window is None:
@@ -157,11 +157,11 @@ class _Ray:
                 lowest, highest = self.surface.range_within(*window)
             except CoverageError:
                 return None
-            found = window, (lowest, highest)
+            window_and_heights = window, (lowest, highest)
             if low <= lowest and highest <= high:
                 break
             low, high = min(low, lowest - 1.0), max(high, highest + 1.0)
-        return found
+        return window_and_heights
 
     def _window(self, low: float, high: float) -> tuple[int, int, int, int] | None:
         """Samples under the rays between two heights; a frame around the points stands for all of them."""
@@ -219,14 +219,14 @@ def _march_many(
         flat = curve_nodes(nodes)
         terrain = ray_kernel.terrain_of(heights, window[0], window[1], middle, half, flat)
         if _lattice_error(ray, nodes, origin, extent, spacing, middle, half) * 2 * terrain.steepest <= tolerance:
-            found = np.empty(len(image))
+            normalised = np.empty(len(image))
             curves = np.empty((flat.shape[2], _TOGETHER))
             for first in range(0, len(image), _TOGETHER):
                 places = (image[first : first + _TOGETHER] - origin) / spacing
                 some = curves[:, : len(places)]
                 ray_kernel.curves_at(flat, places, some)
-                found[first : first + _TOGETHER] = ray_kernel.meet(some, terrain, tolerance)
-            return middle + half * found
+                normalised[first : first + _TOGETHER] = ray_kernel.meet(some, terrain, tolerance)
+            return middle + half * normalised
     return None
 
 
@@ -254,8 +254,8 @@ def _lattice_error(
     fx, fy = (place - np.floor(place)).T[:, :, None, None]
     upper = nodes[j, i] * (1 - fx) + nodes[j, i + 1] * fx
     lower = nodes[j + 1, i] * (1 - fx) + nodes[j + 1, i + 1] * fx
-    found = np.einsum("nk,nka->na", t[:, None] ** np.arange(LEVELS), upper * (1 - fy) + lower * fy)
-    error = np.abs(found - ray.samples(image, middle + half * t)).max(axis=1)
+    places = np.einsum("nk,nka->na", t[:, None] ** np.arange(LEVELS), upper * (1 - fy) + lower * fy)
+    error = np.abs(places - ray.samples(image, middle + half * t)).max(axis=1)
     return float(np.where(np.isnan(error), np.inf, error).max())
 
 
@@ -298,9 +298,9 @@ def _tops(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
     known, unknown = np.full(len(short), low), np.full(len(short), high)
     for _ in range(_HALVINGS if len(short) else 0):
         middle = (known + unknown) / 2
-        found = np.hypot(*(ray.places(short, middle) - foot[short]).T)
-        good = np.isfinite(found)
-        length[short[good]], top[short[good]] = found[good], middle[good]
+        lengths = np.hypot(*(ray.places(short, middle) - foot[short]).T)
+        good = np.isfinite(lengths)
+        length[short[good]], top[short[good]] = lengths[good], middle[good]
         known, unknown = np.where(good, middle, known), np.where(good, unknown, middle)
     return top, length
 

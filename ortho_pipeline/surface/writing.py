@@ -32,8 +32,8 @@ def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float,
     rows, columns = heights.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
     with raster_output(path) as temporary:
-        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
-        with written(made) as dataset:
+        created = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
+        with written(created) as dataset:
             dataset.SetGeoTransform((corner[0], step, 0.0, corner[1], 0.0, -step))
             dataset.SetProjection(system.ExportToWkt())
             dataset.GetRasterBand(1).SetNoDataValue(-32768.0)

@@ -56,7 +56,7 @@ def seen(wide: Chips, radius: int) -> Array:
     return np.asarray(np.isfinite(_inner(wide, radius)).mean(axis=(1, 2)))
 
 
-def doubts(found: Peaks, wide: Chips, around: Chips, radius: int) -> NDArray[np.str_]:
+def doubts(peak: Peaks, wide: Chips, around: Chips, radius: int) -> NDArray[np.str_]:
     """Return why matches are rejected ``(n,)``, keys of `matcher.REASONS`; empty if they are not.
 
     Parameters
@@ -68,9 +68,9 @@ def doubts(found: Peaks, wide: Chips, around: Chips, radius: int) -> NDArray[np.
     """
     reason = np.full(len(wide), "", dtype="<U12")
     for name, passed in (
-        ("backward", _way_back(found.shift, wide, around, radius) <= _BACK),
-        ("ambiguous", found.inside & (found.ratio <= _UNIQUE)),
-        ("weak", found.score >= _LEAST_SCORE),
+        ("backward", _way_back(peak.shift, wide, around, radius) <= _BACK),
+        ("ambiguous", peak.inside & (peak.ratio <= _UNIQUE)),
+        ("weak", peak.score >= _LEAST_SCORE),
         ("hidden", seen(wide, radius) >= _SEEN),
     ):
         reason[~passed] = name
@@ -118,8 +118,8 @@ def in_each_band(
         # Least squares needs a near start, and the whole band may be some pixels away.
         coarse = peaks(surfaces(fields, orientation(wide)))
         moved = (coarse.shift - start[some])[coarse.inside]
-        whole = np.round(np.median(moved, axis=0)) if len(moved) else np.zeros(2)
-        shift = measure(scene[some], wide, start[some] + whole).shift
+        band_shift = np.round(np.median(moved, axis=0)) if len(moved) else np.zeros(2)
+        shift = measure(scene[some], wide, start[some] + band_shift).shift
         # The model moves opposite to the shift of a band.
         moves = (start[some] - shift)[np.isfinite(shift).all(axis=1)] * factor
         if len(moves) >= FEWEST:
@@ -155,13 +155,13 @@ def _inner(wide: NDArray[_T], radius: int) -> NDArray[_T]:
 
 def _way_back(shift: Array, wide: Chips, around: Chips, radius: int) -> Array:
     """Return the distance (chip px) between a chip and the result of matching back ``(n,)``."""
-    whole = np.clip(np.round(shift), -radius, radius).astype(int)
+    rounded = np.clip(np.round(shift), -radius, radius).astype(int)
     side = wide.shape[1] - 4 * radius
     there = np.stack(
         [
             chip[row : row + side, column : column + side]
-            for chip, (column, row) in zip(wide, 2 * radius + whole, strict=True)
+            for chip, (column, row) in zip(wide, 2 * radius + rounded, strict=True)
         ]
     )
     back = peaks(surfaces(orientation(there), orientation(around)))
-    return np.asarray(np.hypot(*(back.shift + (shift - whole)).T))
+    return np.asarray(np.hypot(*(back.shift + (shift - rounded)).T))

@@ -303,9 +303,9 @@ class _Tried:
             around = scene_chips(
                 self.view, self.origins[index] - _RADIUS * self.factor, SIDE + 2 * _RADIUS, self.factor
             )
-            found = found_again(self.scene[index], wide, _RADIUS)
-            self.score[index], self.offset[index] = found.score, found.shift * self.factor
-            self.reason[index] = doubts(found, wide, around, _RADIUS)
+            peak = found_again(self.scene[index], wide, _RADIUS)
+            self.score[index], self.offset[index] = peak.score, peak.shift * self.factor
+            self.reason[index] = doubts(peak, wide, around, _RADIUS)
 
         in_batches(work, np.arange(len(self.origins)), self.threads)
 
@@ -344,13 +344,13 @@ class _Tried:
             index, wide = good[batch], renderer.render(batch)
             start = np.nan_to_num((self.offset[index] - self.whole[index]) / self.factor)
             start = np.where(np.abs(start) < radius - 2, start, 0.0)
-            found = measure(self.scene[index], wide, start)
+            measured = measure(self.scene[index], wide, start)
             self.target[index] = wide[:, radius:-radius, radius:-radius]
-            self.found[index] = found.shift
-            self.offset[index] = self.whole[index] + found.shift * self.factor
-            self.covariance[index] = found.covariance * self.factor**2
-            self.score[index] = found.correlation
-            bad = ~np.isfinite(found.shift).all(axis=1)
+            self.found[index] = measured.shift
+            self.offset[index] = self.whole[index] + measured.shift * self.factor
+            self.covariance[index] = measured.covariance * self.factor**2
+            self.score[index] = measured.correlation
+            bad = ~np.isfinite(measured.shift).all(axis=1)
             self.reason[index[bad]] = "not measured"
 
         in_batches(work, np.arange(len(good)), self.threads)

@@ -92,11 +92,11 @@ class Chips:
             origins = self.centres[index] - SIDE // 2 * factor
             start = np.round(self.offset[index]).astype(int)
             wide = self._rendered(origins + start - 2 * radius * factor, SIDE + 4 * radius, factor)
-            found = found_again(scene_chips(self.view, origins, SIDE, factor), wide, radius)
-            self.offset[index], self.score[index] = start + found.shift * factor, found.score
+            peak = found_again(scene_chips(self.view, origins, SIDE, factor), wide, radius)
+            self.offset[index], self.score[index] = start + peak.shift * factor, peak.score
             if finest:
                 around = scene_chips(self.view, origins - radius * factor, SIDE + 2 * radius, factor)
-                self.reason[index] = doubts(found, wide, around, radius)
+                self.reason[index] = doubts(peak, wide, around, radius)
             else:
                 self.reason[index[seen(wide, radius) <= _GLIMPSED]] = "hidden"
             self.offset[index[self.reason[index] != ""]] = np.nan
@@ -112,10 +112,10 @@ class Chips:
             start = np.round(self.offset[index]).astype(int)
             wide = self._rendered(origins + start - MEASURED * factor, SIDE + 2 * MEASURED, factor)
             scene = scene_chips(self.view, origins, SIDE, factor)
-            found = measure(scene, wide, (self.offset[index] - start) / factor)
-            self.offset[index] = start + found.shift * factor
-            self.covariance[index] = found.covariance * factor**2
-            self.score[index] = found.correlation
+            measured = measure(scene, wide, (self.offset[index] - start) / factor)
+            self.offset[index] = start + measured.shift * factor
+            self.covariance[index] = measured.covariance * factor**2
+            self.score[index] = measured.correlation
 
         self._in_batches(work)
 

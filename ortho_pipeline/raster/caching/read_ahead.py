@@ -164,7 +164,7 @@ def _shared(part: _Part, left: int, top: int, width: int, height: int) -> tuple[
 def _rectangles(places: set[tuple[int, int]]) -> list[tuple[int, int, int, int]]:
     """Return rectangles (first row, last row + 1, first column, last column + 1) that are these places together."""
     open_runs: dict[tuple[int, int], int] = {}
-    found = []
+    rectangles = []
     rows = sorted({row for row, _ in places})
     for row in rows:
         columns = sorted(column for one, column in places if one == row)
@@ -172,8 +172,8 @@ def _rectangles(places: set[tuple[int, int]]) -> list[tuple[int, int, int, int]]
         starts = [0, *(k + 1 for k in ends[:-1])]
         runs = {(columns[a], columns[b] + 1) for a, b in zip(starts, ends, strict=True)}
         for run in [run for run in open_runs if run not in runs or row - 1 not in rows]:
-            found.append((open_runs.pop(run), row, *run))
+            rectangles.append((open_runs.pop(run), row, *run))
         for run in runs:
             open_runs.setdefault(run, row)
-    found += [(first, rows[-1] + 1, *run) for run, first in open_runs.items()]
-    return found
+    rectangles += [(first, rows[-1] + 1, *run) for run, first in open_runs.items()]
+    return rectangles

@@ -188,14 +188,14 @@ class _Gate:
         volumes = [name for name in names if re.fullmatch(r"vol_.*\.xml", name.lower())]
         if len(volumes) == 1:
             return self._product_of(folder / volumes[0])
-        found = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
-        if len(found) > 1:
+        products = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
+        if len(products) > 1:
             raise InputError(
-                f"this folder has several products: {', '.join(sorted(found)[:6])}",
+                f"this folder has several products: {', '.join(sorted(products)[:6])}",
                 file=folder,
                 remedy="give the DIM_*.XML of one of them, or an image",
             )
-        return folder / found[0] if found == names and found else None
+        return folder / products[0] if products == names and products else None
 
     def _product_of(self, volume: Any) -> Any:
         """Return the metadata of the one product of a DIMAP volume; None where the file is no volume."""

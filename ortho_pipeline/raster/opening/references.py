@@ -193,7 +193,7 @@ def products_of_volume(path: Any) -> list[str]:
 
 
 def _inner(node: Any, name: str) -> list[Any]:
-    return [child for found, child in _parts(node) if found == name]
+    return [child for key, child in _parts(node) if key == name]
 
 
 def _names_of_ers(path: Any) -> Iterator[Named]:

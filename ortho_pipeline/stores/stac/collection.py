@@ -53,9 +53,9 @@ class Collection:
             What addresses of items contain, of a static collection, which says nothing of their places.
         """
         yield from self._listed()
-        asked = next((link["href"] for link in self._links if link["rel"] == "items"), None)
-        if asked is not None:
-            yield from self._of_api(target(asked, self.address), box)
+        api = next((link["href"] for link in self._links if link["rel"] == "items"), None)
+        if api is not None:
+            yield from self._of_api(target(api, self.address), box)
             return
         for link in self._links:
             if link["rel"] == "item" and name in link["href"]:
@@ -73,23 +73,23 @@ class Collection:
             If an item does not say where it lies, and where there are too many.
         """
         documents = [self.address]
-        asked = next((link["href"] for link in self._links if link["rel"] == "items"), None)
+        api = next((link["href"] for link in self._links if link["rel"] == "items"), None)
         items: Iterable[Item] = self._listed()
-        if asked is not None:
-            address = target(asked, self.address, self._roots)
+        if api is not None:
+            address = target(api, self.address, self._roots)
             items = [*items, *(item for box in questions(boxes) for item in self._of_api(address, box))]
         else:
             items = [*items, *self._below(boxes, documents)]
-        found = {}
+        by_place = {}
         for item in items:
             if not item.boxes:
                 raise InputError(
                     f"the item {item.id!r} does not state its position", file=item.address, field="bbox", remedy=_REMEDY
                 )
             if any_meet(item.boxes, boxes):
-                found[item.id, tuple(asset.href for asset in item.assets)] = item
-        documents += [item.address for item in found.values() if asked is None]
-        return sorted(found.values(), key=lambda item: (item.date, item.id)), list(dict.fromkeys(documents))
+                by_place[item.id, tuple(asset.href for asset in item.assets)] = item
+        documents += [item.address for item in by_place.values() if api is None]
+        return sorted(by_place.values(), key=lambda item: (item.date, item.id)), list(dict.fromkeys(documents))
 
     def _listed(self) -> Iterator[Item]:
         for feature in self._document.get("features") or ():
@@ -98,9 +98,9 @@ class Collection:
     def _below(self, boxes: Sequence[Box], documents: list[str]) -> Iterator[Item]:
         """Yield the items that links of a static collection and of catalogs below it lead to."""
         seen: set[str] = {Location(self.address).url}
-        wanted = self._named(self._links, self.address, seen)
+        places = self._named(self._links, self.address, seen)
         for _ in range(_DEEPEST):
-            if not wanted:
+            if not places:
                 return
             if len(seen) > _MOST_DOCUMENTS:
                 raise InputError(
@@ -108,19 +108,19 @@ class Collection:
                 )
             below = []
             with thread_pool(_AT_ONCE, "stac") as pool:
-                for place, read in zip(wanted, pool.map(self._read, wanted), strict=True):
+                for place, read in zip(places, pool.map(self._read, places), strict=True):
                     if isinstance(read, Item):
                         yield read
                     elif self._may_hold(read, place, boxes):
                         documents.append(place)
                         below += self._named(_links(read), place, seen)
-            wanted = below
-        if wanted:
+            places = below
+        if places:
             raise InputError(f"more than {_DEEPEST} nested catalogs", file=self.address, remedy=_FEWER)
 
     def _named(self, links: list[dict[str, Any]], base: str, seen: set[str]) -> list[str]:
         """Return the places that links to items and catalogs name, of which none was seen before."""
-        named = [target(one["href"], base, self._roots) for one in links if one["rel"] in ("item", "child")]
+        named = [target(link["href"], base, self._roots) for link in links if link["rel"] in ("item", "child")]
         new = [place for place in dict.fromkeys(named) if place not in seen]
         seen.update(new)
         return new
@@ -149,11 +149,11 @@ class Collection:
         for _ in range(_PAGES):
             if page is None:
                 return
-            found = read_document(page, allow_network=self._allow_network, paged=True)
-            _require_lists(found, page)
-            for feature in found.get("features") or ():
+            document = read_document(page, allow_network=self._allow_network, paged=True)
+            _require_lists(document, page)
+            for feature in document.get("features") or ():
                 yield item_of(_object(feature, page), page)
-            following = [link for link in _links(found) if link["rel"] == "next"]
+            following = [link for link in _links(document) if link["rel"] == "next"]
             ours = [link for link in following if str(link.get("method", "GET")).upper() == "GET"]
             if following and not ours:
                 raise InputError(
@@ -166,9 +166,9 @@ class Collection:
 @reads(_REMEDY)
 def read_collection(address: AnyPath, *, allow_network: bool = False) -> dict[str, Any]:
     """Return the document of a collection, or of a list of items."""
-    found = read_document(address, allow_network=allow_network)
-    _require_collection(found, address)
-    return found
+    document = read_document(address, allow_network=allow_network)
+    _require_collection(document, address)
+    return document
 
 
 def _require_collection(document: Mapping[str, Any], address: AnyPath) -> None:

@@ -106,10 +106,10 @@ def open_cells(
             field="surface.dem",
             remedy="give a DEM of this place",
         )
-    mosaic = laid_out(source.address, sorted(placed, key=lambda one: one[0].path))
-    made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
+    mosaic = laid_out(source.address, sorted(placed, key=lambda part: part[0].path))
+    surface = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
     cells = {"cells": [cell.name for cell in sorted(there)], "sea_cells": [cell.name for cell in sorted(sea)]}
-    return replace(made, record={**made.record, **cells})
+    return replace(surface, record={**surface.record, **cells})
 
 
 def _ordered(cells: Iterable[Cell]) -> list[Cell]:

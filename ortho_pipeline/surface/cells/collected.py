@@ -84,15 +84,15 @@ def open_collected(
         mosaic = laid_out(name, [placed for placed, _ in opened])
     except (CrsError, DatumError) as error:
         raise type(error)(error.message, file=error.file, field=error.field, remedy=_CHOOSE) from error
-    made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
+    surface = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
     ids = {placed[0].path: item.id for item, (placed, _) in zip(items, opened, strict=True)}
-    found = {
-        "warnings": [*made.record["warnings"], *_same_ground(mosaic, ids)],
+    details = {
+        "warnings": [*surface.record["warnings"], *_same_ground(mosaic, ids)],
         "items": [item.id for item in items],
         "documents": documents,
-        "declared_in": None if made.record["declared_vertical"] is None else ("items" if opened[0][1] else "files"),
+        "declared_in": None if surface.record["declared_vertical"] is None else ("items" if opened[0][1] else "files"),
     }
-    return replace(made, record={**made.record, **found})
+    return replace(surface, record={**surface.record, **details})
 
 
 def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Placed, bool]:
@@ -170,8 +170,8 @@ def _neighbours(places: Sequence[tuple[Any, ...]]) -> Iterable[tuple[Any, Any]]:
             yield places[min(index, other)], places[max(index, other)]
 
 
-def _shared(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
-    wide = min(one[3], other[3]) - max(one[1], other[1])
-    high = min(one[4], other[4]) - max(one[2], other[2])
-    least = min((place[3] - place[1]) * (place[4] - place[2]) for place in (one, other))
+def _shared(first: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    wide = min(first[3], other[3]) - max(first[1], other[1])
+    high = min(first[4], other[4]) - max(first[2], other[2])
+    least = min((place[3] - place[1]) * (place[4] - place[2]) for place in (first, other))
     return wide > 0 and high > 0 and wide * high > _SAME_GROUND * least

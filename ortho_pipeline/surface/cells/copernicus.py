@@ -87,11 +87,11 @@ def columns_at(lat: int) -> int:
 
 def cells_of_list(text: str) -> frozenset[Cell]:
     """Return the cells that a list names, one a line, by their names in the DEM of 30 m or of 90 m."""
-    found = []
+    cells = []
     for match in _NAME.finditer(text):
         lat, lon = int(match[3]), int(match[5])
-        found.append(Cell(-lon if match[4] == "W" else lon, -lat if match[2] == "S" else lat))
-    return frozenset(found)
+        cells.append(Cell(-lon if match[4] == "W" else lon, -lat if match[2] == "S" else lat))
+    return frozenset(cells)
 
 
 class Extent(NamedTuple):

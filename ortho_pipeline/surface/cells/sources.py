@@ -43,7 +43,7 @@ class Source(ABC):
         """Return all existing cells: every other one is sea. None if that is unknown."""
 
 
-def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
+def source_of(chosen: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
     """Return the source that is given, that of the environment variable, or the public bucket.
 
     Raises
@@ -51,7 +51,7 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
     InputError
         If there is no such folder, or the network is not allowed.
     """
-    text = os.fspath(given or os.environ.get(VARIABLE) or PUBLIC)
+    text = os.fspath(chosen or os.environ.get(VARIABLE) or PUBLIC)
     if Location(text).is_collection:
         return _Catalogue(text, allow_network)
     if Location(text).is_address:
