@@ -1,11 +1,10 @@
-"""Coordinate systems, height datums and the ways between them.
+"""Coordinate systems, height datums, and the transformations between them.
 
-Heights inside the package are metres above the WGS84 ellipsoid, whatever the horizontal system is: a point in the
-Belgian Lambert grid carries the same height as in WGS84. Only a vertical datum (`Vertical`) changes a height, and only
-where a file is read.
+Heights inside the package are metres above the WGS84 ellipsoid, for any horizontal CRS: a point in the Belgian Lambert
+grid has the same height as in WGS84. Only a vertical datum (`Vertical`) changes a height, and only when a file is read.
 
-Every transformation is asked for with ``only_best`` and without ballpark: PROJ otherwise leaves heights unchanged, with
-no error, where a geoid grid is not installed. PROJ's network access stays off, so that results depend on files only.
+Every transformation uses ``only_best`` and no ballpark operations. Otherwise PROJ would leave heights unchanged,
+without an error, if a geoid grid is not installed. PROJ's network access is off, so results depend only on files.
 """
 
 from __future__ import annotations
@@ -121,7 +120,7 @@ def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     Raises
     ------
     CrsError
-        If it has no horizontal coordinates, or only PROJ knows it, so that no file could say it.
+        If it has no horizontal coordinates, or only PROJ knows it, so that no file could store it.
     """
     crs = parse_crs(text)
     remedy = "give a geographic or a projected CRS, such as EPSG:n"
@@ -146,7 +145,13 @@ def utm_crs(lon: float, lat: float) -> pyproj.CRS:
 
 
 def same_crs(first: pyproj.CRS, second: pyproj.CRS) -> bool:
-    """Tell whether two systems are one, whatever the order of their axes (x is always first here)."""
+    """Return whether two CRSs are equal, for any order of their axes (x is always first here).
+
+    Examples
+    --------
+    >>> same_crs(pyproj.CRS(4326), pyproj.CRS("OGC:CRS84"))
+    True
+    """
     return bool(first == second or first.equals(second, ignore_axis_order=True))
 
 
@@ -238,7 +243,7 @@ class Vertical:
         Raises
         ------
         DatumError
-            If the grid is not installed (the remedy says how to get it), or gives impossible heights.
+            If the grid is not installed, or gives impossible heights.
         """
         lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
         if self.is_ellipsoid:
@@ -460,7 +465,7 @@ def _way_error(source: pyproj.CRS, target: pyproj.CRS, grid: str | None) -> Orth
 def _warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, sample: Array) -> None:
     """Log that a more exact transformation exists whose grid is not installed (``only_best`` lets some of them pass).
 
-    A negative accuracy of `used` says that PROJ chooses among several operations by position.
+    A negative accuracy of `used` means that PROJ chooses among several operations by position.
     """
     lon, lat = Transformer.from_crs(target.to_2d(), 4326, always_xy=True).transform(*sample[:2])
     if not (abs(lon) <= 180 and abs(lat) <= 90):

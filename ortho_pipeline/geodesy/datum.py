@@ -1,4 +1,4 @@
-"""Datum and unit of the heights of a DEM: what it declares against what the user says."""
+"""Datum and unit of the heights of a DEM: its declaration, checked against the options of the user."""
 
 from __future__ import annotations
 

@@ -19,7 +19,13 @@ EARTH_RATE = 7.292115e-5
 
 
 def geocentric(ground: Array) -> Array:
-    """Convert lon, lat (degrees), ellipsoidal height ``(N, 3)`` on WGS84 to ECEF metres ``(N, 3)``."""
+    """Convert lon, lat (degrees), ellipsoidal height ``(N, 3)`` on WGS84 to ECEF metres ``(N, 3)``.
+
+    Examples
+    --------
+    >>> geocentric(np.array([[0.0, 0.0, 0.0]])).tolist()
+    [[6378137.0, 0.0, 0.0]]
+    """
     lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
     prime_vertical = SEMI_MAJOR / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
     level = (prime_vertical + ground[:, 2]) * np.cos(lat)
@@ -30,7 +36,12 @@ def geocentric(ground: Array) -> Array:
 def geodetic(ecef: Array) -> Array:
     """Convert ECEF metres ``(N, 3)`` to lon, lat (degrees), ellipsoidal height ``(N, 3)``, to 1e-9 m.
 
-    Bowring's formula, used three times: good from the sea floor to beyond satellites, poles included; NaN stays NaN.
+    Three iterations of Bowring's formula: accurate from the sea floor to beyond satellites, also at the poles.
+
+    Examples
+    --------
+    >>> geodetic(np.array([[6378237.0, 0.0, 0.0]])).tolist()
+    [[0.0, 0.0, 100.0]]
     """
     x, y, z = ecef.T
     level = np.hypot(x, y)
@@ -78,10 +89,10 @@ def enu_from_geodetic(ground: Array, origin: Array) -> tuple[Array, Array]:
 
 
 def meet_height(origin: Array, direction: Array, height: Array) -> Array:
-    """Follow rays in ECEF to their first point at an ellipsoidal height.
+    """Return the first point of rays in ECEF at an ellipsoidal height.
 
-    Starts from the ellipsoid with axes longer by the height, in closed form, and goes on by Newton's method along the
-    ray, because the surface of equal height is not quite an ellipsoid.
+    Starts in closed form from the ellipsoid with axes longer by the height. Newton's method along the ray follows,
+    because the surface of equal height is not exactly an ellipsoid.
 
     Parameters
     ----------
@@ -121,8 +132,8 @@ def meet_height(origin: Array, direction: Array, height: Array) -> Array:
 def rotation_of_angles(omega: float, phi: float, kappa: float) -> Array:
     """Return the rotation ``(3, 3)`` from ground to camera axes of the angles omega, phi, kappa.
 
-    Source: Ok and Turker, equation 3 (as printed, cos phi sin kappa lacks its minus sign and sin omega stands for sin
-    phi; these are the usual elements, M = R3(kappa) R2(phi) R1(omega)).
+    Source: Ok and Turker, equation 3. In print cos phi sin kappa lacks its minus sign, and sin phi is printed as sin
+    omega; these are the usual elements, M = R3(kappa) R2(phi) R1(omega).
     """
     so, co, sp, cp, sk, ck = *_sin_cos(omega), *_sin_cos(phi), *_sin_cos(kappa)
     return np.array(

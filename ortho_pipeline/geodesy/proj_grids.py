@@ -73,17 +73,17 @@ def missing_grid(vertical: str) -> str | None:
 
 
 def fetch_grid(name: str) -> Path:
-    """Fetch a grid from PROJ's own store into the user's folder of PROJ, where it is found from now on.
+    """Download a grid from PROJ's server to the user's PROJ folder, where PROJ finds it.
 
-    Whole or not at all: size and SHA-256 are those of the list that PROJ publishes beside its grids, and the header is
-    that of a grid. The caller is allowed to use the network.
+    The download is complete or fails: size, SHA-256 and header are checked against PROJ's list of grids. The caller
+    must be allowed to use the network.
 
     Raises
     ------
     InputError
         If PROJ has no grid of this name, or the folder cannot be written.
     StorageError
-        If it cannot be fetched as it is stored.
+        If the download fails, or is not the grid.
     """
     from pyproj.sync import get_proj_endpoint
 
@@ -106,7 +106,7 @@ def fetch_grid(name: str) -> Path:
         raise StorageError(
             "PROJ's server does not have this grid", file=store.of(name), remedy="try again later"
         ) from error
-    # PROJ remembers which grids were not there, until it is told of its folders.
+    # PROJ remembers missing grids until its folders are set again.
     pyproj.datadir.set_data_dir(pyproj.datadir.get_data_dir())
     vertical_transformer.cache_clear()
     return path

@@ -17,13 +17,13 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.source import RasterSource, first_line
 
-#: At most so many bands are averaged: those with the most content, if it is at least this part of the most.
+#: Largest number of bands to average, and the least content of one, as part of that of the best band.
 _BANDS, _WORTH = 4, 0.5
-#: Bands are compared in so many windows of so many pixels a side with values; at most so many windows are tried.
+#: Numbers of windows with values in which bands are compared, their side (px), and the most windows to try.
 _WINDOWS, _WINDOW, _TRIED = 9, 64, 150
 #: A band with values in less than this part of the pixels of the fullest band would cost the other ones theirs.
 _FULL = 0.9
-#: Values are told apart in so many steps between the percentiles 1 and 99 of a band.
+#: Steps between the percentiles 1 and 99 of a band that distinguish values.
 _STEPS = 256
 #: From the first frequency on (cycles per pixel) a raster that was enlarged by two shows at most this part of what it
 #: shows between the other two; noise and edges of a raster that was not show more. Of some 20 real and simulated
@@ -49,17 +49,17 @@ class Intensity:
         self.source = source
         self.width, self.height = source.width, source.height
         self.bands = tuple(bands)
-        # The brightest value of whole numbers says "at least this".
+        # The largest integer means "at least this value".
         kind = source.dtype
         self.saturated = float(np.iinfo(kind).max) if kind.kind in "iu" else np.inf
 
     @cached_property
     def averaged(self) -> tuple[int, ...]:
-        """Numbers of the bands that are averaged; they are chosen when pixels are first asked for."""
+        """Numbers of the bands to average; chosen when pixels are first needed."""
         return self.bands or self.best()
 
     def best(self, most: int = _BANDS) -> tuple[int, ...]:
-        """Return the numbers of at most so many bands, those with the most content; alpha is none."""
+        """Return the numbers of at most `most` bands, those with the most content; without alpha."""
         colours = [band.GetColorInterpretation() for band in self.source.bands]
         known = np.flatnonzero([colour != gdal.GCI_AlphaBand for colour in colours])
         if len(known) < 2:
@@ -101,12 +101,12 @@ class Intensity:
         Parameters
         ----------
         left, top : int
-            First pixel; the window may lie outside in part or whole.
+            First pixel; the window may be partly or fully outside.
         width, height : int
-            Of the result: the window is `factor` times as large.
+            Size of the result; the window is `factor` times as large.
         """
         out = np.full((height, width), np.nan, dtype=np.float32)
-        # Only whole groups of pixels that lie inside.
+        # Only full groups of pixels inside the raster.
         first_column, first_row = max(0, -(left // factor)), max(0, -(top // factor))
         last_column = min(width, (self.width - left) // factor)
         last_row = min(height, (self.height - top) // factor)
@@ -140,7 +140,7 @@ class Intensity:
         Parameters
         ----------
         single : bool
-            Where there are no overviews, take single pixels for all that they stand for.
+            Without overviews, use single pixels instead of means.
         """
         size = {"buf_xsize": columns, "buf_ysize": rows}
         found = np.zeros((rows, columns), dtype=np.float32)
@@ -188,7 +188,7 @@ def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def enlarged(windows: NDArray[np.float32]) -> bool:
-    """Tell whether a raster was enlarged by two or more: windows ``(n, h, w)`` show nothing as fine as their pixels."""
+    """Return whether a raster was enlarged by two or more: windows ``(n, h, w)`` have no detail as fine as a pixel."""
     height, width = windows.shape[1:]
     down, across = (np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in (height, width))
     level = windows - windows.mean(axis=(1, 2), keepdims=True)

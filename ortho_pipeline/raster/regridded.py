@@ -1,8 +1,8 @@
 """Pixels of an ortho on the grid of another one.
 
-It may lie on another grid, in another CRS. On the same grid its pixels are taken over as they are;
-otherwise GDAL's warper brings them there with its exact transformer, in blocks at fixed places and with a fixed size of
-its kernels, so that the result does not depend on tiles, memory or threads.
+It may have another grid or another CRS. On the same grid its pixels are copied. Otherwise GDAL's warper resamples them
+with its exact transformer, in blocks at fixed places and with kernels of fixed size, so that the result does not depend
+on tiles, memory or threads.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
 
 
 class Regridded:
-    """An ortho on the grid of another one; safe to use from several threads.
+    """An ortho on the grid of another one; thread-safe.
 
     Parameters
     ----------
     grid : Grid
-        On which its pixels are wanted.
+        Grid of its pixels.
     resampling : str
-        Between pixels of another grid, by GDAL's name.
+        GDAL's name of the resampling from another grid.
 
     Raises
     ------
     InputError
-        If it is no ortho, or lies elsewhere.
+        If it is not an ortho, or does not overlap the grid.
     """
 
     def __init__(

@@ -1,10 +1,9 @@
 """Folders of objects: behind ``https://``, and in the stores of ``s3://``, ``gs://`` and ``az://``.
 
-Whole objects only: what is read in windows is read by GDAL. Requests that fail in passing (429, 5xx, a connection that
-is cut) are repeated with growing pauses, and a download that is cut goes on where it was cut, by `obstore`. What
-arrives is held against the size and the checksum that the store states. Credentials are those that the store's own
-clients find (environment, role of the machine); nothing of them, and nothing that a server says in its own words, is in
-a message.
+Only complete objects; GDAL reads windows. `obstore` retries temporary failures (429, 5xx, a lost connection) with
+increasing pauses, and resumes an interrupted download. Received data are compared with the size and the checksum that
+the store states. Credentials are those of the store's own clients (environment, role of the machine). Messages contain
+no credentials and no text of a server.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ RETRIES: dict[str, Any] = {
     "retry_timeout": timedelta(minutes=3),
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=15), "base": 2},
 }
-#: How often an object is fetched whose content is not what the store says of it.
+#: Attempts to download an object whose content differs from what the store states.
 _ATTEMPTS = 3
 #: Objects that are written on a condition are small (bytes).
 _MOST_ON_A_CONDITION = 100_000_000
@@ -99,16 +98,16 @@ class Objects:
     # -- reading -----------------------------------------------------------------------------------------------------
 
     def read(self, name: str, limit: int) -> tuple[bytes, Content]:
-        """Return an object of at most `limit` bytes, and what it is.
+        """Return an object of at most `limit` bytes, and its `Content`.
 
         Raises
         ------
         FileNotFoundError
-            If there is none.
+            If it does not exist.
         InputError
-            If it is larger, or may not be read.
+            If it is larger, or access is denied.
         StorageError
-            If the store does not answer, or gives other bytes than it says.
+            If the store does not answer, or the bytes differ from what it states.
         """
         return self._attempts(name, limit, b"".join)
 
@@ -179,7 +178,7 @@ class Objects:
         return None if found is None else str(found)
 
     def exists(self, name: str) -> bool:
-        """Tell whether there is such an object."""
+        """Return whether an object exists."""
         try:
             with self._errors(name):
                 self._store.head(name)
@@ -263,7 +262,7 @@ class Objects:
         )
 
     def _note(self, content: Content) -> Any:
-        """Return what is noted beside an object whose ETag will say nothing of its content."""
+        """Return attributes with the checksum of an object whose ETag is no checksum."""
         return {_SHA256: content.sha256} if self._encrypted else None
 
     def delete(self, name: str) -> None:
@@ -273,7 +272,7 @@ class Objects:
 
     @contextlib.contextmanager
     def _errors(self, name: str) -> Iterator[None]:
-        """Say what went wrong in our words: those of libraries and servers may hold signed addresses."""
+        """Convert exceptions to errors in our own words: texts of libraries and servers may have signed addresses."""
         from obstore import exceptions
 
         try:
@@ -310,7 +309,7 @@ class _Digests:
         self._parts: list[bytes] = []
 
     def through(self, chunks: Iterable[Any], limit: int) -> Iterator[bytes]:
-        """Yield the chunks; stop with an error beyond `limit` bytes, whatever a server said of their number."""
+        """Yield the chunks; raise an error beyond `limit` bytes, whatever size the server stated."""
         for chunk in chunks:
             piece = bytes(chunk)
             self._sha256.update(piece)
@@ -352,9 +351,9 @@ def _content(data: bytes | Path) -> Content:
 
 
 def _difference(content: Content, stated: Mapping[str, Any], *, ours: bool = False) -> str:
-    """Return how a content differs from what a store states of it; empty if it does not.
+    """Return how a content differs from what a store states; empty if it does not.
 
-    The ETag of what others stored in parts says nothing of the content alone.
+    The ETag of a multipart upload is not a checksum of the content alone.
     """
     if content.size != stated["size"]:
         return f"{content.size} bytes, but the store states {stated['size']}"
@@ -397,7 +396,7 @@ def _store_of(address: str) -> Any:
 
 
 def _s3_settings() -> dict[str, Any]:
-    """Return what the names of GDAL and of Amazon's clients say and `obstore` does not read itself."""
+    """Return settings from the variables of GDAL and Amazon's clients that `obstore` does not read itself."""
     settings: dict[str, Any] = {}
     endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_S3_ENDPOINT")
     if endpoint:
@@ -411,7 +410,7 @@ def _s3_settings() -> dict[str, Any]:
 
 
 def _azure_settings() -> dict[str, Any]:
-    """Return what the names of GDAL and of Azure's clients say and `obstore` does not read itself."""
+    """Return settings from the variables of GDAL and Azure's clients that `obstore` does not read itself."""
     stated = os.environ.get("AZURE_STORAGE_CONNECTION_STRING", "")
     parts = {key: value for key, sign, value in (part.partition("=") for part in stated.split(";")) if sign}
     named = {
@@ -423,7 +422,7 @@ def _azure_settings() -> dict[str, Any]:
 
 
 def _google_settings() -> dict[str, Any]:
-    """Return what the names of GDAL say and `obstore` does not read itself."""
+    """Return settings from the variables of GDAL that `obstore` does not read itself."""
     settings: dict[str, Any] = {}
     endpoint = os.environ.get("CPL_GS_ENDPOINT")
     if endpoint:

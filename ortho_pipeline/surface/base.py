@@ -98,7 +98,7 @@ class Surface(abc.ABC):
     def heights(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> Array:
         """Return heights ``(N,)`` at positions ``(N, 2)`` (x, y) of `crs` (that of the surface by default).
 
-        Bilinear between sample centres; NaN outside and beside a void, unless `fill` gives them a height.
+        Bilinear between sample centres; NaN outside and next to a void, unless `fill` gives them a height.
         """
 
     @abc.abstractmethod

@@ -1,8 +1,8 @@
-"""Where a scene lies: its footprint on the surface, how much of it the DEM covers, and the output grid that follows.
+"""The footprint of a scene on the surface, its coverage by the DEM, and the output grid.
 
 Heights come from the surface under the scene. The extent never comes from the DEM alone: where the ray of a border
-pixel leaves the DEM, both ends of the range of heights there stand in, so a DEM that covers half the scene cannot cut
-the ortho in half.
+pixel leaves the DEM, both ends of the range of heights replace it. So a DEM that covers half the scene cannot cut the
+ortho in half.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Points per side of the image at which the DEM is asked for.
+#: Sample points per side of the image for the coverage by the DEM.
 _COVERAGE_SIDE = 33
 _BORDER_SIDE = 65
 #: Samples of the DEM per side of the blocks in which voids are counted.
 _BLOCK = 1024
-#: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
+#: Margin of the heights under a scene for its model: part of their range, and least margin (m).
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
 _SOUND = Text(
     "give the metadata of this image (",
@@ -76,27 +76,27 @@ def facing(model: SensorModel, surface: Surface, width: int, height: int) -> Sur
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Where a scene lies on a surface, and what heights it has there; from `lay`.
+    """The footprint of a scene on a surface, and its heights; from `lay`.
 
     Parameters
     ----------
     surface : Surface
-        What it lies on, with the seam of a global DEM opposite to the scene.
+        With the seam of a global DEM opposite to the scene.
     ring : (N, 3)
-        The border of the image on the ground, in the model's CRS: on the surface, and where a ray leaves the DEM, at
-        the height `middle`. Rays that do not meet the ground are left out.
+        The border of the image on the ground, in the model's CRS: on the surface, or where a ray leaves the DEM, at the
+        height `middle`. Rays that do not meet the ground are omitted.
     reach : (M, 3)
-        Ground that the image may reach: `ring`, and the lost rays at both ends of `heights`.
+        Ground that the image may show: `ring`, and the lost rays at both ends of `heights`.
     heights : (float, float)
-        Lowest and highest ellipsoidal height (m) of the surface under the scene; the model's own range where no ray
-        meets the surface.
+        Lowest and highest ellipsoidal height (m) of the surface under the scene; the model's range if no ray meets the
+        surface.
     middle : float
-        Height (m) at which the middle of the image is seen.
+        Height (m) of the ground in the middle of the image.
     coverage : float
-        Share (0 to 1) of the area of the scene on the ground for which the surface has heights of its own: the same
-        for every fill, because it is measured without one. A ray that finds no height goes on to `middle` there.
+        Share (0 to 1) of the scene's area on the ground with heights of the surface, without filled ones. A ray that
+        meets no height continues to `middle`.
     complete : bool
-        Whether every ray met the surface at a height of its own; small voids between the rays may still be there.
+        Whether every ray met the surface at a height that is not filled; there may be small voids between the rays.
     voids : int
         Samples of the DEM within the scene that have no height.
     unmet : bool
@@ -117,12 +117,12 @@ class Footprint:
     beyond: str = ""
 
     def require_coverage(self) -> None:
-        """Raise a `CoverageError` if the surface does not cover the scene and nothing was said about the rest.
+        """Raise an error if the surface does not cover the scene and has no fill rule.
 
         Raises
         ------
         CoverageError
-            If a ray found no height and the surface has no fill rule.
+            If a ray met no height and the surface has no fill rule.
         """
         surface = self.surface
         if not isinstance(surface, DemSurface):
@@ -202,13 +202,13 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
         return footprint
     unmet = bool((projects & ~met).any())
     ring = footprint.ring
-    if surface.fill not in ("error", "mask"):  # what fills the rest has no say in how much there is
+    if surface.fill not in ("error", "mask"):  # the fill does not change the coverage
         surface = surface.with_fill("mask")
         bare, met, projects = _laid(model, surface, width, height)
         ring = bare.ring
     own = met.sum() / max(projects.sum(), 1)
     voids, area, sampled = _voids(model, surface, ring)
-    # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
+    # Use the finer of both samples; if a ray meets no height, the DEM does not cover all.
     fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
     covered = sampled if fine else min(own, sampled)
     return replace(footprint, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
@@ -217,9 +217,9 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
 def _laid(
     model: SensorModel, surface: Surface, width: int, height: int
 ) -> tuple[Footprint, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return where a scene lies on a surface, and which rays of a grid over the image find a height, and may find one.
+    """Return the footprint of a scene, and which rays of a grid over the image meet a height, and which can meet one.
 
-    The latter are ``(n,)`` each; a ray may find a height if it meets the ground at all.
+    The last two are ``(n,)``; a ray can meet a height if it meets the ground at all.
     """
     ring = border(width, height)
     image = np.concatenate([image_grid(width, height, _COVERAGE_SIDE), ring])
@@ -237,7 +237,7 @@ def _laid(
 
 
 def _nowhere(model: SensorModel, surface: Surface) -> InputError:
-    """Return the error of a scene none of whose pixels meets the ground."""
+    """Return the error for a scene without any pixel that meets the ground."""
     low, high = model.height_range
     if not isinstance(surface, FlatSurface) or low <= surface.height <= high:
         return InputError(
@@ -253,7 +253,7 @@ def _nowhere(model: SensorModel, surface: Surface) -> InputError:
 
 
 def _beyond(model: SensorModel, surface: Surface, footprint: Footprint) -> str:
-    """Say that the surface has heights under a scene at which its model does not project; nothing if it has not."""
+    """Return a sentence if the surface has heights under a scene that its model does not project; empty if not."""
     low, high = model.height_limits
     if not (math.isfinite(low) or math.isfinite(high)):
         return ""
@@ -308,7 +308,7 @@ def _voids(model: SensorModel, surface: DemSurface, ring: Array) -> tuple[int, f
         outline = shapely.MultiPoint(samples).convex_hull
     inside = shapely.intersection(outline, shapely.box(0, 0, columns - 1, rows - 1))
     if inside.is_empty or outline.area == 0:
-        return 0, 0.0, 1.0  # the rays have the only say
+        return 0, 0.0, 1.0  # only the rays count
     beyond = 0.0 if shapely.equals(inside, outline) else 1.0 - inside.area / outline.area
     shapely.prepare(inside)
     left, top, right, bottom = (int(value) for value in (*np.floor(inside.bounds[:2]), *np.ceil(inside.bounds[2:])))
@@ -374,7 +374,7 @@ def choose_grid(
     Parameters
     ----------
     footprint : Footprint
-        Where the scene lies.
+        The footprint of the scene.
     size : (int, int)
         Columns and rows of the image.
     crs : pyproj.CRS, optional
@@ -383,12 +383,12 @@ def choose_grid(
         In units of `crs`, one number or x and y. Default: the ground sample distance at the height of the middle of the
         image, to two significant digits.
     extent : xmin, ymin, xmax, ymax, optional
-        Taken as it is, or widened to whole multiples of the resolution with `align`. Default: the footprint, widened.
+        Used unchanged, or with `align` widened to multiples of the resolution. Default: the footprint, widened.
 
     Raises
     ------
     InputError
-        If extent or resolution make no grid.
+        If extent or resolution give no grid.
     """
     width, height = size
     crs = crs or output_crs(model, width, height)

@@ -1,4 +1,4 @@
-"""STAC collections: the items at a place, of an API that is asked for it, or of a static collection that names them."""
+"""STAC collections: the items at a place, from an API or from a static collection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ortho_pipeline.stores.stac.item import Item, item_of, read_item
 from ortho_pipeline.stores.stac.places import Box, any_meet, extent_boxes, questions
 
 _REMEDY = "give a STAC collection: its JSON file, or its address in an API (…/collections/NAME)"
-#: Items that are asked for at a time, and pages that are followed.
+#: Items of a page, and largest number of pages.
 _LIMIT, _PAGES = 100, 50
 #: Documents of a static collection that are read, and how many at a time; catalogs within each other.
 _MOST_DOCUMENTS, _AT_ONCE, _DEEPEST = 30_000, 16, 8
@@ -23,18 +23,18 @@ _FEWER = "give a smaller collection, or a FeatureCollection file of the items th
 
 
 class Collection:
-    """A collection that is read, or asked, for items at a place.
+    """A collection, static or of an API, with items at a place.
 
     Parameters
     ----------
     address : path or address
     roots : sequence of path
-        Folders on this machine that its files may lie in, besides its own.
+        Further folders on this machine in which its files may be.
 
     Raises
     ------
     InputError
-        If it is no collection.
+        If it is not a collection.
     """
 
     def __init__(self, address: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> None:
@@ -48,9 +48,9 @@ class Collection:
         Parameters
         ----------
         box : (west, south, east, north)
-            Degrees, of an API.
+            Degrees, for an API.
         name : str
-            What addresses of items contain, of a static collection, which says nothing of their places.
+            Part of the addresses of items, for a static collection, which does not state their positions.
         """
         yield from self._listed()
         api = next((link["href"] for link in self._links if link["rel"] == "items"), None)
@@ -62,15 +62,15 @@ class Collection:
                 yield read_item(target(link["href"], self.address), allow_network=self._allow_network)
 
     def under(self, boxes: Sequence[Box]) -> tuple[list[Item], list[str]]:
-        """Return the items that have a point in common with one of some boxes, and the documents that lead to them.
+        """Return the items that overlap one of some boxes, and the documents that lead to them.
 
-        An API is asked; the items of a static collection are all read, but for those in catalogs that say to lie
-        elsewhere. Items are in the order of their dates, then of their ids.
+        An API searches them. The items of a static collection are all read, except those in catalogs that state another
+        extent. Items are in the order of their dates, then of their ids.
 
         Raises
         ------
         InputError
-            If an item does not say where it lies, and where there are too many.
+            If an item does not state its position, or there are too many.
         """
         documents = [self.address]
         api = next((link["href"] for link in self._links if link["rel"] == "items"), None)
@@ -119,19 +119,19 @@ class Collection:
             raise InputError(f"more than {_DEEPEST} nested catalogs", file=self.address, remedy=_FEWER)
 
     def _named(self, links: list[dict[str, Any]], base: str, seen: set[str]) -> list[str]:
-        """Return the places that links to items and catalogs name, of which none was seen before."""
+        """Return the targets of links to items and catalogs that are not yet known."""
         named = [target(link["href"], base, self._roots) for link in links if link["rel"] in ("item", "child")]
         new = [place for place in dict.fromkeys(named) if place not in seen]
         seen.update(new)
         return new
 
     def _read(self, place: str) -> Item | dict[str, Any]:
-        """Return the item that lies at a place, or the catalog."""
+        """Return the item or the catalog at a place."""
         document = read_document(place, allow_network=self._allow_network)
         return item_of(document, place, self._roots) if document.get("type") == "Feature" else document
 
     def _may_hold(self, document: dict[str, Any], place: str, boxes: Sequence[Box]) -> bool:
-        """Tell whether a catalog below the collection may hold items in some boxes."""
+        """Return whether a catalog below the collection may have items in some boxes."""
         _require_collection(document, place)
         if document["type"] == "Collection" and self._document["type"] == "Catalog":
             raise InputError(
@@ -194,5 +194,5 @@ def _is_link(link: object) -> bool:
 def _object(feature: Any, address: str) -> Mapping[str, Any]:
     if not isinstance(feature, dict):
         raise InputError("an item must be a JSON object", file=address, field="features", remedy=_REMEDY)
-    # An API leaves out of its answer what stands in it once.
+    # An API omits the version from each item of its answer.
     return {"stac_version": "1.0.0", **feature} if Location(address).is_address else feature

@@ -1,4 +1,4 @@
-"""STAC documents, wherever they lie, and what they say of other places."""
+"""STAC documents, local or remote, and their references to other places."""
 
 from __future__ import annotations
 

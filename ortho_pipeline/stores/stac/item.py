@@ -36,9 +36,9 @@ _SYSTEM_CHARS = 50_000
 
 @dataclass(frozen=True)
 class Asset:
-    """A file of an item: its key there, where it lies, its roles, its media type (empty where none is said).
+    """A file of an item: its key, address, roles, and media type (empty if not stated).
 
-    `systems` are the coordinate systems that the item says it to be in, as `geodesy.parse_crs` takes them.
+    `systems` are the coordinate systems that the item states, as `geodesy.parse_crs` reads them.
     """
 
     key: str
@@ -72,7 +72,7 @@ class Asset:
 
 @dataclass(frozen=True)
 class Item:
-    """A STAC item: its address, its id and its assets; the boxes it lies in, and its date (s since 1970; 0: none)."""
+    """A STAC item: its address, id and assets, its bounding boxes, and its date (s since 1970; 0: none)."""
 
     address: str
     id: str
@@ -179,19 +179,19 @@ def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPat
     ----------
     path : path or address
     roots : sequence of path
-        Folders on this machine that its assets may lie in, besides its own.
+        Further folders on this machine in which its assets may be.
 
     Raises
     ------
     InputError
-        If it is none, or names files elsewhere on this machine.
+        If it is not a STAC item, or names files elsewhere on this machine.
     """
     return item_of(read_document(path, allow_network=allow_network), path, roots)
 
 
 @reads(REMEDY)
 def item_at(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> Item | None:
-    """Read a STAC item as `read_item` does; None where a collection lies there."""
+    """Read a STAC item as `read_item` does; None if it is a collection."""
     document = read_document(path, allow_network=allow_network)
     return None if document.get("type") in COLLECTIONS else item_of(document, path, roots)
 
@@ -243,7 +243,7 @@ def _systems(*places: Any) -> Iterator[str]:
 
 
 def _date(properties: Mapping[str, Any]) -> float:
-    """Return the time of an item in seconds since 1970: the end of a span of time; 0 where it says none."""
+    """Return the time of an item in seconds since 1970: the end of its time range; 0 if it states none."""
     for name in ("datetime", "end_datetime", "start_datetime"):
         try:
             time = datetime.fromisoformat(str(properties.get(name)))

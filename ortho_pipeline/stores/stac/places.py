@@ -1,4 +1,4 @@
-"""Where STAC items lie: boxes of degrees, which may run over the antimeridian."""
+"""Positions of STAC items: boxes in degrees, which may cross the antimeridian."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def extent_boxes(document: Mapping[str, Any]) -> tuple[Box, ...]:
 
 
 def meet(first: Box, other: Box) -> bool:
-    """Tell whether two boxes have a point in common, whatever turn their longitudes are counted in."""
+    """Return whether two boxes have a common point, also if longitudes differ by full turns."""
     if first[1] > other[3] or other[1] > first[3]:
         return False
     return any(first[0] + turn <= other[2] and other[0] <= first[2] + turn for turn in _TURNS)
 
 
 def any_meet(some: Iterable[Box], others: Sequence[Box]) -> bool:
-    """Tell whether a box of some has a point in common with one of the others."""
+    """Return whether any box of `some` has a common point with any of `others`."""
     return any(meet(box, other) for box in some for other in others)
 
 
 def questions(boxes: Iterable[Box]) -> list[Box]:
-    """Return the boxes that an API is asked for: one where several overlap, and two for one over the antimeridian."""
+    """Return the boxes for requests to an API: one for overlapping boxes, two for a box across the antimeridian."""
     joined: list[Box] = []
     for box in boxes:
         whole = box

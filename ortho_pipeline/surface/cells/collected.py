@@ -1,4 +1,4 @@
-"""The DEM that the items of a STAC collection make at a place: which count where several lie, and its datum."""
+"""A DEM from the items of a STAC collection: which item is used where several overlap, and its height datum."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ def open_collected(
 ) -> DemSurface:
     """Return the items of a collection under some extents as a DEM.
 
-    Where several have a height, that of the finest columns counts, of them the one with the latest date.
+    Where several have a height, the one with the finest columns is used, then the one with the latest date.
 
     Parameters
     ----------
     address : path or address
-        With the key of the asset, or a pattern of it, after a ``#``, where its role does not tell.
+        With the key of the asset, or a pattern of it, after a ``#``, if its role does not identify it.
     vertical, override, fill, memory
         As for `open_dem`.
     access : mapping
@@ -58,11 +58,11 @@ def open_collected(
     Raises
     ------
     CoverageError
-        If no item lies there.
+        If no item covers the extents.
     DatumError
-        If the items state different height datums, or none is stated.
+        If the items state different height datums, or no datum.
     InputError
-        If it is no collection, an item has no raster of heights, or there are too many items.
+        If it is not a collection, an item has no raster of heights, or there are too many items.
     """
     access = access or {}
     network, roots = bool(access.get("allow_network")), tuple(access.get("roots", ()))
@@ -96,7 +96,7 @@ def open_collected(
 
 
 def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Placed, bool]:
-    """Return the file of an asset, where it lies and its unit; and whether its datum is what the item says of it."""
+    """Return the file of an asset, its grid and its unit; and whether its datum comes from the item."""
     file = DemFile(asset.href, access)
     crs, grid = file.place()
     unit = file.unit
