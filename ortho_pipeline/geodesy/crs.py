@@ -145,13 +145,7 @@ def utm_crs(lon: float, lat: float) -> pyproj.CRS:
 
 
 def same_crs(first: pyproj.CRS, second: pyproj.CRS) -> bool:
-    """Return whether two CRSs are equal, for any order of their axes (x is always first here).
-
-    Examples
-    --------
-    >>> same_crs(pyproj.CRS(4326), pyproj.CRS("OGC:CRS84"))
-    True
-    """
+    """Return whether two CRSs are equal, for any order of their axes (x is always first here)."""
     return bool(first == second or first.equals(second, ignore_axis_order=True))
 
 
@@ -339,18 +333,18 @@ def _grid_error(vertical: Vertical, message: str) -> DatumError:
 
 
 class GroundTransform:
-    """Map ground points ``(N, 3)`` of one system to another; heights are ellipsoidal metres on both sides.
+    """Transforms ground points ``(N, 3)`` from one CRS to another; heights are ellipsoidal metres on both sides.
 
-    Systems on a modern ellipsoid are promoted to 3D, so small differences between realisations enter the height.
-    Systems on a classical ellipsoid (Bessel, Airy, Hayford ...) are transformed in plan and keep the WGS84 height,
-    because heights are not measured above those. Geocentric systems are allowed on either side.
+    A CRS on a modern ellipsoid is promoted to 3D, so small differences between realisations enter the height. A CRS on
+    a classical ellipsoid (Bessel, Airy, Hayford ...) is transformed horizontally and keeps the WGS84 height, because
+    heights are not measured above such ellipsoids. Geocentric CRSs are allowed on either side.
 
     Instances can be pickled, and shared between threads.
 
     Parameters
     ----------
     source, target : str or pyproj.CRS
-        Of compound and 3D systems the horizontal part is used.
+        Only the horizontal part of a compound or 3D CRS is used.
 
     Raises
     ------
@@ -493,5 +487,11 @@ _made_once = functools.lru_cache(maxsize=64)(GroundTransform)
 
 
 def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> GroundTransform:
-    """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one."""
+    """Return a `GroundTransform`, the same one for the same pair: PROJ takes ten milliseconds to make one.
+
+    Examples
+    --------
+    >>> ground_transform("EPSG:4979", "EPSG:32636")(np.array([[33.0, 37.0, 500.0]])).round(1).tolist()
+    [[500000.0, 4094872.4, 500.0]]
+    """
     return _made_once(*(crs if isinstance(crs, str) else crs.srs for crs in (source, target)))

@@ -1,4 +1,4 @@
-"""Small geometry that several modules share."""
+"""The ellipsoid, its local axes, and rotations."""
 
 from __future__ import annotations
 
@@ -58,7 +58,13 @@ def geodetic(ecef: Array) -> Array:
 
 
 def enu_from_ecef(ground: Array) -> Array:
-    """Return the east, north and up axes at lon, lat (degrees) in ECEF as rows of rotations ``(N, 3, 3)``."""
+    """Return the east, north and up axes at lon, lat (degrees) in ECEF, as rows of rotations ``(N, 3, 3)``.
+
+    Examples
+    --------
+    >>> enu_from_ecef(np.array([[0.0, 0.0]]))[0, 2].tolist()  # up
+    [1.0, 0.0, 0.0]
+    """
     lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
     sin_lon, cos_lon, sin_lat, cos_lat = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
     east = np.stack([-sin_lon, cos_lon, np.zeros_like(lon)], axis=1)
@@ -146,7 +152,13 @@ def rotation_of_angles(omega: float, phi: float, kappa: float) -> Array:
 
 
 def angles_of_rotation(matrix: Array) -> tuple[float, float, float]:
-    """Return omega, phi, kappa of a rotation ``(3, 3)`` from ground to camera axes; phi within 90 degrees."""
+    """Return omega, phi, kappa (rad) of a rotation ``(3, 3)`` from ground to camera axes; phi within 90 degrees.
+
+    Examples
+    --------
+    >>> [round(angle, 3) for angle in angles_of_rotation(rotation_of_angles(0.1, 0.2, 0.3))]
+    [0.1, 0.2, 0.3]
+    """
     omega = np.arctan2(-matrix[2, 1], matrix[2, 2])
     phi = np.arctan2(matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
     kappa = np.arctan2(-matrix[1, 0], matrix[0, 0])
@@ -154,14 +166,20 @@ def angles_of_rotation(matrix: Array) -> tuple[float, float, float]:
 
 
 def orbital_from_ecef(position: Array, velocity: Array) -> Array:
-    """Return the axes along, right, down of an orbit as rows of a rotation ``(3, 3)`` from ECEF.
+    """Return the axes along, right, down of an orbit, as rows of a rotation ``(3, 3)`` from ECEF.
 
-    Down is towards the centre of the Earth, along as close to the inertial velocity as that leaves free.
+    Down is towards the centre of the Earth. Along is the direction at a right angle to it that is nearest to the
+    inertial velocity.
 
     Parameters
     ----------
     position, velocity : (3,)
-        In ECEF, metres and metres per second; the velocity is that relative to the turning Earth.
+        In ECEF (m, m/s); the velocity is relative to the rotating Earth.
+
+    Examples
+    --------
+    >>> orbital_from_ecef(np.array([7e6, 0.0, 0.0]), np.array([0.0, 7500.0, 0.0]))[0].tolist()  # along
+    [-0.0, 1.0, 0.0]
     """
     down = -position / np.linalg.norm(position)
     inertial = velocity + EARTH_RATE * np.array([-position[1], position[0], 0.0])
@@ -171,7 +189,7 @@ def orbital_from_ecef(position: Array, velocity: Array) -> Array:
 
 
 def rotation_between(from_vectors: Array, to_vectors: Array) -> Array:
-    """Return the rotation ``(3, 3)`` that best turns vectors ``(N, 3)`` into others, by least squares (Kabsch)."""
+    """Return the rotation ``(3, 3)`` that best maps vectors ``(N, 3)`` to others, by least squares (Kabsch)."""
     u, _, vt = np.linalg.svd(to_vectors.T @ from_vectors)
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 

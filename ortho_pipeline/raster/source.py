@@ -390,6 +390,12 @@ class RasterSource:
     ------
     InputError
         If a file cannot be used, differs in size from the first, or has no such band.
+
+    Examples
+    --------
+    >>> source = RasterSource("sample_data/scene.tif")
+    >>> source.width, source.height, source.count, str(source.dtype)
+    (1000, 1000, 1, 'uint16')
     """
 
     def __init__(

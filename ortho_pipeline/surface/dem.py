@@ -72,6 +72,11 @@ def open_dem(
     InputError, DatumError, CrsError
         If it cannot be opened, its height datum is unknown or contradicts `vertical`, a geoid grid is missing, or
         it has no usable georeference.
+
+    Examples
+    --------
+    >>> open_dem("sample_data/dem.tif").heights([[33.35, 37.25]], "EPSG:4326").round(1)
+    array([723.5])
     """
     access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)
