@@ -320,6 +320,14 @@ def write_rpc_txt(rpc: RPC, path: str | PathLike[str]) -> None:
     ------
     InputError
         If the folder cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = f"{tempfile.mkdtemp()}/scene_RPC.TXT"
+    >>> write_rpc_txt(read_rpc_text("sample_data/scene_RPC.TXT"), path)
+    >>> open(path).readline().split()[0]
+    'LINE_OFF:'
     """
     fields = rpc_metadata(rpc)
     lines = [f"{key}: {fields[key]} {unit}" for key, (_, unit) in SCALARS.items()]

@@ -390,6 +390,14 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
     InputError
         For another suffix, an id that would change (with blanks around it, or several in a row), or a folder that
         cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = f"{tempfile.mkdtemp()}/points.csv"
+    >>> write_points(read_points("sample_data/gcps.geojson"), path)
+    >>> len(read_points(path))
+    18
     """
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
     suffix = Path(path).suffix.lower()
