@@ -1,4 +1,4 @@
-"""The bundle adjustment that is shown: that of `ortho adjust` to the points as they are now, and figures about it."""
+"""The bundle adjustment on the page: that of `ortho adjust` to the present points, and its figures."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 @dataclass(frozen=True, eq=False)
 class BlockSolution:
-    """An adjustment, or why there is none.
+    """An adjustment, or the reason why there is none.
 
     Parameters
     ----------
     models : mapping of label to SensorModel
-        Adjusted; as they were delivered where nothing was adjusted.
+        Adjusted models; the delivered ones without an adjustment.
     fit : BlockFit, optional
     error : str
-        What keeps it from being made, as people read it.
+        Why there is no adjustment, for people.
     left_out : LeftOutResiduals, optional
-        What each measurement is off by had it taken no part.
+        Leave-one-out residuals of all measurements.
     """
 
     models: Mapping[str, SensorModel]
@@ -46,7 +46,7 @@ class BlockSolution:
 def solve(
     starts: Mapping[str, Start], points: BlockPoints, hold: float | None, *, robust: bool = True
 ) -> BlockSolution:
-    """Adjust images and points as `ortho adjust` does; where not `robust`, gross errors are left in."""
+    """Adjust images and points, like `ortho adjust`; without `robust`, gross errors stay in."""
     models = {label: start.model for label, start in starts.items()}
     if not len(points):
         return BlockSolution(models)
@@ -60,13 +60,13 @@ def solve(
     except OrthoError as error:
         return BlockSolution(models, None, error.message)
     except np.linalg.LinAlgError as error:
-        # What is in the journal has to open again, whatever it is.
+        # The journal must open again, whatever points it has.
         return BlockSolution(models, None, f"the points cannot be adjusted ({error})")
     return BlockSolution(fit.models, fit, "", left_out)
 
 
 def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
-    """Return what the page shows of a solution, as JSON values; `relative` is one to a reference."""
+    """Return the figures of a solution for the page, as JSON values; `relative` means relative to a reference."""
     fit, without = solution.fit, solution.left_out
     if fit is None or without is None:
         return {"error": solution.error, "points": {}, "headline": _headline(solution, relative), "notices": []}
@@ -115,7 +115,7 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
 
 
 def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
-    """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
+    """Return the best available measure of accuracy and its description; never the residuals of the fit itself."""
     fit = solution.fit
     if fit is None or solution.left_out is None:
         return {"px": None, "m": None, "what": "no points yet"}
@@ -135,7 +135,7 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
 
 
 def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks: int) -> dict[str, Any]:
-    """Return the accuracy at control points whose ground was left out in turn, where others tell of all of it."""
+    """Return the leave-one-out accuracy of the ground of control points that the others determine."""
     apart = without.ground[fit.used_ground]
     apart = apart[np.isfinite(apart).all(axis=1)]
     if not len(apart) or not fit.redundancy:

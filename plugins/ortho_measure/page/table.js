@@ -1,4 +1,4 @@
-// The table of points, sorted by whatever is clicked.
+// The table of points, sorted by the column that is clicked.
 
 const number = (value, digits = 3) => (value === null || value === undefined ? '–' : value.toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
 const length = (pair) => (pair ? Math.hypot(...pair) : null);

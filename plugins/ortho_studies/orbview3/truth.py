@@ -409,7 +409,7 @@ def places(count: int, coast: Coast, seed: int, area: tuple[float, float] = FIEL
     Of some candidates for each other point the one that is farthest from all points is taken.
     """
     if count < 4:
-        raise InputError("a scene has at least 4 points", field="points")
+        raise InputError("a scene needs at least 4 points", field="points")
     random = np.random.default_rng([seed, 2])
     found = np.zeros((0, 2))
     while len(found) < count:
