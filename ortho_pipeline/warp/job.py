@@ -1,4 +1,4 @@
-"""What an engine is asked for, and what it answers: a job of the warp, and its outcome."""
+"""The request to an engine and its result: a job of the warp, and the record of its exactness."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ortho_pipeline.runtime.process_limits import Resources, require_memory, sta
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.warp import kernels
 
-#: The stage of a job that makes pixels, for its progress.
+#: Name of the stage that makes pixels, for progress.
 WARPING = "Warping"
 #: Kernels by the name on the command line, with the source pixels that each reads around the one that holds the point
 #: ('average': plus half of its box).
@@ -32,26 +32,26 @@ KERNELS = {
     "lanczos": (kernels.LANCZOS, 3),
     "average": (kernels.AVERAGE, 1),
 }
-#: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
+#: Memory of GDAL's warper per ortho pixel with geolocation arrays (bytes): 1.4 GB for 13.7 Mpx.
 _ARRAYS_BYTES = 100
 
 
 @dataclass(frozen=True)
 class WarpJob:
-    """An ortho to be made: what an engine needs to know but where it is written.
+    """An ortho to be made: everything that an engine needs, except its path.
 
     Parameters
     ----------
     surface : Surface
         The seam of a global DEM beside the grid (`Surface.around`).
     resampling, dem_interpolation : str
-        How pixels and heights are interpolated.
+        Interpolation of pixels and of heights.
     tolerance : float
         Bound on the geometric error in source pixels, for an engine that interpolates geometry.
     profile : Profile, optional
-        What the ortho looks like; like its source without.
+        Profile of the ortho; default: like its source.
     exported : RpcExport, optional
-        The RPC that represents the model (`rpc.export_rpc`), if there is one, for an engine that needs it.
+        An RPC that represents the model (`rpc.export_rpc`), for an engine that needs one.
     """
 
     model: SensorModel
@@ -68,17 +68,17 @@ class WarpJob:
     exported: RpcExport | None = None
 
     def look(self) -> Profile:
-        """Return what the ortho looks like."""
+        """Return the profile of the ortho."""
         return self.profile or Profile.of(self.source)
 
     def threads(self) -> int:
-        """Return how many threads there are for tiles, with as many again for GDAL, which waits for missing ones."""
+        """Return the number of threads for tiles; GDAL gets as many again, because it waits for missing ones."""
         wanted = self.resources.threads or os.cpu_count() or 1
         require_memory(self.resources.memory, 2 * wanted)
         return max(1, startable_threads(2 * wanted) // 2)
 
     def check(self) -> None:
-        """Refuse an unknown kernel, and pixels that cannot be interpolated."""
+        """Raise an error for an unknown kernel, or for pixels that cannot be interpolated."""
         if self.resampling not in KERNELS:
             raise InputError(
                 f"unknown resampling kernel {self.resampling!r}",
@@ -116,10 +116,10 @@ class WarpJob:
 
 
 class WarpRecord(Record):
-    """The exactness of the warp, in pixels of the image; the transformer is GDAL's where its warper made the ortho.
+    """Exactness of the warp, in pixels of the image; the transformer is that of GDAL if its warper made the ortho.
 
-    `hidden_share` is that of the pixels that the image reaches which terrain hides, null where nobody looked;
-    `filled_share` that of those which another ortho filled (`output.fill_from`), null where none was given.
+    `hidden_share` is the share of pixels within the image that terrain hides, null if not tested; `filled_share` is the
+    share that another ortho filled (`output.fill_from`), null without one.
     """
 
     # max_error_px bounds the difference between the geometry used and the exact model at every output pixel, or is what
@@ -138,7 +138,7 @@ class WarpRecord(Record):
     seconds: Annotated[float, pydantic.Field(exclude=True)] = 0.0
 
     def notes(self, memory: int) -> list[Notice]:
-        """Return a notice if GDAL's geolocation arrays took more memory (bytes) than was allowed, which they may."""
+        """Return a notice if GDAL's geolocation arrays took more memory (bytes) than the limit."""
         took = self.pixels * _ARRAYS_BYTES
         if self.transformer != "GEOLOC_ARRAY" or took <= memory:
             return []

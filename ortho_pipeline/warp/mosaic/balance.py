@@ -1,14 +1,13 @@
-r"""Brightness of the orthos of a mosaic, made alike: a gain and an offset of each ortho and band.
+r"""Balance the brightness of the orthos of a mosaic: a gain and an offset for each ortho and band.
 
 Where orthos i and j overlap, means over small cells, :math:`v_i` and :math:`v_j`, give an equation
 
 .. math:: a_i v_i + b_i = a_j v_j + b_j,
 
-all of them together one least-squares problem for each band. What changed in between (clouds, shadows, water) is no
-part of it: it begins with lines of repeated medians, which half of the cells cannot disturb, and goes on with Tukey's
-weights. No absolute brightness follows from differences, so the datum is that gains have a mean of 1 and offsets of 0
-over all orthos that hang together. What overlaps do not tell (a gain where all is equally bright) is held by a weak
-prior.
+all together are one least-squares problem for each band. Changes between the images (clouds, shadows, water) must not
+count: the start uses lines of repeated medians, which resist up to half of wrong cells, and the iteration uses Tukey's
+weights. Differences give no absolute brightness, so gains have a mean of 1 and offsets a mean of 0 over all connected
+orthos. A weak prior determines what overlaps do not (such as a gain where everything is equally bright).
 
 Source: Chandelier and Martinoty 2009, A radiometric aerial triangulation (the global adjustment); Siegel 1982 (repeated
 medians).
@@ -33,15 +32,15 @@ from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, box_of, intersection
 from ortho_pipeline.warp.mosaic.overlaps import Overlap
 from ortho_pipeline.warp.mosaic.reading import open_layers
 
-#: Side of a cell, of the windows that are read (px), and windows per side of an overlap, at most.
+#: Side of a cell, side of the windows that are read (px), and largest number of windows per side of an overlap.
 _CELL, _WINDOW, _PER_SIDE = 16, 128, 8
-#: Standard deviations of gains and of offsets (in spreads of the brightness) where nothing else tells of them.
+#: Prior standard deviations of gains and of offsets (in spreads of the brightness).
 _GAIN, _OFFSET = 0.5, 1.0
-#: Limit of Tukey's weights in robust standard deviations; steps, and cells that a line is taken through.
+#: Limit of Tukey's weights in robust standard deviations; number of steps, and of cells for a line.
 _TUKEY, _STEPS, _OF_A_LINE = 4.685, 20, 400
-#: Scatter about a line (in spreads of the brightness) below which it is no better for less.
+#: Lower limit of the scatter about a line (in spreads of the brightness).
 _LEAST_SCATTER = 0.01
-#: A gain beyond this, or below its inverse, says that two orthos do not show the same thing.
+#: A gain above this, or below its inverse, means that two orthos do not show the same thing.
 _LARGEST_GAIN = 5.0
 
 
@@ -69,13 +68,13 @@ class Balance:
     outlying: float
 
     def apply(self, layer: int, pixels: NDArray[np.floating]) -> Array:
-        """Return the pixels ``(bands, ...)`` of a layer as they are in the mosaic."""
+        """Return the pixels ``(bands, ...)`` of a layer with their brightness in the mosaic."""
         shape = (-1,) + (1,) * (pixels.ndim - 1)
         return np.asarray(pixels * self.gains[layer].reshape(shape) + self.offsets[layer].reshape(shape))
 
 
 def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) -> Balance:
-    """Return the gains and offsets that make the orthos of a mosaic alike where they overlap.
+    """Return the gains and offsets that give the orthos of a mosaic the same brightness where they overlap.
 
     Raises
     ------
@@ -141,7 +140,7 @@ def _windows(box: Box) -> list[Box]:
 def _cell_means(one: Array, other: Array, valid: NDArray[np.bool_]) -> Array:
     """Return the means of both ``(n, 2, bands)`` over the cells of a window that are valid in both.
 
-    A cell all of whose pixels are equal is saturated, or filled: it tells nothing.
+    A cell whose pixels are all equal is saturated or filled, and is not used.
     """
     rows, columns = valid.shape[0] // _CELL, valid.shape[1] // _CELL
     whole = (..., slice(0, rows * _CELL), slice(0, columns * _CELL))
@@ -179,10 +178,10 @@ def _solved(ends: NDArray[np.int_], cells: Array, count: int) -> tuple[Array, Ar
 
 
 def _start(ends: NDArray[np.int_], values: Array, count: int) -> Array:
-    """Return gains and offsets (gain, offset, gain, …) by lines that half of the cells of an overlap cannot disturb.
+    """Return gains and offsets (gain, offset, gain, …) from lines that resist wrong cells in up to half of an overlap.
 
-    The line of each overlap is that of repeated medians. Its slope is a ratio of gains, from which all follow; the
-    better cells lie on it, the more it counts.
+    Each overlap has a line of repeated medians. Its slope is a ratio of gains, and these give all gains. Lines with
+    less scatter have more weight.
     """
     pairs, which = np.unique(ends, axis=0, return_inverse=True)
     cells = [values[which.ravel() == k].T for k in range(len(pairs))]
@@ -210,7 +209,7 @@ def _line(first: Array, second: Array) -> tuple[float, float]:
 
 
 def _differences(pairs: NDArray[np.int_], wanted: Array, weight: Array, count: int) -> Array:
-    """Return values ``(count,)`` about 0 whose differences (second minus first) are as wanted, about."""
+    """Return values ``(count,)`` with mean 0 whose differences (second minus first) approximate the given ones."""
     rows = np.repeat(np.arange(len(pairs)), 2)
     design = sparse.csr_matrix((np.tile([-1.0, 1.0], len(pairs)), (rows, pairs.ravel())), shape=(len(pairs), count))
     weighted = design.T @ sparse.diags(weight / weight.max())
@@ -229,7 +228,7 @@ def _step(ends: NDArray[np.int_], values: Array, weight: Array, count: int) -> A
     normal = design.T @ sparse.diags(weight) @ design + sparse.diags(held)
     graph = sparse.csr_matrix((ones, (ends[:, 0], ends[:, 1])), shape=(count, count))
     parts, label = csgraph.connected_components(graph, directed=False)
-    # Of each part the sum of its gains, and that of its offsets.
+    # The sums of the gains and of the offsets of each part.
     which = np.stack([2 * label, 2 * label + 1], axis=1).ravel()
     datum = sparse.csr_matrix((np.ones(2 * count), (which, np.arange(2 * count))), shape=(2 * parts, 2 * count))
     wanted = np.stack([np.bincount(label, minlength=parts), np.zeros(parts)], axis=1).ravel()

@@ -1,4 +1,4 @@
-"""Orthos placed on their common grid, and which lies on top."""
+"""Orthos on their common grid, and their order."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
-#: Part of a pixel by which grids may differ: rounding of coordinates, no more.
+#: Largest offset of grids (in pixels), for rounding of coordinates.
 _SAME = 1e-3
 Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
 class Ortho:
-    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None where it is not known.
+    """An orthoimage of a mosaic; `relief_displacement` is that of a metre of height (m), None if unknown.
 
-    `accuracy` is the raster that `layers.accuracy` wrote of it.
+    `accuracy` is its raster of accuracy, as `layers.accuracy` writes it.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Ortho:
 
 @dataclass(frozen=True)
 class PlacedOrtho:
-    """An orthoimage and where it lies in the mosaic."""
+    """An orthoimage and its position in the mosaic."""
 
     ortho: Ortho
     grid: Grid
@@ -53,18 +53,18 @@ class Mosaic:
 
 
 def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
-    """Return where orthos lie on their common grid.
+    """Place orthos on their common grid.
 
     Parameters
     ----------
     order : {'best-view', 'first-on-top', 'most-accurate'}
-        What lies on top: the steepest view, in which errors of the DEM move pixels least, or the first; or at each
-        pixel the ortho with the smallest ce90 there (the steepest view of equal ones).
+        The topmost ortho: the steepest view, in which errors of the DEM move pixels least; the first; or at each pixel
+        the ortho with the smallest ce90 (of equal ones the steepest view).
 
     Raises
     ------
     InputError
-        If they do not share a grid, or differ in bands, type or nodata; if one has no accuracy that would decide.
+        If they have different grids, bands, types or nodata, or an ortho has no accuracy raster that is needed.
     """
     if not orthos:
         raise InputError("a mosaic needs an ortho", field="mosaic")
@@ -135,7 +135,7 @@ def box_of(layer: PlacedOrtho) -> Box:
 
 
 def intersection(one: Box, other: Box) -> Box | None:
-    """Return the common part of two boxes (left, top, right, bottom); None where there is none."""
+    """Return the common part of two boxes (left, top, right, bottom); None without one."""
     left, top, right, bottom = (
         max(one[0], other[0]),
         max(one[1], other[1]),
@@ -153,9 +153,9 @@ def windows(grid: Grid, side: int) -> Iterator[tuple[int, int, int, int]]:
 
 
 def circular_errors(layer: PlacedOrtho, left: int, top: int, width: int, height: int) -> NDArray[np.float32]:
-    """Return the circular error (m) in a window of an ortho, of the nearest pixel of its raster of accuracy.
+    """Return the circular error (m) in a window of an ortho, from the nearest pixel of its raster of accuracy.
 
-    Where nothing is known it is larger than any that is.
+    An unknown error is larger than any known one.
     """
     assert layer.ortho.accuracy is not None
     source = RasterSource(layer.ortho.accuracy)

@@ -1,4 +1,4 @@
-"""Pairs of orthos that overlap, and how well their content agrees there: phase correlation of patches."""
+"""Overlapping pairs of orthos, and the agreement of their positions, by phase correlation of patches."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, PlacedOrtho, box_of, 
 
 #: Side of the windows in which seams are measured.
 _SEAM_WINDOW = 384
-#: Windows per seam, at most, and patches in one that are enough.
+#: Largest number of windows per seam, and number of patches in a window that suffices.
 _SEAM_WINDOWS, _ENOUGH = 9, 4
-#: Sides of the patches that are correlated, the largest that the overlap allows; a quarter of it is the reach.
+#: Sides of correlated patches (the largest that fits the overlap is used); the search radius is a quarter.
 _PATCHES = (128, 64, 32)
-#: Pixels around a patch that have to be valid too: the edge of the values, blurred, is the same in both orthos.
+#: Pixels around a patch that must also be valid, because the blurred edge of the values is the same in both orthos.
 _MARGIN = 18
 
 
@@ -48,13 +48,13 @@ def overlaps(placed: Mosaic) -> list[Overlap]:
 
 
 def measure_seam(overlap: Overlap) -> dict[str, Any]:
-    """Measure how far the content of the second ortho of an overlap lies from that of the first, in pixels.
+    """Measure the shift of the second ortho of an overlap relative to the first, in pixels.
 
     Returns
     -------
     dict
-        `first`, `second`, `overlap_px`, `patches` (how many agreed upon by correlation), and over these `median_px`
-        [column, row], `rmse_px` and `largest_px` of the lengths; None where there is no patch.
+        `first`, `second`, `overlap_px`, `patches` (number of successful correlations), and over these `median_px`
+        [column, row], `rmse_px` and `largest_px` of the lengths; None without a patch.
     """
     first, second = overlap.first, overlap.second
     box = intersection(box_of(first), box_of(second))
@@ -100,8 +100,8 @@ def _ties(
 ) -> NDArray[np.float64]:
     """Return the shifts ``(N, 2)`` px of the patches of a window.
 
-    What is cut out at the same place in both is pulled towards no shift at all, so it is measured a second time around
-    what was found.
+    Patches at the same position in both orthos are biased towards zero shift, so each is measured again at the first
+    result.
     """
     ties = np.zeros((0, 2))
     if patch + 2 > min(one.shape):

@@ -1,4 +1,4 @@
-"""Pixels of the orthos of a mosaic, by places of the mosaic."""
+"""Pixels of the orthos of a mosaic, by positions in the mosaic."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Opened:
         self.layer, self.source = layer, RasterSource(layer.ortho.path, memory=memory)
 
     def read(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return pixels and which are valid ``(bands, h, w)`` of a box of the mosaic that lies in the ortho."""
+        """Return pixels and validity ``(bands, h, w)`` of a box of the mosaic within the ortho."""
         left, top = box[0] - self.layer.left, box[1] - self.layer.top
         values = self.source.read(left, top, box[2] - box[0], box[3] - box[1])
         good = self.source.read_valid(left, top, values)
         return values, np.ones(values.shape, dtype=bool) if good is None else np.broadcast_to(good, values.shape)
 
     def read_around(self, box: Box) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return pixels ``(bands, h, w)`` of any box of the mosaic, and which have values in all bands ``(h, w)``."""
+        """Return pixels ``(bands, h, w)`` of any box of the mosaic, and which are valid in all bands ``(h, w)``."""
         shape = box[3] - box[1], box[2] - box[0]
         values, valid = np.zeros((self.source.count, *shape)), np.zeros(shape, dtype=bool)
         inner = intersection(box, box_of(self.layer))

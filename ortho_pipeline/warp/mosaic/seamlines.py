@@ -1,13 +1,13 @@
-"""Which ortho each place of a mosaic is taken from: as its order has it, or along lines where orthos differ least.
+"""Choose the ortho of each pixel of a mosaic: by the order, or with seam lines where orthos differ least.
 
-The mosaic is looked at in cells, of one pixel where there are not too many. As the order has it (steepest view, first,
-most accurate) each cell belongs to the topmost ortho that fills it. A seam may move from there by `_REACH` pixels,
-where two orthos fill a cell: what lies farther from it keeps its ortho, and from these parts the rest is flooded in the
-order of the differences, the largest first. So regions meet where orthos differ least, and no seam crosses a car, a
-cloud or a roof that is not in both orthos if there is a way around. That is a watershed with markers: unlike a shortest
-path or a minimum cut it takes any number of orthos and any form of their overlaps at once, in n log n, and has one
-result.
-Small holes of an ortho (what was hidden from it) are filled exactly: seams around them do not move.
+The mosaic is divided into cells, of one pixel if there are not too many. By the order (steepest view, first, most
+accurate), each cell belongs to the topmost ortho that fills it. A seam can move by up to `_REACH` pixels where two
+orthos fill a cell. Cells farther away keep their ortho; from these markers, the rest is flooded in the order of the
+differences, the largest first. So regions meet where orthos differ least, and no seam crosses a car, a cloud or a roof
+that is not in both orthos, if there is a way around. This is a watershed with markers. Unlike a shortest path or a
+minimum cut, it handles any number of orthos and any form of overlaps at once, in n log n, with a unique result.
+
+Small holes of an ortho (hidden pixels) are filled exactly: seams around them do not move.
 
 Source: Soille 2006, Morphological image compositing.
 """
@@ -29,14 +29,13 @@ from ortho_pipeline.warp.mosaic.balance import Balance
 from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, box_of, circular_errors, intersection, windows
 from ortho_pipeline.warp.mosaic.reading import Opened, open_layers
 
-#: Cells of a mosaic, at most (100 bytes each, and 8 of each band), and side (px) of the windows that are read, about.
+#: Largest number of cells (100 bytes each, plus 8 for each band), and approximate side (px) of the windows.
 _CELLS, _WINDOW = 1 << 21, 1024
-#: So far (px) may a seam move from where the order has it, and at least so many cells.
+#: Largest move of a seam (px), and least number of cells for it.
 _REACH, _REACH_CELLS = 256, 8
-#: Steps of a factor of two in which differences are told apart, and those that are all alike: up to a quarter of the
-#: usual difference.
+#: Number of levels of differences, in factors of two; differences up to a quarter of the usual one are level 0.
 _LEVELS_PER_OCTAVE, _ALIKE = 2, 0.25
-#: Cells that a seam keeps away from a difference if it can: its edge is blurred, and seldom at one place in both.
+#: Distance (cells) of a seam from a difference, if possible, because edges are blurred and differ in position.
 _BESIDE = 2
 
 Labels = NDArray[np.int16]
@@ -44,16 +43,16 @@ Labels = NDArray[np.int16]
 
 @dataclass(frozen=True, eq=False)
 class Owners:
-    """The layer of each cell of a mosaic, -1 where there is none.
+    """The layer of each cell of a mosaic; -1 without one.
 
     Parameters
     ----------
     cell : int
         Pixels per side of a cell.
     ordered : (rows, columns)
-        As the order of the mosaic has it.
+        By the order of the mosaic.
     owners : (rows, columns)
-        With seams where they are.
+        With the final seams.
     """
 
     cell: int
@@ -67,19 +66,19 @@ class Owners:
 
 
 def owners_of(placed: Mosaic, balance: Balance | None, *, seamlines: bool, memory: int = MEMORY) -> Owners:
-    """Return which ortho each cell of a mosaic is taken from.
+    """Return the ortho of each cell of a mosaic.
 
     Parameters
     ----------
     balance : Balance, optional
-        Of the brightness that is compared.
+        Applied before brightness is compared.
     seamlines : bool
-        Whether seams may move to where orthos differ least.
+        Whether seams can move to where orthos differ least.
 
     Raises
     ------
     InputError
-        If pixels cannot be compared, because they are indices into a palette.
+        If pixels are palette indices, which cannot be compared.
     """
     opened = open_layers(placed, memory)
     for one in opened:
@@ -97,7 +96,7 @@ def owners_of(placed: Mosaic, balance: Balance | None, *, seamlines: bool, memor
 
 
 class _Cells:
-    """What is gathered of the cells of a mosaic, one layer after the other."""
+    """Statistics of the cells of a mosaic, collected layer by layer."""
 
     def __init__(self, placed: Mosaic, bands: int) -> None:
         self.placed, grid = placed, placed.grid
@@ -108,11 +107,11 @@ class _Cells:
         self.count = np.zeros(shape, dtype=np.int16)
         self.low = np.full((bands, *shape), np.inf, dtype=np.float32)
         self.high = np.full((bands, *shape), -np.inf, dtype=np.float32)
-        #: Of each layer the place of its cells, and which of them it fills.
+        #: Position of the cells of each layer, and which of them it fills.
         self.filled: list[tuple[tuple[slice, slice], NDArray[np.bool_]]] = []
 
     def add(self, number: int, one: Opened, balance: Balance | None) -> None:
-        """Look at all of a layer."""
+        """Add a layer."""
         step, box = self.cell, box_of(one.layer)
         place = (slice(box[1] // step, -(-box[3] // step)), slice(box[0] // step, -(-box[2] // step)))
         filled = np.zeros(self.top.shape, dtype=bool)
@@ -137,7 +136,7 @@ class _Cells:
         self.filled.append((place, filled[place].copy()))
 
     def _means(self, one: Opened, window: Box) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the means ``(bands, rows, columns)`` of the cells of a window, and which are full of values."""
+        """Return the means ``(bands, rows, columns)`` of the cells of a window, and which cells are full."""
         values, valid = one.read_around(window)
         counts = self._sums(valid.astype(np.int64))
         full = counts == self._sums(np.ones(valid.shape, dtype=np.int64))
@@ -148,7 +147,7 @@ class _Cells:
         return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=-2), columns, axis=-1))
 
     def _rank(self, number: int, one: Opened, window: Box) -> NDArray[np.float32]:
-        """Return the ranks of a layer in the cells of a window: the topmost has the least."""
+        """Return the ranks of a layer in the cells of a window; the topmost has the smallest."""
         shape = tuple(-(-(window[k + 2] - window[k]) // self.cell) for k in (1, 0))
         if not self.placed.by_pixel:
             return np.full(shape, number, dtype=np.float32)
@@ -163,13 +162,13 @@ class _Cells:
     # -- flooding ----------------------------------------------------------------------------------------------------
 
     def moved(self) -> Labels:
-        """Return the layers of the cells with seams where orthos differ least."""
+        """Return the layers of the cells with seams moved to where orthos differ least."""
         from skimage.segmentation import watershed
 
         free = (self.count > 1) & self._near_seams()
         markers = np.where(free, 0, self.top.astype(np.int32) + 1)
         level = np.where(free, self._levels(), 0)
-        # Markers are lowest: none of them begins when others have flooded everything already.
+        # Markers are lowest, so that all of them start before others flood everything.
         relief = np.where(free, -level, -level.max() - 1)
         found = watershed(relief, markers, mask=self.count > 0)
         _mend_cut_things(found, markers, level)
@@ -177,11 +176,11 @@ class _Cells:
         allowed = np.zeros(found.shape, dtype=bool)
         for number, (place, filled) in enumerate(self.filled):
             allowed[place] |= filled & (found[place] == number)
-        # Flooding does not know where an ortho ends.
+        # Flooding ignores the limits of orthos.
         return np.where(allowed, found, self.top).astype(np.int16)
 
     def _near_seams(self) -> NDArray[np.bool_]:
-        """Return the cells that are near to where the order has a seam; around small holes it has none."""
+        """Return the cells near a seam of the order, without seams around small holes."""
         reach, near = max(_REACH_CELLS, _REACH // self.cell), np.zeros(self.top.shape, dtype=bool)
         for number, (place, _) in enumerate(self.filled):
             part = tuple(slice(max(0, one.start - reach), one.stop + reach) for one in place)
@@ -192,7 +191,7 @@ class _Cells:
         return near
 
     def _levels(self) -> NDArray[np.int16]:
-        """Return how much orthos differ in steps, 0 where that is usual."""
+        """Return the differences of orthos in levels, 0 for usual ones."""
         overlap = self.count > 1
         most = np.zeros(self.top.shape, dtype=np.float32)
         for low, high in zip(self.low, self.high, strict=True):
@@ -207,10 +206,10 @@ class _Cells:
 
 
 def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level: NDArray[np.int16]) -> None:
-    """Give whole things to one ortho where that can be, from those that differ little to those that differ much.
+    """Assign objects completely to one ortho where possible, in the order of increasing difference.
 
-    A thing is a connected part that differs by a level or more. Flooding enters it from all sides where it is an island
-    in what is alike, and may cut it. Only one that joins two markers has to be cut.
+    An object is a connected part that differs by a level or more. If its surroundings do not differ, flooding enters it
+    from all sides and may cut it. Only an object that touches two markers must be cut.
     """
     neighbours = np.stack(
         [np.roll(np.pad(markers, 1), shift, axis)[1:-1, 1:-1] for shift in (-1, 1) for axis in (0, 1)]
@@ -227,7 +226,7 @@ def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level
         if not len(cells[0]):
             continue
         pairs, sizes = np.unique(np.stack([things[cells], found[cells]]), axis=1, return_counts=True)
-        # The last of a thing is the ortho that has most of it.
+        # The last value of an object is the ortho with its largest part.
         order = np.lexsort((-pairs[1], sizes, pairs[0]))
         owner = np.zeros(count + 1, dtype=found.dtype)
         owner[pairs[0][order]] = pairs[1][order]
@@ -235,7 +234,7 @@ def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level
 
 
 def _without_holes(mask: NDArray[np.bool_], area: int) -> NDArray[np.bool_]:
-    """Return a mask with its holes of less than an area (cells) filled."""
+    """Return a mask with holes smaller than an area (cells) filled."""
     labels, count = ndimage.label(~mask)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     small = sizes < area

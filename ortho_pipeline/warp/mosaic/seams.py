@@ -1,7 +1,7 @@
-"""How much orthos differ along the seams of a mosaic: in brightness, and by how many pixels their content is apart.
+"""Differences of orthos along the seams of a mosaic: in brightness, and in position (pixels).
 
-Places spread along each seam are looked at. Brightness is compared in a few pixels about a place, content by chips of
-the matcher: orientation correlation, then least squares.
+Samples are spread along each seam. Brightness is compared in a few pixels around a sample, position by chips of the
+matcher: orientation correlation, then least squares.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from ortho_pipeline.warp.mosaic.layout import Mosaic
 from ortho_pipeline.warp.mosaic.reading import Opened, open_layers
 from ortho_pipeline.warp.mosaic.seamlines import Labels
 
-#: Places of a seam that are looked at, at most; side of a chip, reach of its search, and of what is compared (px).
+#: Largest number of samples per seam; side of a chip, radius of its search, and radius of compared pixels (px).
 _PLACES, _CHIP, _REACH, _BESIDE = 48, 32, 8, 2
 _WIDE = _CHIP + 2 * _REACH
-#: What a match has to have: likeness in the search and after it, and how alike a second place may be.
+#: Limits for a match: correlation in the search and after it, and that of the second best position.
 _LEAST_SCORE, _LEAST_CORRELATION, _UNIQUE = 0.25, 0.4, 0.8
-#: Part of a chip that has to be valid.
+#: Least valid part of a chip.
 _SEEN = 0.95
 
 
 def along_seams(
     placed: Mosaic, labels: Labels, cell: int, balance: Balance | None, *, memory: int = MEMORY
 ) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return what is measured along the seams between cells of different layers, by the names of both.
+    """Return measurements along the seams between cells of different layers, by the names of both.
 
     Parameters
     ----------
     labels : (rows, columns)
         The layer of each cell, -1 for none.
     balance : Balance, optional
-        Of the brightness that is compared.
+        Applied before brightness is compared.
 
     Returns
     -------
@@ -108,9 +108,9 @@ def _measured(
 
 
 def _best_part(valid: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Return the part of a chip's size, of nine about the middle of a window, in which most is valid in both.
+    """Return the chip-sized part of a window (of nine around its middle) with the most valid pixels in both.
 
-    Where a seam runs along the end of an ortho, nothing about the middle is.
+    If a seam follows the edge of an ortho, the middle itself is not valid.
     """
     sums = np.pad(np.cumsum(np.cumsum(valid, axis=0), axis=1), ((1, 0), (1, 0)))
     starts = [_WIDE // 2 + step for step in (0, -(_WIDE // 2), _WIDE // 2)]
@@ -124,7 +124,7 @@ def _best_part(valid: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _shifts(chips: NDArray[np.float32]) -> Array:
-    """Return how far ``(n, 2)`` px the content of the second of two chips ``(n, 2, s, s)`` lies from the first's."""
+    """Return the shift ``(n, 2)`` px of the second of two chips ``(n, 2, s, s)`` relative to the first."""
     inner = (slice(None), slice(_REACH, -_REACH), slice(_REACH, -_REACH))
     known = [np.isfinite(part).mean(axis=(1, 2)) >= _SEEN for part in (chips[:, 0][inner], chips[:, 1])]
     chips = chips[known[0] & known[1]]

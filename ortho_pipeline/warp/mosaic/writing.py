@@ -24,12 +24,12 @@ _WINDOW = 2048
 
 
 def write_vrt(placed: Mosaic, path: Path) -> None:
-    """Write the mosaic as a VRT that refers to the orthos by relative paths; they have to lie below its folder.
+    """Write the mosaic as a VRT that refers to the orthos by relative paths; they must be below its folder.
 
     Raises
     ------
     InputError
-        If GDAL leaves an ortho out.
+        If GDAL omits an ortho.
     """
     if placed.by_pixel:
         raise InputError(
@@ -51,7 +51,7 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
         missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
         if missing or size != (placed.grid.width, placed.grid.height):
             raise InputError(
-                f"GDAL leaves out {', '.join(missing) or 'pixels'} in this VRT", file=path, remedy="write a COG"
+                f"GDAL omits {', '.join(missing) or 'pixels'} in this VRT", file=path, remedy="write a COG"
             )
 
 
@@ -69,9 +69,9 @@ def write_cog(
     Parameters
     ----------
     owners : Owners, optional
-        Which ortho a pixel is taken from, if that has a value there; else and without, as the order has it.
+        The ortho of each pixel, where it has a value; otherwise the order decides.
     balance : Balance, optional
-        What becomes of the pixels of each ortho; they are taken over as they are without.
+        Gains and offsets of each ortho; without it, pixels are copied unchanged.
     """
     opened = open_layers(placed, memory)
     profile, grid = Profile.of(opened[0].source), placed.grid
@@ -96,8 +96,8 @@ def write_cog(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """A window of the mosaic in the making: its pixels, which are valid, and where it is chosen pixel by pixel whose
-    they shall be and the ranks ``(h, w)`` of those that there are.
+    """A window of the mosaic while it is filled: pixels and validity; for a choice per pixel also the wanted layers and
+    the present ranks ``(h, w)``.
     """
 
     left: int
@@ -108,7 +108,7 @@ class _Window:
     best: NDArray[np.float32] | None
 
     def put(self, number: int, one: Opened, balance: Balance | None, profile: Profile, *, by_pixel: bool) -> int:
-        """Take from an ortho what has no value yet, or a worse rank; return how many values were clamped."""
+        """Copy pixels of an ortho where there is no value yet or a worse rank; return the number of clamped values."""
         _, height, width = self.pixels.shape
         box = intersection((self.left, self.top, self.left + width, self.top + height), box_of(one.layer))
         if box is None:
@@ -146,7 +146,7 @@ def _balanced(
     new: NDArray[np.bool_],
     profile: Profile,
 ) -> tuple[NDArray[Any], int]:
-    """Return pixels of an ortho as they are in the mosaic, and how many that are new were clamped."""
+    """Return pixels of an ortho with balanced brightness, and how many of the new ones were clamped."""
     exact = balance.apply(number, np.where(good, values, 0).astype(np.float64))
     low, high, _, fill = value_range(profile.dtype, profile)
     beyond = int(np.count_nonzero(((exact < low - 0.5) | (exact > high + 0.5)) & new))

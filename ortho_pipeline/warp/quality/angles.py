@@ -1,8 +1,8 @@
-"""Angles of view and of the sun at each place of an ortho, and what lies in shadow.
+"""Angles of view and of the sun at each pixel of an ortho, and shadows.
 
 Azimuths are clockwise from true north, towards sensor and sun, whatever the map; zenith angles are from the ellipsoid's
-normal, and the sun's incidence is from the normal of the terrain over a pixel of the layer. The sun stands at one place
-for the whole scene. Refraction is left out.
+normal, and the sun's incidence is from the normal of the terrain over a pixel of the layer. The sun has one direction
+for the whole scene. Refraction is ignored.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask of shadows, by their values; 0 stands for nothing.
+#: Classes of the mask of shadows by value; 0 means no value.
 LIT, SHADED, WITHOUT = 1, 2, 4
-#: Side of a tile, of the layer and of the mask, and pixels of the layer between nodes.
+#: Side of a tile of the layer and of the mask, and spacing of nodes in pixels of the layer.
 _TILE, _MASK_TILE, _SPACING = 256, 1024, 16
 _LEVELS = 3
 
 
 @dataclass(frozen=True)
 class Sun:
-    """Where the sun stands, degrees: azimuth from true north, elevation over the horizon.
+    """Position of the sun in degrees: azimuth from true north, elevation above the horizon.
 
     Raises
     ------
     InputError
-        If it does not stand over the horizon.
+        If it is not above the horizon.
     """
 
     azimuth_deg: float
@@ -52,25 +52,26 @@ class Sun:
     def __post_init__(self) -> None:
         if not (0.0 < self.elevation_deg <= 90.0 and abs(self.azimuth_deg) <= 360.0):
             raise InputError(
-                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} degrees are no position of the sun",
+                f"azimuth {self.azimuth_deg:g} and elevation {self.elevation_deg:g} degrees are not a valid "
+                f"position of the sun",
                 field="output.sun",
                 remedy="give the azimuth from north and an elevation above 0, in degrees",
             )
 
     @property
     def way(self) -> Array:
-        """Metres true east and north ``(2,)`` that a line to the sun goes per metre upwards."""
+        """Metres true east and north ``(2,)`` of a line to the sun per metre of height."""
         bearing, tangent = math.radians(self.azimuth_deg), 1.0 / math.tan(math.radians(self.elevation_deg))
         return tangent * np.array([math.sin(bearing), math.cos(bearing)])
 
     def way_over(self, sight: Sight) -> Callable[[Array, Array, Array], Array]:
-        """Return the function from output positions and heights to output pixels ``(n, 2)`` per metre upwards."""
+        """Return a function from output positions and heights to output pixels ``(n, 2)`` per metre of height."""
         return lambda columns, rows, heights: inverse_2x2(sight.metres(columns, rows, heights)) @ self.way
 
 
 @dataclass(frozen=True)
 class AnglesResult:
-    """Least and greatest zenith angle of view (degrees) where the image reaches; NaN where it does not."""
+    """Smallest and largest zenith angle of view (degrees) within the image; NaN if there is none."""
 
     view_zenith_deg: tuple[float, float]
 
@@ -89,18 +90,18 @@ def write_angles(
     sun: Sun | None = None,
     resources: Resources | None = None,
 ) -> AnglesResult:
-    """Write zenith and azimuth of view, and the sun's incidence, of the ortho on the grid of `sight` as a COG.
+    """Write zenith and azimuth of view, and the sun's incidence, for the ortho on the grid of `sight` as a COG.
 
-    Bands: view_zenith, view_azimuth and with a sun sun_incidence, degrees; NaN where the image does not reach.
+    Bands: view_zenith, view_azimuth and (with a sun) sun_incidence, degrees; NaN outside the image.
 
     Parameters
     ----------
     size : (int, int)
         Columns and rows of the image.
     heights : (float, float)
-        Lowest and highest ground of the scene, about.
+        Approximate lowest and highest ground of the scene.
     step : int
-        Pixels of the ortho to one of the layer, per side.
+        Pixels of the ortho per pixel of the layer, per side.
     """
     grid = layer_grid(sight.grid, step)
     own, names = sight.on(grid), ["view_zenith", "view_azimuth", *(["sun_incidence"] if sun else [])]
@@ -152,7 +153,7 @@ def _angles(
     lean = (fields[..., 0, 2:] + t * (fields[..., 1, 2:] + t * fields[..., 2, 2:])).reshape(-1, 2)
     metres = sight.metres(*flat, ground)
     east, north = np.einsum("nij,nj->in", metres, lean)
-    # A ray goes against the displacement; straight down it comes from nowhere in particular.
+    # A ray goes against the displacement; a vertical ray has no azimuth.
     found = [np.degrees(np.arctan(np.hypot(east, north))), np.degrees(np.arctan2(-east, -north)) % 360.0]
     if sun is not None:
         found.append(_incidence(sight, surface, flat, metres, sun.way))
@@ -168,14 +169,14 @@ def _between(sight: Sight, window: tuple[int, int, int, int], middle: float, hal
     across, down = (np.arange(-(-side // _SPACING) + 1) * _SPACING for side in (width, height))
     nodes = _nodes(sight, left + 0.5 + across, top + 0.5 + down, middle, half)
     if not np.isfinite(nodes).all():
-        # Where the model ends between nodes, every pixel is one.
+        # If the model ends between nodes, evaluate every pixel.
         return _nodes(sight, left + 0.5 + np.arange(width), top + 0.5 + np.arange(height), middle, half)
     by_row, by_column = (_weights(side) for side in (height, width))
     return np.asarray(np.einsum("rj,jikf,ci->rckf", by_row, nodes, by_column, optimize=True))
 
 
 def _nodes(sight: Sight, across: NDArray[Any], down: NDArray[Any], middle: float, half: float) -> Array:
-    """Return what `_between` does at nodes ``(rows, columns, levels, 4)``."""
+    """Return image points and displacements at nodes ``(rows, columns, levels, 4)``."""
     columns, rows = np.meshgrid(across, down)
     count = columns.size
     at = np.repeat(middle + half * levels(_LEVELS), count)
@@ -217,10 +218,10 @@ def write_shadows(
     resources: Resources | None = None,
     driver: str = "COG",
 ) -> float:
-    """Write which pixels of the ortho lie in shadow, their own or that of other terrain; return the share of shadow.
+    """Write the pixels of the ortho that are in shadow (their own, or of other terrain); return the share of shadow.
 
-    Byte: 1 in the sun, 2 in shadow, 4 without a height. A line from the pixel to the sun is followed over the surface,
-    exactly as lines of sight are (`visibility`).
+    Byte: 1 in the sun, 2 in shadow, 4 without a height. The line from the pixel to the sun is traced over the surface,
+    like lines of sight (`visibility`).
     """
     resources = resources or Resources()
     grid = sight.grid

@@ -20,11 +20,11 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Classes of the mask, by their values, with their names and colours; 0 stands for nothing.
+#: Classes of the mask by value, with names and colours; 0 means no value.
 CLASSES = {
     1: ("visible", "#d9e8d0"),
     2: ("hidden", "#b4500b"),
-    3: ("outside of the image", "#e6e6e6"),
+    3: ("outside the image", "#e6e6e6"),
     4: ("without a height", "#6b6b6b"),
 }
 VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
@@ -32,17 +32,17 @@ VISIBLE, BEHIND, OUTSIDE, WITHOUT = 1, 2, 3, 4
 
 @dataclass(frozen=True)
 class Hiding:
-    """Where an ortho is written, and what is done about pixels that terrain hides.
+    """Output of an ortho, and what to do with pixels that terrain hides.
 
     Parameters
     ----------
     ortho : path
     heights : (float, float)
-        Lowest and highest ground of the scene, about.
+        Approximate lowest and highest ground of the scene.
     mask : path, optional
-        Where the classes of all pixels are written; without it hidden pixels have no value in the ortho.
+        File for the classes of all pixels; without it, hidden pixels have no value in the ortho.
     other : Regridded, optional
-        The ortho whose pixels they have, where it shows them.
+        Ortho that fills hidden pixels where it has values.
     """
 
     ortho: str | os.PathLike[str]
@@ -51,7 +51,7 @@ class Hiding:
     other: Regridded | None = None
 
     def begun(self, model: SensorModel, surface: Surface, grid: Grid, window_bytes: int) -> Looked:
-        """Return the work on an ortho, which may hold so many bytes of heights at once."""
+        """Start the work on an ortho; `window_bytes` limits the heights in memory."""
         return Looked(self, grid, Visibility(Sight(model, grid), surface, self.heights, window_bytes))
 
 
@@ -69,31 +69,31 @@ class Looked:
 
     @property
     def hidden_share(self) -> float:
-        """Share of the pixels that the image reaches which terrain hides."""
+        """Share of the pixels within the image that terrain hides."""
         return self._hidden / max(self._shown, 1)
 
     @property
     def filled_share(self) -> float | None:
-        """Share of the same pixels that are those of another ortho; None where none is given."""
+        """Share of these pixels that another ortho filled; None without one."""
         return None if self.hiding.other is None else self._filled / max(self._shown, 1)
 
     def look(
         self, left: int, top: int, pixels: NDArray[Any], valid: NDArray[np.bool_], fill: Any
     ) -> tuple[NDArray[np.uint8] | None, NDArray[np.bool_] | None]:
-        """Return the classes of a tile ``(h, w)``, and which of its pixels are hidden; None where none is.
+        """Return the classes of a tile ``(h, w)``, and its hidden pixels; None if none is hidden.
 
-        Without a mask there are no classes, and hidden pixels get `fill`, no value.
+        Without a mask there are no classes, and hidden pixels get the value `fill`.
 
         Parameters
         ----------
         pixels, valid : (bands, h, w)
-            Of the tile, before they are written.
+            Of the tile, before writing.
         """
         height, width = pixels.shape[1:]
         found = self.visibility.look(left, top, width, height)
         shown: NDArray[np.bool_] = valid[0] if len(valid) == 1 else np.asarray(valid.any(axis=0))
         count = int(np.count_nonzero(shown))
-        # Most tiles of most terrain have nothing hidden: every look at all of their pixels is worth saving.
+        # Most tiles have no hidden pixels, so avoid every unnecessary pass over their pixels.
         hidden = np.asarray((found == HIDDEN) & shown) if found.any() else None
         with self._lock:
             self._shown += count
@@ -107,12 +107,12 @@ class Looked:
     def fill(
         self, left: int, top: int, hidden: NDArray[np.bool_] | None, pixels: NDArray[Any], valid: NDArray[np.bool_]
     ) -> None:
-        """Give the hidden pixels ``(h, w)`` of a tile the values of the other ortho, where it has any.
+        """Fill the hidden pixels ``(h, w)`` of a tile from the other ortho, where it has values.
 
         Parameters
         ----------
         pixels, valid : (bands, h, w)
-            Of the tile, as they are written.
+            Of the tile; changed in place.
         """
         if self.hiding.other is None or hidden is None or not hidden.any():
             return
@@ -128,7 +128,7 @@ class Looked:
             self._filled += int(np.count_nonzero(new.any(axis=0)))
 
     def writer(self, driver: str, threads: int) -> Any:
-        """Return the writer of the mask by a driver of GDAL as a context; of nothing where none is wanted."""
+        """Return the writer of the mask by a GDAL driver as a context; it writes nothing without a mask."""
         if self.hiding.mask is None:
             return contextlib.nullcontext()
         profile = classes_profile("visibility", CLASSES, {})
@@ -138,9 +138,9 @@ class Looked:
 
 
 def of_classes(driver: str) -> dict[str, str]:
-    """Return the creation options of a raster of classes, which is made of large parts that are all the same.
+    """Return the creation options of a raster of classes, which has large uniform areas.
 
-    Runs are counted four times as fast as they are deflated, and everything reads them; COGs have no such compression.
+    Run-length compression is four times as fast as deflate, and all programs read it; COGs do not offer it.
     """
     if driver == "GTiff":
         return {"COMPRESS": "PACKBITS"}
@@ -148,7 +148,7 @@ def of_classes(driver: str) -> dict[str, str]:
 
 
 def _classes(found: NDArray[np.uint8], shown: NDArray[np.bool_], hidden: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    # Two simple passes: the one through an index of booleans takes ten times as long.
+    # Two simple passes: boolean indexing takes ten times as long.
     classes = np.left_shift(shown.view(np.uint8), 1)
     np.subtract(OUTSIDE, classes, out=classes)
     if hidden is not None:
