@@ -149,26 +149,26 @@ def _whole(descriptor: int, path: Path) -> bytes:
 
 def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
     """Return the number of valid bytes, and their actions."""
-    found: list[dict[str, Any]] = []
+    actions: list[dict[str, Any]] = []
     start = 0
     while start < len(data):
         end = data.find(b"\n", start)
         if end < 0:
-            return start, found
+            return start, actions
         action = _action(data[start:end])
         if action is None:
             if end + 1 == len(data):
                 # After a power cut, a line can have its length but not its bytes.
-                return start, found
+                return start, actions
             raise InputError(
                 "the journal is damaged at this line, and later actions depend on it",
                 file=path,
-                field=f"line {len(found) + 1}",
+                field=f"line {len(actions) + 1}",
                 remedy=REMEDY,
             )
-        found.append(action)
+        actions.append(action)
         start = end + 1
-    return start, found
+    return start, actions
 
 
 def _action(line: bytes) -> dict[str, Any] | None:

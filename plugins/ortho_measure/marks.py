@@ -99,12 +99,12 @@ class Mark(Record):
     def places(self) -> set[tuple[object, ...]]:
         """Its positions, which no other point may have: readers would refuse a file with both."""
         images = {name: ray.image for name, ray in self.rays.items()} if self.rays else {"": self.image}
-        found: set[tuple[object, ...]] = {
+        positions: set[tuple[object, ...]] = {
             ("image", name, *np.round(place, 6).tolist()) for name, place in images.items() if place is not None
         }
         if self.ground is not None and not (self.rays and self.role == "tie"):
-            found.add(("ground", *np.round(self.ground, 8).tolist()))
-        return found
+            positions.add(("ground", *np.round(self.ground, 8).tolist()))
+        return positions
 
 
 def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) -> np.ndarray:
@@ -116,7 +116,7 @@ def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) 
 
 def errors_of(measured: Sequence[Mark | RayMark]) -> tuple[np.ndarray, np.ndarray]:
     """Return standard deviations ``(N,)`` and covariances ``(N, 2, 2)`` of measurements, as written to files."""
-    covariance = np.array([one.matrix for one in measured], dtype=float).reshape(-1, 2, 2)
+    covariance = np.array([mark.matrix for mark in measured], dtype=float).reshape(-1, 2, 2)
     sigma = sigma_of_covariance(covariance)
     for k in np.flatnonzero(~says_more(covariance)).tolist():
         sigma[k] = measured[k].sigma_image or sigma[k] if measured[k].covariance is None else sigma[k]
@@ -161,16 +161,16 @@ def checked(mark: Mark) -> Mark:
     return mark
 
 
-def _check_measurement(one: Mark | RayMark, where: str) -> None:
-    if one.image is not None and max(map(abs, one.image)) > 1e8:
+def _check_measurement(mark: Mark | RayMark, where: str) -> None:
+    if mark.image is not None and max(map(abs, mark.image)) > 1e8:
         raise InputError("this is not an image position", field=f"{where}image")
     least, most = _SIGMAS
-    if one.sigma_image is not None and not least <= one.sigma_image <= most:
+    if mark.sigma_image is not None and not least <= mark.sigma_image <= most:
         raise InputError(
             "a standard deviation must be positive", field=f"{where}sigma_image", remedy="give it in pixels"
         )
-    if one.covariance is not None:
-        column, row, both = one.covariance
+    if mark.covariance is not None:
+        column, row, both = mark.covariance
         possible = least**2 <= min(column, row) and max(column, row) <= most**2
         # Use a root: a power of a float can overflow 1e308.
         if not (possible and abs(both) < math.sqrt(column * row * (1 - 1e-9))):
@@ -264,10 +264,10 @@ def marks_of(points: Points, at: str) -> list[Mark]:
         Time of reading.
     """
     more = says_more(points.covariance_image)
-    found = []
+    marks = []
     for k, point in enumerate(points.to_crs(GROUND_CRS)):
         (column, both), (_, row) = point.covariance_image
-        found.append(
+        marks.append(
             checked(
                 Mark(
                     id=point.id,
@@ -287,7 +287,7 @@ def marks_of(points: Points, at: str) -> list[Mark]:
                 )
             )
         )
-    return found
+    return marks
 
 
 # -- actions ---------------------------------------------------------------------------------------------------------
@@ -348,7 +348,7 @@ def _changed(marks: Marks, action: Mapping[str, Any]) -> Marks:
     if kind == "begin":
         if marks.by_id or not isinstance(action.get("marks"), list):
             raise InputError("points can only be loaded into an empty table", field="marks")
-        return _begun([mark_of(one) for one in action["marks"]])
+        return _begun([mark_of(document) for document in action["marks"]])
     if kind == "put":
         return replace(marks, by_id=_with(marks.by_id, mark_of(action.get("mark")), action.get("was")))
     if kind == "remove":
@@ -372,10 +372,10 @@ def _require_members(action: Mapping[str, Any], members: set[str]) -> None:
 
 
 def _begun(marks: Sequence[Mark]) -> Marks:
-    found = {mark.id: mark for mark in marks}
-    if len(found) != len(marks) or len(found) > MOST_MARKS:
+    by_id = {mark.id: mark for mark in marks}
+    if len(by_id) != len(marks) or len(by_id) > MOST_MARKS:
         raise InputError(f"{counted(len(marks), 'point')}: too many, or two with the same name", field="marks")
-    return Marks(found)
+    return Marks(by_id)
 
 
 def _with(marks: Mapping[str, Mark], mark: Mark, was: object) -> dict[str, Mark]:

@@ -111,17 +111,17 @@ def measure_next(grid: PlanningGrid, fit: Fit | None, taken: Array) -> list[Next
     noise = np.eye(2) * (sigma * (1.0 if fit.sigma0 is None else fit.sigma0)) ** 2
     largest = _root(_variances(everywhere, fit.covariance).max(initial=0.0))
     left = np.arange(len(grid.image))
-    found: list[Next] = []
-    while len(left) and len(found) < OFFERED:
+    places: list[Next] = []
+    while len(left) and len(places) < OFFERED:
         alike = left[variance[left] >= (1 - ALIKE) * variance[left].max()]
         best = int(alike[apart(grid.image[alike], taken, 1)[0]])
         there = partials[best] @ fit.covariance
         gain = there.T @ np.linalg.solve(there @ partials[best].T + noise, there)
         then = _root(_variances(everywhere, fit.covariance - gain).max(initial=0.0))
         height = float(grid.ground[best, 2])
-        found.append(Next(_pair(grid.image[best]), _root(variance[best]), largest, then, height=height))
+        places.append(Next(_pair(grid.image[best]), _root(variance[best]), largest, then, height=height))
         taken, left = np.concatenate([taken, grid.image[[best]]]), left[left != best]
-    return found
+    return places
 
 
 def _variances(partials: Array, covariance: Array) -> Array:

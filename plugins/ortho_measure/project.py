@@ -78,8 +78,8 @@ class _Shown(abc.ABC):
         marks, history, version = list(self.marks.by_id.values()), self._history, self.version
         shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
         there = np.full((len(ahead), 3), np.nan)
-        for number in {one.number for one in ahead}:
-            rows = [k for k, one in enumerate(ahead) if one.number == number]
+        for number in {place.number for place in ahead}:
+            rows = [k for k, place in enumerate(ahead) if place.number == number]
             there[rows] = self.places_of(number).ground_about(
                 [ahead[k].image for k in rows], [ahead[k].height for k in rows]
             )
@@ -91,8 +91,8 @@ class _Shown(abc.ABC):
             "redo": history.can_redo,
             **self._figures(),
             "next": [
-                {**json_value(one), "places": places}
-                for one, places in zip(ahead, self._places(version, there), strict=True)
+                {**json_value(place), "places": places}
+                for place, places in zip(ahead, self._places(version, there), strict=True)
             ],
         }
 
@@ -297,8 +297,8 @@ class Project(_Shown):
 
     def _first(self) -> dict[str, Any]:
         """Return the first action of a journal."""
-        given = self._given()
-        if given is None and self.output.exists():
+        marks = self._given()
+        if marks is None and self.output.exists():
             raise InputError(
                 "this file already exists and was not made by ortho measure",
                 file=self.output,
@@ -309,7 +309,7 @@ class Project(_Shown):
             )
         return {
             "do": "begin",
-            "marks": [mark.to_json() for mark in given or ()],
+            "marks": [mark.to_json() for mark in marks or ()],
             "source": self._source(),
             "image": self._identity(),
             "at": now(),

@@ -79,16 +79,16 @@ def propose(places: SceneGeometry, image: Sequence[float], radius: float) -> Pro
     origin = np.round(np.asarray(image, dtype=float) - SIDE * factor / 2).astype(int)[None]
     scene = scene_chips(places.view, origin, SIDE, factor)
     wide = _rendered(places, origin, 2 * reach, factor)
-    found = found_again(scene, wide, reach)
+    match = found_again(scene, wide, reach)
     around = scene_chips(places.view, origin - reach * factor, SIDE + 2 * reach, factor)
-    doubt = str(doubts(found, wide, around, reach)[0])
+    doubt = str(doubts(match, wide, around, reach)[0])
     if not np.isfinite(wide).any():
         return _nothing("the reference has no data here")
-    shift, measured = found.shift[0] * factor, None
+    shift, measured = match.shift[0] * factor, None
     for _ in range(_ROUNDS):
         measured = _measured(places, origin, shift, factor, scene)
         if not np.isfinite(measured.shift).all():
-            return _nothing(REASONS[doubt or "not measured"], float(found.score[0]))
+            return _nothing(REASONS[doubt or "not measured"], float(match.score[0]))
         shift = shift + measured.shift[0] * factor
         if np.abs(measured.shift).max() < 0.02:
             break
@@ -118,28 +118,28 @@ def proposal_of(places: SceneGeometry, click: Array | None, ground: Array | None
         if click is None and not np.isfinite(expected).all():
             raise InputError("this place is outside the scene", field="ground", remedy="click it in the scene")
         about = expected if click is None else click
-        found = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
-        place, on_ground = about - found.shift, ground
+        match = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
+        place, on_ground = about - match.shift, ground
     elif click is None:
         raise InputError("no position to match", field="image")
     else:
-        found = propose(places, click.tolist(), radius)
+        match = propose(places, click.tolist(), radius)
         place, on_ground = click, np.full(3, np.nan)
-        if np.isfinite(found.shift).all():
-            on_ground = places.ground_of([click + found.shift])[0]
-    reason = found.reason or ("" if np.isfinite(on_ground).all() else "the DEM does not cover this place")
-    (column, both), (_, row) = found.covariance
-    told: dict[str, Any] = json_value(
+        if np.isfinite(match.shift).all():
+            on_ground = places.ground_of([click + match.shift])[0]
+    reason = match.reason or ("" if np.isfinite(on_ground).all() else "the DEM does not cover this place")
+    (column, both), (_, row) = match.covariance
+    document: dict[str, Any] = json_value(
         {
             "image": json_position(place),
             "ground": json_position(on_ground),
-            "score": found.score,
+            "score": match.score,
             "covariance": json_position([column, row, both]),
-            "scattered": found.scattered,
+            "scattered": match.scattered,
             "reason": reason,
         }
     )
-    return told
+    return document
 
 
 def _rendered(places: SceneGeometry, origins: NDArray[np.int_], radius: int, factor: int) -> NDArray[np.float32]:
@@ -165,11 +165,11 @@ def _covariance(
     origins = origins[inside][:_NEIGHBOURS]
     scene = scene_chips(places.view, origins, SIDE, factor)
     full = np.flatnonzero(np.isfinite(scene).all(axis=(1, 2)))
-    found = _measured(places, origins[full], shift, factor, scene[full]) if len(full) else None
-    good = np.zeros(0, dtype=int) if found is None else np.flatnonzero(np.isfinite(found.shift).all(axis=1))
-    if found is None or len(good) < _FEWEST:
+    neighbours = _measured(places, origins[full], shift, factor, scene[full]) if len(full) else None
+    good = np.zeros(0, dtype=int) if neighbours is None else np.flatnonzero(np.isfinite(neighbours.shift).all(axis=1))
+    if neighbours is None or len(good) < _FEWEST:
         return np.eye(2) * DEFAULT_SIGMA_IMAGE**2, 0
-    offsets, stated = found.shift[good] * factor, found.covariance[good] * factor**2
+    offsets, stated = neighbours.shift[good] * factor, neighbours.covariance[good] * factor**2
     # Relative to the median, because neighbours on other ground (a roof, a tree) may be far off.
     distance = squared_distances(offsets - np.median(offsets, axis=0), stated)
     # The median of chi-squared with two degrees of freedom is 2 log 2; the sample median removes part of the scatter.

@@ -58,7 +58,7 @@ class Session(Project):
     rendered: list[SensorModel]
 
     def __init__(self, scene: Scene, places: SceneGeometry, output: Path, request: Request) -> None:
-        maps = [Sheet(one, places.surface) for one in places.references if isinstance(one, Reference)]
+        maps = [Sheet(reference, places.surface) for reference in places.references if isinstance(reference, Reference)]
         super().__init__(output, places.surface, [places.view], maps)
         self.scene, self.places = scene, places
         self._request = request

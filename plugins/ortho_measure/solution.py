@@ -90,8 +90,8 @@ def figures(solution: LiveAdjustment, surface: Surface) -> dict[str, Any]:
     }
     for name, reason in fit.rejected:
         points[name] |= {"suspicious": True, "reason": reason}
-    for one in fit.outlying:
-        points[one.id] |= {"suspicious": True, "reason": one.reason}
+    for point in fit.outlying:
+        points[point.id] |= {"suspicious": True, "reason": point.reason}
     return {
         "error": "",
         "model": fit.model_name,
@@ -107,7 +107,7 @@ def figures(solution: LiveAdjustment, surface: Surface) -> dict[str, Any]:
         "rmse_m": rmse_metres(fit).given(),
         "sigma0": fit.sigma0,
         "redundancy": fit.redundancy,
-        "notices": [str(one) for one in solution.adjusted.warnings(surface)],
+        "notices": [str(notice) for notice in solution.adjusted.warnings(surface)],
     }
 
 

@@ -55,8 +55,8 @@ class _Tried:
             "loo_m": _rms(self.errors("control")),
             "rays": _rms(self.rays),
         }
-        told = {"model": self.name, "parameters": self.parameters, "error": self.solution.error or None, **figures}
-        return dict(json_value(told))
+        row = {"model": self.name, "parameters": self.parameters, "error": self.solution.error or None, **figures}
+        return dict(json_value(row))
 
 
 def compare_corrections(
@@ -95,8 +95,10 @@ def compare_corrections(
 
 def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     """Return the correction to take, and why."""
-    of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
-    of_rays = {one.name: one.rays for one in tried}
+    of_ground = {
+        candidate.name: np.concatenate([candidate.errors("check"), candidate.errors("control")]) for candidate in tried
+    }
+    of_rays = {candidate.name: candidate.rays for candidate in tried}
     for errors, what, unit in (
         (of_ground, "points (their ground coordinates left out)", "m"),
         (of_rays, "rays (leave-one-out)", "px"),
@@ -109,8 +111,10 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
             continue
         sizes = {name: _rms(values[common]) or 0.0 for name, values in tested.items()}
         smallest = min(sizes.values())
-        able = [one for one in tried if one.name in sizes and sizes[one.name] <= _WORTH * smallest]
-        chosen = min(able, key=lambda one: (one.parameters, sizes[one.name]))
+        able = [
+            candidate for candidate in tried if candidate.name in sizes and sizes[candidate.name] <= _WORTH * smallest
+        ]
+        chosen = min(able, key=lambda candidate: (candidate.parameters, sizes[candidate.name]))
         text = (
             f"RMSE {sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
         )

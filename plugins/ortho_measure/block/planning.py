@@ -124,15 +124,15 @@ def next_of_block(grid: BlockGrid, fit: BlockFit | None, taken: Array, *, tie: b
     everywhere = _Rows(fit, grid.everywhere, grid.seen_everywhere, tie)
     sigmas, largest = rows.sigmas(fit.covariance), everywhere.largest(fit.covariance)
     free = np.flatnonzero(np.isfinite(sigmas))
-    found: list[Next] = []
-    while len(free) and len(found) < OFFERED:
+    offers: list[Next] = []
+    while len(free) and len(offers) < OFFERED:
         alike = free[sigmas[free] ** 2 >= (1 - ALIKE) * sigmas[free].max() ** 2]
         best = int(alike[apart(places[alike], points, 1)[0]])
         then = everywhere.largest(rows.after(fit.covariance, best))
-        told = replace(_next(left, best), sigma=float(sigmas[best]), largest=largest, then=then)
-        found.append(replace(told, role="tie" if tie else "control"))
+        offer = replace(_next(left, best), sigma=float(sigmas[best]), largest=largest, then=then)
+        offers.append(replace(offer, role="tie" if tie else "control"))
         points, free = np.concatenate([points, places[[best]]]), free[free != best]
-    return found
+    return offers
 
 
 def _next(grid: BlockGrid, k: int) -> Next:
@@ -210,15 +210,15 @@ class _Rows:
 
     def largest(self, covariance: Array) -> float:
         """Return that at the worst place."""
-        return max((float(one.sigmas(covariance).max()) for one in self.batches), default=0.0)
+        return max((float(batch.sigmas(covariance).max()) for batch in self.batches), default=0.0)
 
     def after(self, covariance: Array, place: int) -> Array:
         """Return the covariance of the parameters after a measurement at a place."""
-        for one in self.batches:
-            for row in np.flatnonzero(one.of == place):
-                design = one.weighed[row]
-                there = design @ covariance[one.columns]
-                own = there[:, one.columns] @ design.T
+        for batch in self.batches:
+            for row in np.flatnonzero(batch.of == place):
+                design = batch.weighed[row]
+                there = design @ covariance[batch.columns]
+                own = there[:, batch.columns] @ design.T
                 return np.asarray(covariance - there.T @ np.linalg.solve(own + np.eye(len(own)), there))
         return covariance
 
@@ -226,8 +226,8 @@ class _Rows:
 def _ground_sigmas(fit: BlockFit) -> Array:
     """Return the standard deviations ``(3,)`` (m) that the ground of the next control point will have."""
     control = fit.points.sigma_ground[fit.used_ground]
-    found = np.array([fit.variances.sigma_xy or 0.0, fit.variances.sigma_xy or 0.0, fit.variances.sigma_h or 0.0])
+    sigmas = np.array([fit.variances.sigma_xy or 0.0, fit.variances.sigma_xy or 0.0, fit.variances.sigma_h or 0.0])
     for axis in range(3):
         stated = control[control[:, axis] > 0, axis]
-        found[axis] = np.median(stated) if len(stated) else found[axis]
-    return found
+        sigmas[axis] = np.median(stated) if len(stated) else sigmas[axis]
+    return sigmas

@@ -82,24 +82,24 @@ class ProposalPair:
             reach = float(NEAR)
         else:
             reach = radius + _SIGMAS * sigma_height * self.parallax(image)
-        found = propose(local, image.tolist(), reach)
-        if found.reason or not np.isfinite(found.shift).all():
-            return {"seen": True, "reason": found.reason, "score": found.score, "image": None}
-        place = self.second.image_of(local.ground_of(image[None] + found.shift))[0]
+        match = propose(local, image.tolist(), reach)
+        if match.reason or not np.isfinite(match.shift).all():
+            return {"seen": True, "reason": match.reason, "score": match.score, "image": None}
+        place = self.second.image_of(local.ground_of(image[None] + match.shift))[0]
         # The error of a match is that of both chips, half and half.
-        own = found.covariance / 2
-        told: dict[str, Any] = json_value(
+        own = match.covariance / 2
+        document: dict[str, Any] = json_value(
             {
                 "seen": True,
                 "reason": "" if np.isfinite(place).all() else "the DEM does not cover this place",
                 "image": json_position(place),
                 "covariance": _three(jacobian @ own @ jacobian.T),
                 "own": _three(own),
-                "score": found.score,
-                "scattered": found.scattered,
+                "score": match.score,
+                "scattered": match.scattered,
             }
         )
-        return told
+        return document
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +174,8 @@ class TieSearch:
             elif not self.referenced:
                 rays[label] = {"seen": True, "reason": "there is no reference image", "image": None}
             else:
-                found = proposal_of(known, None, place, reach)
-                rays[label] = {**found, "image": None if found["reason"] else found["image"], "seen": True}
+                match = proposal_of(known, None, place, reach)
+                rays[label] = {**match, "image": None if match["reason"] else match["image"], "seen": True}
         return {"rays": rays, "ground": None}
 
 

@@ -86,21 +86,21 @@ class BlockSession(Project):
         heights: SurfaceOptions = SurfaceOptions(),
     ) -> None:
         surface = images.places[0].surface
-        maps = [Sheet(one, surface) for one in references]
-        super().__init__(output, surface, [one.view for one in images.places], maps)
+        maps = [Sheet(reference, surface) for reference in references]
+        super().__init__(output, surface, [geometry.view for geometry in images.places], maps)
         self.images, self._options, self._heights = images, options, heights
         self._opened = list(opened) or [SceneOptions()] * len(images.paths)
         self._starts: dict[str | None, dict[str, Start]] = {}
         self._search = [
-            search_of(scene, match, metres_per_pixel(one.view)).distance / metres_per_pixel(one.view)
-            for scene, one in zip(images.scenes, images.places, strict=True)
+            search_of(scene, match, metres_per_pixel(geometry.view)).distance / metres_per_pixel(geometry.view)
+            for scene, geometry in zip(images.scenes, images.places, strict=True)
         ]
         usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
         stated = typical_sigma(surface)
         self._sigma_height = usual if stated is None else stated
         self.grid = BlockGrid.over(images.places, references)
-        self._everywhere = [self._spread(one) for one in images.places]
-        self.rendered = [tuple(one.model for one in images.places)]
+        self._everywhere = [self._spread(geometry) for geometry in images.places]
+        self.rendered = [tuple(geometry.model for geometry in images.places)]
         self._solution = BlockSolution(dict(zip(images.labels, self.rendered[0], strict=True)))
         self._begin()
 
@@ -149,9 +149,9 @@ class BlockSession(Project):
             If a model cannot be corrected so.
         """
         if correction not in self._starts:
-            asked = replace(self._options, points=None, correction=correction or self._options.correction)
+            options = replace(self._options, points=None, correction=correction or self._options.correction)
             self._starts[correction] = {
-                label: start_of(path, asked, opened, _nothing(), None)
+                label: start_of(path, options, opened, _nothing(), None)
                 for label, path, opened in zip(self.images.labels, self.images.paths, self._opened, strict=True)
             }
         return self._starts[correction]
@@ -194,16 +194,16 @@ class BlockSession(Project):
 
     def _grounds(self, marks: Sequence[Mark]) -> Array:
         """Return known ground, that of the adjustment for ties, and on the surface for what has one ray alone."""
-        found, fit = super()._grounds(marks), self._solution.fit
+        ground, fit = super()._grounds(marks), self._solution.fit
         adjusted = {} if fit is None else dict(zip(fit.points.ids, fit.ground, strict=True))
         for k, mark in enumerate(marks):
             if mark.ground is not None and mark.role != "tie":
                 continue
-            found[k] = adjusted.get(mark.id, np.full(3, np.nan))
-            if not np.isfinite(found[k]).all() and mark.rays:
+            ground[k] = adjusted.get(mark.id, np.full(3, np.nan))
+            if not np.isfinite(ground[k]).all() and mark.rays:
                 label, ray = next(iter(mark.rays.items()))
-                found[k] = self.places_of(self.images.labels.index(label)).ground_of([ray.image])[0]
-        return found
+                ground[k] = self.places_of(self.images.labels.index(label)).ground_of([ray.image])[0]
+        return ground
 
     def _sigma(self, ground: Array) -> list[float] | None:
         return None
@@ -220,11 +220,11 @@ class BlockSession(Project):
         return self.images.places[number].by(self.rendered[version][number])
 
     def _geometries(self, version: int) -> dict[str, Geometry]:
-        found: dict[str, Geometry] = {}
+        geometries: dict[str, Geometry] = {}
         for number in range(len(self.images.labels)):
-            found[f"scene-{number}"] = self.places_of(number)
-            found[f"reference-{number}"] = self.at(version, number)
-        return found | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
+            geometries[f"scene-{number}"] = self.places_of(number)
+            geometries[f"reference-{number}"] = self.at(version, number)
+        return geometries | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
 
     def rendering(self, name: str, version: int) -> SceneGeometry | None:
         kind, number = name.split("-")
@@ -274,11 +274,11 @@ class BlockSession(Project):
 
         with self._lock:
             self.save()
-            asked = self._asked()
+            options = self._asked()
         label, folder = self.images.labels[number], self.output.with_name(f"{self.output.stem}_ortho")
         path, own = self.images.paths[number], self._opened[number]
         with confined(self.output.parent):
-            block = adjust(self.images.paths, folder / "block", asked, self._opened)
+            block = adjust(self.images.paths, folder / "block", options, self._opened)
             opened = SceneOptions(model=block.files[f"{label} model"], allow_network=own.allow_network, roots=own.roots)
             return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
 

@@ -87,9 +87,9 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         point, label = points[table.ids[of]], table.images[image]
         point["residuals"][label] = json_position(fit.residuals[ray])
         point["loo"][label] = json_position(without.rays[ray])
-    for one in fit.rejected:
-        where = f" in {one.image}" if one.image else ""
-        points[one.point] |= {"suspicious": True, "reason": f"rejected{where}: {one.reason}"}
+    for error in fit.rejected:
+        where = f" in {error.image}" if error.image else ""
+        points[error.point] |= {"suspicious": True, "reason": f"rejected{where}: {error.reason}"}
     for doubt in fit.outlying:
         text = f"its {doubt.what} differs from the block by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
         points[doubt.point] |= {"suspicious": True, "reason": text}
@@ -110,7 +110,7 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
                 for label in table.images
             }
         ),
-        "notices": [str(one) for one in fit.warnings],
+        "notices": [str(notice) for notice in fit.warnings],
     }
 
 
@@ -120,18 +120,18 @@ def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
     if fit is None or solution.left_out is None:
         return {"px": None, "m": None, "what": "no points yet"}
     to = ", relative to the reference" if relative else ""
-    found = fit.object_rms()
-    if found is None or found.n < LEAST_CHECK_POINTS:
-        without = _left_out_in_turn(fit, solution.left_out, to, 0 if found is None else found.n)
-        if found is None or without["m"] is not None:
+    rmse = fit.object_rms()
+    if rmse is None or rmse.n < LEAST_CHECK_POINTS:
+        without = _left_out_in_turn(fit, solution.left_out, to, 0 if rmse is None else rmse.n)
+        if rmse is None or without["m"] is not None:
             return without
-    rays = [one for one in (fit.image_rms(image, "check") for image in fit.points.images) if one is not None]
-    count = sum(one.n for one in rays)
-    total = float(np.sqrt(sum(one.n * one.total**2 for one in rays) / count)) if count else None
-    few = f". Indicative: fewer than {ENOUGH_CHECK_POINTS} check points" if found.n < ENOUGH_CHECK_POINTS else ""
-    text = f"RMSE in plan; {found.h:.3f} m in height, at {counted(found.n, 'check point')}{to}{few}"
-    told: dict[str, Any] = json_value({"px": total, "m": found.plan, "n": found.n, "what": text})
-    return told
+    rays = [record for record in (fit.image_rms(image, "check") for image in fit.points.images) if record is not None]
+    count = sum(record.n for record in rays)
+    total = float(np.sqrt(sum(record.n * record.total**2 for record in rays) / count)) if count else None
+    few = f". Indicative: fewer than {ENOUGH_CHECK_POINTS} check points" if rmse.n < ENOUGH_CHECK_POINTS else ""
+    text = f"RMSE in plan; {rmse.h:.3f} m in height, at {counted(rmse.n, 'check point')}{to}{few}"
+    document: dict[str, Any] = json_value({"px": total, "m": rmse.plan, "n": rmse.n, "what": text})
+    return document
 
 
 def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks: int) -> dict[str, Any]:
@@ -143,5 +143,5 @@ def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks:
     few = f"Only {counted(checks, 'check point')}" if checks else "No check points"
     east, north, up = np.sqrt((apart**2).mean(axis=0)).tolist()
     text = f"RMSE in plan; {up:.3f} m in height, at {counted(len(apart), 'control point')} (leave-one-out){to}. {few}"
-    told: dict[str, Any] = json_value({"px": None, "m": math.hypot(east, north), "n": len(apart), "what": text})
-    return told
+    document: dict[str, Any] = json_value({"px": None, "m": math.hypot(east, north), "n": len(apart), "what": text})
+    return document

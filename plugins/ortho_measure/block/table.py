@@ -50,7 +50,7 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
     """
     table = block_points(marks, tuple(names), source)
     features = {label: {point.id: feature_of(point) for point in table.in_image(label)} for label in names}
-    found = []
+    collected = []
     for name in table.ids:
         mark = marks.by_id[name]
         for label in names:
@@ -66,9 +66,9 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
                 "ground_from": None if mark.role == "tie" else mark.ground_from,
                 **({"note": mark.note} if mark.note else {}),
             }
-            found.append(feature)
+            collected.append(feature)
     left = [mark.to_json() for mark in marks.by_id.values() if not mark.counts]
-    return {"type": "FeatureCollection", "features": found, **({"left_out": left} if left else {})}
+    return {"type": "FeatureCollection", "features": collected, **({"left_out": left} if left else {})}
 
 
 def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
@@ -82,7 +82,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
     ground = ground_transform(points.crs, GROUND_CRS)(points.ground)
     covariance = points.covariance_image
     more = says_more(covariance)
-    found = []
+    marks = []
     for k, name in enumerate(points.ids):
         rays = {}
         for ray in np.flatnonzero(points.point == k).tolist():
@@ -94,7 +94,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
                 covariance=(column, row, both) if more[ray] else None,
             )
         known = bool(np.isfinite(ground[k]).all())
-        found.append(
+        marks.append(
             checked(
                 Mark(
                     id=name,
@@ -109,4 +109,4 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
                 )
             )
         )
-    return found
+    return marks

@@ -31,11 +31,11 @@ const SEVERAL = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
   ['Rays', (mark) => rays(mark).length, counted],
-  ['Residual, px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
+  ['px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
   ['Leave-one-out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
   ['Plan, m', (mark) => plan(mark.loo_m), (mark) => number(plan(mark.loo_m), 2)],
-  ['Height, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
-  ['± Height, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
+  ['h, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
+  ['± h, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
 ];
 

@@ -65,7 +65,7 @@ class PageEntry:
     def knows(self, cookies: list[bytes]) -> bool:
         """Return whether the ``Cookie`` headers of a request have the cookie."""
         mine = _COOKIE + self._cookie.encode()
-        return any(secrets.compare_digest(one.strip(), mine) for header in cookies for one in header.split(b";"))
+        return any(secrets.compare_digest(cookie.strip(), mine) for header in cookies for cookie in header.split(b";"))
 
     def exchange(self, query: bytes) -> bytes | None:
         """Return the ``Set-Cookie`` header for the query of the address; None if it is wrong or was used before."""

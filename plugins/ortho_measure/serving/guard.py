@@ -127,13 +127,13 @@ async def _body(receive: Receive) -> bytes | None:
 
 def _replayed(body: bytes, receive: Receive) -> Receive:
     """Return a function that delivers a body that was already read."""
-    given = False
+    delivered = False
 
     async def again() -> MutableMapping[str, Any]:
-        nonlocal given
-        if given:
+        nonlocal delivered
+        if delivered:
             return await receive()
-        given = True
+        delivered = True
         return {"type": "http.request", "body": body, "more_body": False}
 
     return again
@@ -144,7 +144,7 @@ def _with_headers(send: Send) -> Send:
         if message["type"] == "http.response.start":
             own = list(message.get("headers", []))
             named = {name for name, _ in own}
-            message = {**message, "headers": [*own, *(one for one in HEADERS if one[0] not in named)]}
+            message = {**message, "headers": [*own, *(header for header in HEADERS if header[0] not in named)]}
         await send(message)
 
     return sending

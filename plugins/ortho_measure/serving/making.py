@@ -75,32 +75,32 @@ class Making:
 
     def _make(self, number: int) -> None:
         try:
-            made = self._session.ortho(self._advance, number)
+            result = self._session.ortho(self._advance, number)
         except OrthoError as error:
             self._tell({"state": "failed", "share": 0.0, "error": f"{error.message} ({error.remedy})"})
         except Exception as error:  # otherwise the page would wait forever
             self._tell({"state": "failed", "share": 0.0, "error": f"{type(error).__name__}: {error}"})
             raise
         else:
-            headline = made.document["report"]["headline"]
+            headline = result.document["report"]["headline"]
             with self._lock:
-                self._files = dict(made.files)
+                self._files = dict(result.files)
             self._tell(
                 {
                     "state": "done",
                     "share": 1.0,
                     "figure": headline["figure"],
                     "what": headline["what"],
-                    "files": [str(path) for path in made.files.values()],
+                    "files": [str(path) for path in result.files.values()],
                 }
             )
 
     def _advance(self, stage: str, share: float) -> None:
         self._tell({"state": "running", "stage": stage, "share": float(share)})
 
-    def _tell(self, told: dict[str, Any]) -> None:
+    def _tell(self, progress: dict[str, Any]) -> None:
         with self._lock:
-            self._told = {"number": self._told["number"], **told}
+            self._told = {"number": self._told["number"], **progress}
 
     def _file(self, name: str) -> Path:
         with self._lock:

@@ -363,15 +363,15 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
 
 
 def _asked(body: bytes) -> dict[str, Any]:
-    given = parse_json(body or b"{}", "request", _REMEDY)
-    if not isinstance(given, dict):
+    document = parse_json(body or b"{}", "request", _REMEDY)
+    if not isinstance(document, dict):
         raise InputError("a request must be a JSON object", remedy=_REMEDY)
     try:
-        json.dumps(given, ensure_ascii=False).encode()
+        json.dumps(document, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
         # JSON can contain unpaired surrogates, which files and answers cannot.
         raise InputError("this request has text that is not Unicode", field="request", remedy=_REMEDY) from error
-    return given
+    return document
 
 
 def _tile(request: Request) -> tuple[Any, ...]:
@@ -396,10 +396,10 @@ def _tile(request: Request) -> tuple[Any, ...]:
 
 
 def _bands(values: Any) -> list[int]:
-    found = [_whole(value) for value in values] if isinstance(values, list) else []
-    if len(found) not in (1, 3):
+    bands = [_whole(value) for value in values] if isinstance(values, list) else []
+    if len(bands) not in (1, 3):
         raise InputError("choose one band (grey) or three (colour)", field="bands")
-    return found
+    return bands
 
 
 def _whole(value: Any) -> int:

@@ -116,18 +116,18 @@ class TileServer:
                 return self._kept[key]
         pyramids = self._pyramids(name, band)
         if places is None:
-            made = pyramids[0].read(left, top, SIDE, SIDE, factor)
+            values = pyramids[0].read(left, top, SIDE, SIDE, factor)
         else:
             shown = [
                 replace(target, intensity=pyramid)  # type: ignore[type-var]  # all of them are dataclasses
                 for target, pyramid in zip(places.references, pyramids, strict=True)
             ]
-            made = Renderer(places.view, shown, np.array([[left, top]]), SIDE, factor).render(np.array([0]))[0]
+            values = Renderer(places.view, shown, np.array([[left, top]]), SIDE, factor).render(np.array([0]))[0]
         with self._lock:
-            self._kept[key] = made
+            self._kept[key] = values
             while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
-        return made
+        return values
 
     def _pyramids(self, name: str, band: int) -> list[Pyramid]:
         """Return the rasters of a view, opened when they are first asked for."""
