@@ -107,8 +107,8 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
     before, after, outlying = np.zeros(bands), np.zeros(bands), np.zeros(bands)
     for band in range(bands if len(cells) else 0):
         gains[:, band], offsets[:, band], good = _solved(which, cells[:, :, band], count)
-        made = cells[:, :, band] * gains[which, band] + offsets[which, band]
-        before[band], after[band] = (_rms(np.diff(values[good], axis=1)) for values in (cells[:, :, band], made))
+        adjusted = cells[:, :, band] * gains[which, band] + offsets[which, band]
+        before[band], after[band] = (_rms(np.diff(values[good], axis=1)) for values in (cells[:, :, band], adjusted))
         outlying[band] = 1.0 - good.mean()
     wrong = np.argwhere(~((gains > 1 / _LARGEST_GAIN) & (gains < _LARGEST_GAIN)))
     if len(wrong):
@@ -167,8 +167,8 @@ def _solved(ends: NDArray[np.int_], cells: Array, count: int) -> tuple[Array, Ar
     scale = 0.0
     for _ in range(_STEPS):
         pairs = unknowns.reshape(-1, 2)
-        made = values * pairs[ends, 0] + pairs[ends, 1]
-        residual = made[:, 0] - made[:, 1]
+        adjusted = values * pairs[ends, 0] + pairs[ends, 1]
+        residual = adjusted[:, 0] - adjusted[:, 1]
         scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
         weight = np.maximum(0.0, 1.0 - (residual / (_TUKEY * scale)) ** 2) ** 2
         unknowns = _step(ends, values, weight / scale**2, count)

@@ -89,12 +89,12 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     right = max(grid.left + grid.width * grid.dx for grid in grids)
     bottom = min(grid.top - grid.height * grid.dy for grid in grids)
     width, height = round((right - left) / first.dx), round((top - bottom) / first.dy)
-    whole = Grid(first.crs, left, top, first.dx, first.dy, width, height)
+    common = Grid(first.crs, left, top, first.dx, first.dy, width, height)
     layers = [
         PlacedOrtho(ortho, grid, round((grid.left - left) / first.dx), round((top - grid.top) / first.dy))
         for ortho, grid in zip(orthos, grids, strict=True)
     ]
-    return Mosaic(whole, tuple(layers), order == "most-accurate")
+    return Mosaic(common, tuple(layers), order == "most-accurate")
 
 
 def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
@@ -163,5 +163,5 @@ def circular_errors(layer: PlacedOrtho, left: int, top: int, width: int, height:
     steps = [round(size / pixel) for size, pixel in zip((own.dx, own.dy), (layer.grid.dx, layer.grid.dy), strict=True)]
     columns, rows = (np.arange(left, left + width) // steps[0], np.arange(top, top + height) // steps[1])
     part = source.read(int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1))
-    found = part[-1][np.ix_(rows - rows[0], columns - columns[0])]
-    return np.where(np.isfinite(found), found, np.finfo(np.float32).max).astype(np.float32)
+    errors = part[-1][np.ix_(rows - rows[0], columns - columns[0])]
+    return np.where(np.isfinite(errors), errors, np.finfo(np.float32).max).astype(np.float32)

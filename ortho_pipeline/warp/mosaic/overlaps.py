@@ -39,12 +39,12 @@ def overlaps(placed: Mosaic) -> list[Overlap]:
     """Return all pairs of layers that overlap, in the order of the layers."""
     outlines = [valid_outline(layer.ortho.path) for layer in placed.layers]
     tree = shapely.STRtree(outlines)
-    found = []
+    pairs = []
     for i, j in sorted({(int(a), int(b)) for a, b in tree.query(outlines, predicate="intersects").T if a < b}):
         area = shapely.intersection(outlines[i], outlines[j]).area / (placed.grid.dx * placed.grid.dy)
         if area >= 1:
-            found.append(Overlap(placed.layers[i], placed.layers[j], area))
-    return found
+            pairs.append(Overlap(placed.layers[i], placed.layers[j], area))
+    return pairs
 
 
 def measure_seam(overlap: Overlap) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def measure_seam(overlap: Overlap) -> dict[str, Any]:
 
 def _shifts(first: PlacedOrtho, second: PlacedOrtho, box: Box) -> NDArray[np.float64]:
     sources = [RasterSource(layer.ortho.path) for layer in (first, second)]
-    found = [np.zeros((0, 2))]
+    shifts = [np.zeros((0, 2))]
     for left, top, width, height in _windows(box):
         bands, valid = [], np.ones((height, width), dtype=bool)
         for layer, source in zip((first, second), sources, strict=True):
@@ -91,8 +91,8 @@ def _shifts(first: PlacedOrtho, second: PlacedOrtho, box: Box) -> NDArray[np.flo
             ties = _ties(one, other, valid, patch)
             if len(ties) >= _ENOUGH:
                 break
-        found.append(ties)
-    return np.concatenate(found)
+        shifts.append(ties)
+    return np.concatenate(shifts)
 
 
 def _ties(

@@ -32,9 +32,9 @@ class Opened:
         inner = intersection(box, box_of(self.layer))
         if inner is not None:
             part = (slice(inner[1] - box[1], inner[3] - box[1]), slice(inner[0] - box[0], inner[2] - box[0]))
-            found, good = self.read(inner)
+            pixels, good = self.read(inner)
             valid[part] = good.all(axis=0)
-            values[(slice(None), *part)] = np.where(good, found, 0)
+            values[(slice(None), *part)] = np.where(good, pixels, 0)
         return values, valid
 
 

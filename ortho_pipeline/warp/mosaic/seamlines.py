@@ -81,17 +81,17 @@ def owners_of(placed: Mosaic, balance: Balance | None, *, seamlines: bool, memor
         If pixels are palette indices, which cannot be compared.
     """
     opened = open_layers(placed, memory)
-    for one in opened:
-        if seamlines and one.source.palette:
+    for layer in opened:
+        if seamlines and layer.source.palette:
             raise InputError(
                 "seam lines cannot follow palette indices",
-                file=one.layer.ortho.path,
+                file=layer.layer.ortho.path,
                 field="mosaic.seamlines",
                 remedy="leave it out",
             )
     cells = _Cells(placed, opened[0].source.count)
-    for number, one in enumerate(opened):
-        cells.add(number, one, balance)
+    for number, layer in enumerate(opened):
+        cells.add(number, layer, balance)
     return Owners(cells.cell, cells.top, cells.moved() if seamlines else cells.top)
 
 
@@ -110,16 +110,16 @@ class _Cells:
         #: Position of the cells of each layer, and which of them it fills.
         self.filled: list[tuple[tuple[slice, slice], NDArray[np.bool_]]] = []
 
-    def add(self, number: int, one: Opened, balance: Balance | None) -> None:
+    def add(self, number: int, layer: Opened, balance: Balance | None) -> None:
         """Add a layer."""
-        step, box = self.cell, box_of(one.layer)
+        step, box = self.cell, box_of(layer.layer)
         place = (slice(box[1] // step, -(-box[3] // step)), slice(box[0] // step, -(-box[2] // step)))
         filled = np.zeros(self.top.shape, dtype=bool)
         for left, top, width, height in windows(self.placed.grid, max(1, _WINDOW // step) * step):
             window = left, top, left + width, top + height
             if intersection(window, box) is None:
                 continue
-            means, full = self._means(one, window)
+            means, full = self._means(layer, window)
             part = (slice(top // step, -(-window[3] // step)), slice(left // step, -(-window[2] // step)))
             if balance is not None:
                 means = balance.apply(number, means)
@@ -128,16 +128,16 @@ class _Cells:
                 low, high = self.low[band][part], self.high[band][part]
                 np.minimum(low, means[band], out=low, where=full)
                 np.maximum(high, means[band], out=high, where=full)
-            rank = self._rank(number, one, window)
+            rank = self._rank(number, layer, window)
             better = full & (rank < self.best[part])
             self.best[part] = np.where(better, rank, self.best[part])
             self.top[part] = np.where(better, number, self.top[part])
             self.count[part] += full
         self.filled.append((place, filled[place].copy()))
 
-    def _means(self, one: Opened, window: Box) -> tuple[Array, NDArray[np.bool_]]:
+    def _means(self, layer: Opened, window: Box) -> tuple[Array, NDArray[np.bool_]]:
         """Return the means ``(bands, rows, columns)`` of the cells of a window, and which cells are full."""
-        values, valid = one.read_around(window)
+        values, valid = layer.read_around(window)
         counts = self._sums(valid.astype(np.int64))
         full = counts == self._sums(np.ones(valid.shape, dtype=np.int64))
         return self._sums(values) / np.maximum(counts, 1), full
@@ -146,17 +146,17 @@ class _Cells:
         rows, columns = (np.arange(0, side, self.cell) for side in values.shape[-2:])
         return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=-2), columns, axis=-1))
 
-    def _rank(self, number: int, one: Opened, window: Box) -> NDArray[np.float32]:
+    def _rank(self, number: int, layer: Opened, window: Box) -> NDArray[np.float32]:
         """Return the ranks of a layer in the cells of a window; the topmost has the smallest."""
         shape = tuple(-(-(window[k + 2] - window[k]) // self.cell) for k in (1, 0))
         if not self.placed.by_pixel:
             return np.full(shape, number, dtype=np.float32)
         errors = np.zeros((window[3] - window[1], window[2] - window[0]))
-        inner = intersection(window, box_of(one.layer))
+        inner = intersection(window, box_of(layer.layer))
         assert inner is not None
         part = (slice(inner[1] - window[1], inner[3] - window[1]), slice(inner[0] - window[0], inner[2] - window[0]))
         size = inner[2] - inner[0], inner[3] - inner[1]
-        errors[part] = circular_errors(one.layer, inner[0] - one.layer.left, inner[1] - one.layer.top, *size)
+        errors[part] = circular_errors(layer.layer, inner[0] - layer.layer.left, inner[1] - layer.layer.top, *size)
         return np.asarray(self._sums(errors) / self._sums(np.ones(errors.shape)), dtype=np.float32)
 
     # -- flooding ----------------------------------------------------------------------------------------------------
@@ -170,14 +170,14 @@ class _Cells:
         level = np.where(free, self._levels(), 0)
         # Markers are lowest, so that all of them start before others flood everything.
         relief = np.where(free, -level, -level.max() - 1)
-        found = watershed(relief, markers, mask=self.count > 0)
-        _mend_cut_things(found, markers, level)
-        found = found.astype(np.int16) - 1
-        allowed = np.zeros(found.shape, dtype=bool)
+        labels = watershed(relief, markers, mask=self.count > 0)
+        _mend_cut_things(labels, markers, level)
+        labels = labels.astype(np.int16) - 1
+        allowed = np.zeros(labels.shape, dtype=bool)
         for number, (place, filled) in enumerate(self.filled):
-            allowed[place] |= filled & (found[place] == number)
+            allowed[place] |= filled & (labels[place] == number)
         # Flooding ignores the limits of orthos.
-        return np.where(allowed, found, self.top).astype(np.int16)
+        return np.where(allowed, labels, self.top).astype(np.int16)
 
     def _near_seams(self) -> NDArray[np.bool_]:
         """Return the cells near a seam of the order, without seams around small holes."""
@@ -205,7 +205,7 @@ class _Cells:
         return np.asarray(level, dtype=np.int16)
 
 
-def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level: NDArray[np.int16]) -> None:
+def _mend_cut_things(labels: NDArray[np.int32], markers: NDArray[np.int32], level: NDArray[np.int16]) -> None:
     """Assign objects completely to one ortho where possible, in the order of increasing difference.
 
     An object is a connected part that differs by a level or more. If its surroundings do not differ, flooding enters it
@@ -219,18 +219,18 @@ def _mend_cut_things(found: NDArray[np.int32], markers: NDArray[np.int32], level
     for threshold in np.unique(level[level > 0]):
         things, count = ndimage.label(level >= threshold)
         index = np.arange(1, count + 1)
-        cut = ndimage.minimum(found, things, index) < ndimage.maximum(found, things, index)
+        cut = ndimage.minimum(labels, things, index) < ndimage.maximum(labels, things, index)
         joins = ndimage.minimum(lowest, things, index) < ndimage.maximum(highest, things, index)
         mended = np.concatenate([[False], cut & ~joins])
         cells = np.nonzero(mended[things])
         if not len(cells[0]):
             continue
-        pairs, sizes = np.unique(np.stack([things[cells], found[cells]]), axis=1, return_counts=True)
+        pairs, sizes = np.unique(np.stack([things[cells], labels[cells]]), axis=1, return_counts=True)
         # The last value of an object is the ortho with its largest part.
         order = np.lexsort((-pairs[1], sizes, pairs[0]))
-        owner = np.zeros(count + 1, dtype=found.dtype)
+        owner = np.zeros(count + 1, dtype=labels.dtype)
         owner[pairs[0][order]] = pairs[1][order]
-        found[cells] = owner[things[cells]]
+        labels[cells] = owner[things[cells]]
 
 
 def _without_holes(mask: NDArray[np.bool_], area: int) -> NDArray[np.bool_]:

@@ -58,7 +58,7 @@ def along_seams(
 
 def _places(labels: Labels) -> dict[tuple[int, int], Array]:
     """Return the corners ``(n, 2)`` (column, row of cells) in the middle of the edges of each seam."""
-    found: dict[tuple[int, int], list[Array]] = {}
+    corners: dict[tuple[int, int], list[Array]] = {}
     for one, other, shift in (
         (labels[:, :-1], labels[:, 1:], (1.0, 0.5)),
         (labels[:-1], labels[1:], (0.5, 1.0)),
@@ -68,8 +68,8 @@ def _places(labels: Labels) -> dict[tuple[int, int], Array]:
         places = np.stack([columns + shift[0], rows + shift[1]], axis=1)
         for first, second in np.unique(ends, axis=0):
             which = (ends == (first, second)).all(axis=1)
-            found.setdefault((int(first), int(second)), []).append(places[which])
-    return {pair: np.concatenate(some) for pair, some in found.items()}
+            corners.setdefault((int(first), int(second)), []).append(places[which])
+    return {pair: np.concatenate(some) for pair, some in corners.items()}
 
 
 def _measured(
@@ -131,9 +131,9 @@ def _shifts(chips: NDArray[np.float32]) -> Array:
     if not len(chips):
         return np.zeros((0, 2))
     scene, target = np.ascontiguousarray(chips[:, 0][inner]), np.ascontiguousarray(chips[:, 1])
-    found = peaks(surfaces(orientation(scene), orientation(target)))
-    measured = least_squares.measure(scene, target, found.shift)
-    good = found.inside & (found.score >= _LEAST_SCORE) & (found.ratio <= _UNIQUE)
+    shifts = peaks(surfaces(orientation(scene), orientation(target)))
+    measured = least_squares.measure(scene, target, shifts.shift)
+    good = shifts.inside & (shifts.score >= _LEAST_SCORE) & (shifts.ratio <= _UNIQUE)
     with np.errstate(invalid="ignore"):
         good &= np.abs(measured.correlation) >= _LEAST_CORRELATION
     return np.asarray(measured.shift[good & np.isfinite(measured.shift).all(axis=1)])

@@ -79,7 +79,7 @@ def write_cog(
     clamped = shown = 0
     with RasterWriter(path, grid, profile, threads=threads) as writer:
         for left, top, width, height in windows(grid, _WINDOW):
-            made = _Window(
+            block = _Window(
                 left,
                 top,
                 np.full((profile.count, height, width), fill, dtype=profile.dtype),
@@ -87,10 +87,10 @@ def write_cog(
                 None if owners is None else owners.window(left, top, width, height),
                 np.full((height, width), np.inf, dtype=np.float32) if owners is not None or placed.by_pixel else None,
             )
-            for number, one in enumerate(opened):
-                clamped += made.put(number, one, balance, profile, by_pixel=placed.by_pixel)
-            shown += int(np.count_nonzero(made.valid))
-            writer.write(left, top, made.pixels, np.all(made.valid, axis=0))
+            for number, layer in enumerate(opened):
+                clamped += block.put(number, layer, balance, profile, by_pixel=placed.by_pixel)
+            shown += int(np.count_nonzero(block.valid))
+            writer.write(left, top, block.pixels, np.all(block.valid, axis=0))
     return clamped / max(shown, 1)
 
 
@@ -107,24 +107,24 @@ class _Window:
     owners: NDArray[np.int16] | None
     best: NDArray[np.float32] | None
 
-    def put(self, number: int, one: Opened, balance: Balance | None, profile: Profile, *, by_pixel: bool) -> int:
+    def put(self, number: int, layer: Opened, balance: Balance | None, profile: Profile, *, by_pixel: bool) -> int:
         """Copy pixels of an ortho where there is no value yet or a worse rank; return the number of clamped values."""
         _, height, width = self.pixels.shape
-        box = intersection((self.left, self.top, self.left + width, self.top + height), box_of(one.layer))
+        box = intersection((self.left, self.top, self.left + width, self.top + height), box_of(layer.layer))
         if box is None:
             return 0
         part = (slice(box[1] - self.top, box[3] - self.top), slice(box[0] - self.left, box[2] - self.left))
         place = (slice(None), *part)
         if self.best is None and self.valid[place].all():
             return 0
-        values, good = one.read(box)
+        values, good = layer.read(box)
         if self.best is None:
             new = ~self.valid[place] & good
         else:
             rank = np.full(values.shape[1:], number, dtype=np.float32)
             if by_pixel:
-                there = box[0] - one.layer.left, box[1] - one.layer.top
-                rank = circular_errors(one.layer, *there, box[2] - box[0], box[3] - box[1])
+                there = box[0] - layer.layer.left, box[1] - layer.layer.top
+                rank = circular_errors(layer.layer, *there, box[2] - box[0], box[3] - box[1])
             if self.owners is not None:
                 rank[self.owners[part] == number] = -1.0
             better = good.all(axis=0) & (rank < self.best[part])
@@ -150,7 +150,7 @@ def _balanced(
     exact = balance.apply(number, np.where(good, values, 0).astype(np.float64))
     low, high, _, fill = value_range(profile.dtype, profile)
     beyond = int(np.count_nonzero(((exact < low - 0.5) | (exact > high + 0.5)) & new))
-    made = as_written(exact, good, profile.dtype, fill)
+    balanced = as_written(exact, good, profile.dtype, fill)
     if profile.validity == "nodata":
-        keep_off_nodata(made, good, fill, low)
-    return made, beyond
+        keep_off_nodata(balanced, good, fill, low)
+    return balanced, beyond

@@ -289,7 +289,7 @@ class _Layer:
         low, high = heights
         self.middle, self.half = (low + high) / 2, max((high - low) / 2, 1.0)
         sources = [surface] if not isinstance(budget.heights, Surface) else [surface, budget.heights]
-        self.samplers = [one.sampler(sight.grid.crs) for one in sources]
+        self.samplers = [source.sampler(sight.grid.crs) for source in sources]
         self.spacing = self._spacing()
         grid = sight.grid
         self.stride = max(1, int(math.sqrt(grid.width * grid.height / _SAMPLE)))

@@ -90,16 +90,16 @@ class Looked:
             Of the tile, before writing.
         """
         height, width = pixels.shape[1:]
-        found = self.visibility.look(left, top, width, height)
+        visibility = self.visibility.look(left, top, width, height)
         shown: NDArray[np.bool_] = valid[0] if len(valid) == 1 else np.asarray(valid.any(axis=0))
         count = int(np.count_nonzero(shown))
         # Most tiles have no hidden pixels, so avoid every unnecessary pass over their pixels.
-        hidden = np.asarray((found == HIDDEN) & shown) if found.any() else None
+        hidden = np.asarray((visibility == HIDDEN) & shown) if visibility.any() else None
         with self._lock:
             self._shown += count
             self._hidden += 0 if hidden is None else int(np.count_nonzero(hidden))
         if self.hiding.mask is not None:
-            return _classes(found, shown, hidden), hidden
+            return _classes(visibility, shown, hidden), hidden
         if hidden is not None:
             pixels[:, hidden], valid[:, hidden] = fill, False
         return None, hidden

@@ -1,4 +1,4 @@
-"""Marks of several images as points of a block: the table that is adjusted, and the file that is read as the same."""
+"""Marks of several images as points of a block: the table for the adjustment, and the file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ortho_pipeline.points.image_errors import says_more
 
 
 def block_points(marks: Marks, labels: Sequence[str], source: str) -> BlockPoints:
-    """Return the points of the adjustment: marks that are whole and on, with images called by their labels."""
+    """Return the points of the adjustment: complete marks that are on, with the labels of their images."""
     used = [mark for mark in marks.by_id.values() if mark.counts]
     rays = [(k, label, mark.rays[label]) for k, mark in enumerate(used) for label in labels if label in mark.rays]
     sigma, covariance = errors_of([ray for _, _, ray in rays])
@@ -36,7 +36,7 @@ def block_points(marks: Marks, labels: Sequence[str], source: str) -> BlockPoint
 
 
 def _known(mark: Mark) -> tuple[float, ...]:
-    """Return the ground that is known of a mark; of a tie there is none."""
+    """Return the known ground of a mark; NaN for a tie."""
     return (np.nan,) * 3 if mark.role == "tie" or mark.ground is None else mark.ground
 
 
@@ -46,7 +46,7 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
     Parameters
     ----------
     names : mapping
-        Labels of the images to what files call them.
+        Labels of the images -> names in files.
     """
     table = block_points(marks, tuple(names), source)
     features = {label: {point.id: feature_of(point) for point in table.in_image(label)} for label in names}
@@ -77,7 +77,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
     Parameters
     ----------
     at : str
-        When they were read.
+        Time of reading.
     """
     ground = ground_transform(points.crs, GROUND_CRS)(points.ground)
     covariance = points.covariance_image

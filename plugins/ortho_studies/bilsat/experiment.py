@@ -213,7 +213,7 @@ def reproduce(
     dict
         As `tables.make_document` makes it.
     """
-    found = np.full((len(rows), realisations, len(QUANTITIES)), np.nan)
+    values = np.full((len(rows), realisations, len(QUANTITIES)), np.nan)
     vectors = np.full((realisations, 2), np.nan)
     for seed in range(realisations):
         scene = BilsatScene.make(off_nadir_deg, seed=seed)
@@ -221,16 +221,16 @@ def reproduce(
         position = geodetic(np.array([scene.survey(seed).position]))[0]
         for index, row in enumerate(rows):
             result = _fit(row, points, position)
-            found[index, seed] = _numbers(result)
+            values[index, seed] = _numbers(result)
             if (row.model, row.selection) == (RIGOROUS, f"even:{len(points)}") and result is not None:
                 vectors[seed] = _vector_statistics(points.image, result.residuals)
         if progress:
             progress((seed + 1) / realisations)
-    asked = [(row, k) for row in rows for k, number in enumerate(row.paper) if number is not None]
+    numbers = [(row, k) for row in rows for k, number in enumerate(row.paper) if number is not None]
     medians = {
         (row.label, QUANTITIES[k]): float(np.median(kept))
-        for row, k in asked
-        for kept in [found[rows.index(row), :, k][np.isfinite(found[rows.index(row), :, k])]]
+        for row, k in numbers
+        for kept in [values[rows.index(row), :, k][np.isfinite(values[rows.index(row), :, k])]]
         if len(kept)
     }
     seen = np.isfinite(vectors).any()
@@ -244,8 +244,8 @@ def reproduce(
         ),
         knobs=KNOBS,
         naive_text=NAIVE,
-        numbers=[Number(row.table, row.label, QUANTITIES[k], "px", row.paper[k], naive(row, k)) for row, k in asked],
-        found=np.stack([found[rows.index(row), :, k] for row, k in asked], axis=1),
+        numbers=[Number(row.table, row.label, QUANTITIES[k], "px", row.paper[k], naive(row, k)) for row, k in numbers],
+        found=np.stack([values[rows.index(row), :, k] for row, k in numbers], axis=1),
         titles=TITLES,
         statements=statements(medians, Vectors(*np.nanmedian(vectors, axis=0).tolist()) if seen else None),
     )

@@ -35,12 +35,12 @@ class Vectors:
 
 def statements(medians: Medians, vectors: Vectors | None = None) -> list[Statement]:
     """Return the statements whose rows were computed."""
-    found = []
+    checked = []
     for text, labels, test, excuse in _STATEMENTS:
         if all((label, quantity) in medians for label, quantity in labels):
             holds, detail = test({key: medians[key] for key in labels})
-            found.append(Statement(text, holds, detail, **excuse))
-    return found + ([] if vectors is None else _of_vectors(vectors))
+            checked.append(Statement(text, holds, detail, **excuse))
+    return checked + ([] if vectors is None else _of_vectors(vectors))
 
 
 def _of_vectors(vectors: Vectors) -> list[Statement]:

@@ -303,13 +303,13 @@ def reproduce(
         As `tables.make_document` makes it. The labels of s0 and of the extreme residuals begin with these words.
     """
     numbers = _numbers(rows)
-    found = np.full((realisations, len(rows), len(RMS) + len(OTHERS) + 1), np.nan)
+    values = np.full((realisations, len(rows), len(RMS) + len(OTHERS) + 1), np.nan)
     curves = np.full((realisations, len(CURVES), len(counts)), np.nan)
     rpcs = delivered_rpcs()
     for seed in range(realisations):
         block = Block.make(seed, rpcs)
         for k, row in enumerate(rows):
-            found[seed, k] = _found(block.fit(row.model, row.selection), row.geocentric)
+            values[seed, k] = _found(block.fit(row.model, row.selection), row.geocentric)
         # Curves are smooth; a fifth of the realisations shows them.
         if seed % 5 == 0:
             for k, model in enumerate(CURVES.values()):
@@ -324,11 +324,11 @@ def reproduce(
         naive_text=NAIVE,
         numbers=numbers,
         found=np.concatenate(
-            [found[:, :, : len(RMS)].reshape(realisations, -1), found[:, :, len(RMS) : -1].reshape(realisations, -1)],
+            [values[:, :, : len(RMS)].reshape(realisations, -1), values[:, :, len(RMS) : -1].reshape(realisations, -1)],
             axis=1,
         ),
         titles=TITLES,
-        statements=statements(dict(zip((row.label for row in rows), np.nanmedian(found, axis=0), strict=True))),
+        statements=statements(dict(zip((row.label for row in rows), np.nanmedian(values, axis=0), strict=True))),
         curves=_curves(curves, counts),
     )
 

@@ -251,7 +251,7 @@ def error_vectors(seed: int = 0) -> dict[str, tuple[Array, Array]]:
     drawn = Realisation.draw(seed)
     check = drawn.points.check
     fits = {name: fit_family(name, drawn.points, robust=False) for name in TABLE_2}
-    return {name: (drawn.points.image[check], found.residuals[check]) for name, found in fits.items()}
+    return {name: (drawn.points.image[check], fitted.residuals[check]) for name, fitted in fits.items()}
 
 
 def relief_check(drawn: Realisation) -> tuple[float, float]:
@@ -295,11 +295,11 @@ def _own_name(own: str, correction: str, count: int) -> tuple[str, str]:
 def _evaluate(drawn: Realisation) -> _Values:
     values: _Values = {}
     for name in TABLE_2:
-        found = fit_family(name, drawn.points, robust=False)
-        values[2, NAMES[name], "RMS check"] = _rms(found, "check")
-        values["A", NAMES[name], "leave-one-out"] = _rms(found, "loo")
-        kept = len(prune(found).fit.param_names)
-        values["A", NAMES[name], "share justified"] = kept / len(found.param_names)
+        fitted = fit_family(name, drawn.points, robust=False)
+        values[2, NAMES[name], "RMS check"] = _rms(fitted, "check")
+        values["A", NAMES[name], "leave-one-out"] = _rms(fitted, "loo")
+        kept = len(prune(fitted).fit.param_names)
+        values["A", NAMES[name], "share justified"] = kept / len(fitted.param_names)
     for row in OWN:
         values["B", *_own_name(*row)] = _check_error(_own_fit, drawn, *row)
     return values
@@ -345,8 +345,8 @@ def _check_error(make: Callable[..., Fit], *given: Any, **options: Any) -> float
         return float("nan")
 
 
-def _rms(found: Fit, which: str) -> float:
-    numbers = found.rmse(which)
+def _rms(fitted: Fit, which: str) -> float:
+    numbers = fitted.rmse(which)
     return float("nan") if numbers is None else numbers.total
 
 
@@ -364,12 +364,12 @@ def statements(table: Array) -> list[Statement]:
     groups = [table[:, [names.index(name) for name in group]] for group in (order[:2], order[2:4], order[4:])]
     apart = [(one.max(axis=1) < other.min(axis=1)).mean() for one, other in pairwise(groups)]
     best = (table.argmin(axis=1) == names.index("dlt")).mean()
-    said = {name: f"{NAMES[name]} {medians[names.index(name)]:.2f}" for name in names}
+    labels = {name: f"{NAMES[name]} {medians[names.index(name)]:.2f}" for name in names}
     return [
         Statement(
             "The models rank: " + ", ".join(NAMES[name] for name in order) + ".",
             ours == order,
-            ", ".join(said[name] for name in ours) + f" m; {100 * ordered:.0f} % of the realisations have all six so",
+            ", ".join(labels[name] for name in ours) + f" m; {100 * ordered:.0f} % of the realisations have all six so",
         ),
         Statement(
             "The DLT model was the best model for the test area.",
@@ -379,7 +379,7 @@ def statements(table: Array) -> list[Statement]:
         Statement(
             "An accuracy of 1.1 m is achieved with DLT.",
             medians[names.index("dlt")] < 1.25,
-            f"{said['dlt']} m; the paper’s table has 1.19 m",
+            f"{labels['dlt']} m; the paper’s table has 1.19 m",
             "The noise of pointing was fitted to this row.",
             by_settings=True,
         ),
@@ -392,12 +392,12 @@ def statements(table: Array) -> list[Statement]:
 
 
 def _relief_note(relief: Array) -> str:
-    expected, found = np.median(relief, axis=0)
+    expected, estimated = np.median(relief, axis=0)
     spread = np.percentile(relief[:, 1] / relief[:, 0], (5, 95))
     return (
         "A check that needs no adjustment: the error of 2D affine should be what a plane does not explain of the "
         f"heights, over the tangent of the satellite’s elevation. That is {expected:.2f} m; the adjustment has "
-        f"{found:.2f} m (ratio {spread[0]:.2f} to {spread[1]:.2f} in 90 % of the realisations)."
+        f"{estimated:.2f} m (ratio {spread[0]:.2f} to {spread[1]:.2f} in 90 % of the realisations)."
     )
 
 

@@ -153,13 +153,13 @@ def _write_points(measured: Points, cuts: list[SimulatedComponent], path: Path) 
 
 
 def _write_image(
-    out: Path, cut: SimulatedComponent, whole: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
+    out: Path, cut: SimulatedComponent, scene: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
 ) -> Iterator[tuple[str, Path]]:
     grid = _of_band(cut.scene, band)
     name = "_".join(
         ["", *([] if cut.identifier == "0000000" else [cut.identifier]), *([] if band == "pan" else [band])]
     )
-    first = round((grid.west - whole.west) / grid.pixel)
+    first = round((grid.west - scene.west) / grid.pixel)
     path = out / f"po_{ORDER}_{band}_{cut.identifier}.tif"
     _write_tiff(path, pixels[:, first : first + grid.columns], grid)
     yield f"image{name}".rstrip("_"), path

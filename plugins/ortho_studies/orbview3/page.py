@@ -68,9 +68,9 @@ def page(document: Mapping[str, Any], vectors: Mapping[str, tuple[Array, Array]]
     )
 
 
-def _vectors(number: int, model: str, scene: str, found: tuple[Array, Array], bar: float) -> Figure:
+def _vectors(number: int, model: str, scene: str, vectors: tuple[Array, Array], bar: float) -> Figure:
     """Draw residuals on the ground, enlarged, as on a map: east to the right, north up; `bar` (m) is the scale bar."""
-    where, shifts = found
+    where, shifts = vectors
     low, high = where.min(axis=0) - _MARGIN, where.max(axis=0) + _MARGIN
     scale = _WIDE / float(high[0] - low[0])
     tall, unit = float(high[1] - low[1]) * scale, _WIDE / 14 / bar

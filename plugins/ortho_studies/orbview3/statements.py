@@ -212,15 +212,15 @@ def _on_edges() -> Iterator[Statement]:
 
 def relative_deviation(findings: Findings) -> dict[str, list[float]]:
     """Return the relative standard deviation (m) per class of distance: scenes and axes, over all realisations."""
-    found = {}
+    deviations = {}
     for scene, analyses in findings.analyses.items():
         for k, axis in enumerate("XY"):
             squares: list[list[float]] = [[] for _ in CLASSES[1:]]
             for analysis in analyses:
                 for one in analysis.classes:
                     squares[CLASSES.index(one.from_m)].append(one.relative[k] ** 2)
-            found[f"{scene} {axis}"] = [float(np.sqrt(np.mean(part))) for part in squares]
-    return found
+            deviations[f"{scene} {axis}"] = [float(np.sqrt(np.mean(part))) for part in squares]
+    return deviations
 
 
 def edges(enhancement: float) -> dict[str, tuple[float, float]]:

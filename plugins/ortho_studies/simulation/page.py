@@ -57,11 +57,12 @@ def text(document: Mapping[str, Any]) -> str:
             ours = "".join(f" {_number(row[key]):>7}" for key in ("paper", "median", "p5", "p95", "naive"))
             lines.append(f"{marks} {row['label']:<{wide}} {row['quantity']:<{narrow}} {row['units']:<2}{ours}")
         lines.append("")
-    for one in document["statements"]:
-        why = f" {one['why']}" if one["why"] else ""
+    for statement in document["statements"]:
+        why = f" {statement['why']}" if statement["why"] else ""
         lines.append(
-            f"{'!' if one['verdict'] == VERDICTS[2] else ' '} {one['text']} {_capital(one['verdict'])}: "
-            f"{one['detail']}.{why}"
+            f"{'!' if statement['verdict'] == VERDICTS[2] else ' '} {statement['text']} "
+            f"{_capital(statement['verdict'])}: "
+            f"{statement['detail']}.{why}"
         )
     return "\n".join([*lines, *([""] if document["statements"] else []), *verdict(document)])
 
@@ -97,7 +98,7 @@ def verdict(document: Mapping[str, Any]) -> list[str]:
             f"spread ({draws['covered']} are between our 5th and 95th percentile)."
         )
     if document["statements"]:
-        numbers = [sum(one["verdict"] == which for one in document["statements"]) for which in VERDICTS]
+        numbers = [sum(statement["verdict"] == which for statement in document["statements"]) for which in VERDICTS]
         sentences.append(
             f"Of {sum(numbers)} statements of the paper, {numbers[0]} are reproduced, {numbers[1]} are true because of "
             f"the settings, and {numbers[2]} are not reproduced."
@@ -225,19 +226,19 @@ def draw_vectors(
 def draw_curve(curve: Mapping[str, Any]) -> Drawing:
     """Draw the series of a `Curve` (as JSON) as lines, each with its name at its end."""
     drawing = Drawing(640, 380, curve["title"], "curve")
-    xs = [value for one in curve["series"] for value in one["x"]]
-    ys = [value for one in curve["series"] for value in one["y"] if value is not None]
+    xs = [value for series in curve["series"] for value in series["x"]]
+    ys = [value for series in curve["series"] for value in series["y"] if value is not None]
     low, high = min(ys, default=0.0), max(ys, default=1.0)
     reach = (high - low) or 1.0
     floor = 0.0 if low >= 0 else low - 0.05 * reach
     axes = Axes(drawing, (58.0, 14.0, 430.0, 306.0), (min(xs), max(xs)), (floor, high + 0.05 * reach))
     axes.draw(curve["x_label"], curve["y_label"])
     ends: list[tuple[float, int, str]] = []
-    for k, one in enumerate(curve["series"]):
-        known = [(x, y) for x, y in zip(one["x"], one["y"], strict=True) if y is not None]
+    for k, series in enumerate(curve["series"]):
+        known = [(x, y) for x, y in zip(series["x"], series["y"], strict=True) if y is not None]
         if known:
             drawing.path(f"series-{k % 9}", [axes.at(x, y) for x, y in known])
-            ends.append((axes.at(*known[-1])[1], k, one["name"]))
+            ends.append((axes.at(*known[-1])[1], k, series["name"]))
     level = -np.inf
     for y, k, name in sorted(ends):
         level = max(y, level + 15)
