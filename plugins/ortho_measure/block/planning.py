@@ -1,9 +1,9 @@
 r"""Planning a block: the best place for the next point of all images together, and its gain.
 
-The method is that for one image (`ortho_measure.planning`), with the rows of all images that show a place. For a
-control point, whose ground is known with a covariance :math:`\Sigma`, the predictions have the covariance :math:`A C A^T` and
-are measured with :math:`R = s^2 I + B \Sigma B^T`. For a tie the ground is unknown and is eliminated from the rows; the
-rest is the predicted distance of the rays from each other.
+The method is that for one image (`ortho_measure.planning`), with the rows of all images that show a place. The ground
+of a control point is known with a covariance :math:`\Sigma`: predictions have the covariance :math:`A C A^T`, and are
+measured with :math:`R = s^2 I + B \Sigma B^T`. The ground of a tie is unknown and is eliminated from the rows; the rest
+is the predicted distance of the rays from each other.
 """
 
 from __future__ import annotations
