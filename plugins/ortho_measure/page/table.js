@@ -11,14 +11,14 @@ const ONE = [
   ['Column, px', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
   ['Row, px', (mark) => mark.residual?.[1] ?? null, (mark) => number(mark.residual?.[1])],
   ['Ground, m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
-  ['Leave-one-out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
+  ['Left out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
   ['Method', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
 ];
 
-const hands = { matched: 'match', manual: 'manual' };
+const hands = { matched: 'match', manual: 'click' };
 const rays = (mark) => Object.values(mark.rays ?? {});
-/** How many rays there are by each method: 2 match, 1 manual. */
+/** How many rays there are by each method: 2 match, 1 click. */
 function counted(mark) {
   const found = {};
   for (const { how } of rays(mark)) found[hands[how] ?? how] = (found[hands[how] ?? how] ?? 0) + 1;
@@ -32,7 +32,7 @@ const SEVERAL = [
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
   ['Rays', (mark) => rays(mark).length, counted],
   ['px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
-  ['Leave-one-out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
+  ['Left out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
   ['Plan, m', (mark) => plan(mark.loo_m), (mark) => number(plan(mark.loo_m), 2)],
   ['h, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
   ['± h, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
