@@ -13,15 +13,15 @@ const ONE = [
   ['Ground, m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
   ['Left out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
-  ['Method', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
+  ['Method', (mark) => mark.how, (mark) => (methods[mark.how] ?? mark.how)],
 ];
 
-const hands = { matched: 'match', manual: 'click' };
+const methods = { matched: 'match', manual: 'click' };
 const rays = (mark) => Object.values(mark.rays ?? {});
 /** How many rays there are by each method: 2 match, 1 click. */
 function counted(mark) {
   const found = {};
-  for (const { how } of rays(mark)) found[hands[how] ?? how] = (found[hands[how] ?? how] ?? 0) + 1;
+  for (const { how } of rays(mark)) found[methods[how] ?? how] = (found[methods[how] ?? how] ?? 0) + 1;
   return Object.entries(found).map(([how, count]) => `${count} ${how}`).join(', ');
 }
 const longest = (of) => { const found = Object.values(of ?? {}).map(length).filter((value) => value !== null); return found.length ? Math.max(...found) : null; };
