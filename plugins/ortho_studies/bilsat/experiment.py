@@ -59,8 +59,8 @@ KNOBS = (
         SIGMA_IMAGE,
         "px per axis",
         "fitted",
-        "Noise of pointing: that of the paper's images and people, which nobody has published elsewhere. 0.5 px, which "
-        "is customary, would leave 0.71 px of the 0.99.",
+        "Pointing noise of the paper's images and operators, which is not published elsewhere. The usual 0.5 px "
+        "would explain only 0.71 of the 0.99 px.",
         ("3|rigorous even:44|*",),
     ),
     Knob(
@@ -68,7 +68,7 @@ KNOBS = (
         OFF_NADIR_DEG,
         "degrees",
         "fitted",
-        "Tilt across the track. The satellite can be turned by 30 degrees; the paper does not say how far it was.",
+        "Tilt across the track. The satellite can tilt by up to 30 degrees; the paper does not state the angle.",
         ("5|poly1 even:44|*",),
     ),
     Knob(
@@ -76,7 +76,7 @@ KNOBS = (
         ROUGHNESS,
         "",
         "fitted",
-        "How much the plains roll: what the models without heights leave over the relief.",
+        "Height variation of the plains, from the errors of the models without heights.",
         ("5|poly2 even:44|*", "5|poly3 even:44|*", "5|projective even:44|*"),
     ),
     Knob(
@@ -84,8 +84,8 @@ KNOBS = (
         RIDGE,
         "",
         "fitted",
-        "Weight of Tikhonov's regularisation, which the paper has for these two models and does not state; in steps "
-        "of a factor 3.",
+        "Weight of the Tikhonov regularisation of these two models, which the paper does not state; tried in "
+        "steps of a factor of 3.",
         ("5|rfm2 even:44|*", "5|rfm3 even:44|*"),
     ),
     Knob(
@@ -93,38 +93,38 @@ KNOBS = (
         "plains, one range of mountains in the east, 700 to 1900 m",
         "",
         "chosen",
-        "The heights and the mountains in the east are the paper's. Of four shapes that fit the rows with 44 points "
-        "this one was taken in sight of all rows: with the others 80 to 85 % of all rows were within 1.5, with this 85 "
-        "%, so that up to five points of a hundred are owed to the choice.",
+        "The heights and the mountains in the east are from the paper. Four shapes fit the rows with 44 points; "
+        "this one was chosen with knowledge of all rows. With the others, 80 to 85 % of all rows were within "
+        "1.5, with this one 85 %. So the choice may explain up to 5 %.",
     ),
     Knob(
         "PLACES",
         PLACES,
         "places in a cell",
         "chosen",
-        "Of so many places in each cell the lowest is measured, for road crossings lie in plains and valleys. With one "
-        "place three predictions in a hundred fewer are within 1.5; with six as many.",
+        "The lowest of this many places in each cell is measured, because road crossings are in plains and "
+        "valleys. With one place, 3 % fewer predictions are within 1.5; with six, the same number.",
     ),
     Knob(
         "SIGMA_GROUND",
         SIGMA_GROUND,
         "m per axis",
         "paper",
-        "Better than 1 m in planimetry and elevation; a fortieth of a pixel, so that it decides nothing.",
+        "Better than 1 m in planimetry and elevation. This is a fortieth of a pixel, so it has no influence.",
     ),
     Knob(
         "SIGMA_POSITION",
         SIGMA_POSITION,
         "m per axis",
         "chosen",
-        "Error of the ephemeris, from which the rigorous model starts; it decides nothing, for position and attitude "
-        "are adjusted without weights, as in the paper.",
+        "Error of the ephemeris, from which the rigorous model starts. It has no influence, because position "
+        "and attitude are adjusted without weights, as in the paper.",
     ),
 )
 NAIVE = (
-    "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for the check "
-    "points, for p unknowns and k points. It knows the noise of each model from the paper, which the simulation has to "
-    "predict, and nothing of geometry."
+    "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for "
+    "the check points, for p unknowns and k points. It uses the noise of each model from the paper, which the "
+    "simulation must predict, and no geometry."
 )
 
 

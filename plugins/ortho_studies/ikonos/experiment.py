@@ -74,8 +74,8 @@ KNOBS = (
         POINTING,
         "px per axis",
         "fitted",
-        "Noise of pointing, from the model that has nothing else left. It came out at the half pixel that is customary "
-        "a priori (Willneff et al. have it), but it was found in sight of this row, so the row is not counted.",
+        "Pointing noise, from the model without other errors. The result is the usual half pixel (as in "
+        "Willneff et al.). But it was chosen with knowledge of this row, so the row is not counted.",
         ("2|DLT|*",),
     ),
     Knob(
@@ -92,41 +92,40 @@ KNOBS = (
         [STEEPNESS, BEND],
         "",
         "published",
-        "The slope of the city, through heights that are published: the railway station 1117 m, the centre (35.696 "
-        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. Formerly 4.0 and 0.9 fitted 2D affine; with "
-        "the heights of the city itself 2D affine and projective come out by a third too small. A tilt of 27 degrees "
-        "would make up for that, but nothing tells it.",
+        "The slope of the city, through published heights: the railway station 1117 m, the centre (35.696 "
+        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. With these heights, 2D affine and "
+        "projective are a third too small. A tilt of 27 degrees would explain this, but there is no evidence for it.",
     ),
     Knob(
         "REVERSED",
         REVERSED,
         "of the realisations",
         "published",
-        "A scan against the flight, in which lines of sight are not parallel along it: two of the three real products "
-        "that were looked at have it, so it is drawn. Formerly all scans were reversed, which 3D affine asked for.",
+        "A scan against the flight, with lines of sight that are not parallel along it. Two of three real "
+        "products have it, so it is drawn at random.",
     ),
     Knob(
         "OFF_NADIR_DEG",
         OFF_NADIR_DEG,
         "degrees",
         "chosen",
-        "Tilt. Geo products are ordered with at least 60 degrees of elevation; this is between. All models without "
-        "heights have errors in proportion to its tangent.",
+        "Tilt. Geo products are ordered with an elevation of at least 60 degrees; this is in the middle. The "
+        "errors of all models without heights are proportional to its tangent.",
     ),
     Knob(
         "relief",
         "waves of 0.4 to 25 km, 1050 to 1800 m",
         "",
         "chosen",
-        "How the hills fall off with their wavelength. Of longest waves of 12, 25 and 40 km the second was taken in "
-        "sight of all rows, so that the cubic polynomial is no pure prediction.",
+        "Decrease of the hills with their wavelength. Of 12, 25 and 40 km for the longest wave, the second was "
+        "chosen with knowledge of all rows, so the cubic polynomial is not a pure prediction.",
     ),
     Knob(
         "BIAS",
         list(BIAS),
         "m",
         "published",
-        "Error of the vendor's line of sight: 10 to 25 m are usual for Geo products. All models of table 2 take it up.",
+        "Error of the vendor's line of sight: 10 to 25 m are usual for Geo products. All models of table 2 absorb it.",
     ),
 )
 #: What a vendor's model is good for: heights (m) of the RPC and of the model from metadata.
