@@ -1,8 +1,8 @@
-"""Tables 3, 4 and 5 of Ok and Turker on simulated BILSAT-1 scenes: the paper's numbers beside ours.
+"""Tables 3, 4 and 5 of Ok and Turker on simulated BILSAT-1 scenes, compared with the paper.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 44 places, which
-the paper does not tell, the noise of the points, and the error of the ephemeris. `KNOBS` lists all settings, and the
-rows that they were fitted to: rows with all 44 points, in which there is nothing to select.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 44 positions
+(which the paper does not state), the noise of the points, and the error of the ephemeris. `KNOBS` lists all settings,
+and the rows to which they were fitted: rows with all 44 points, which need no selection.
 """
 
 from __future__ import annotations

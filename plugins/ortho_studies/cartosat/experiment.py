@@ -1,9 +1,9 @@
-"""Tables 2 to 6 of Willneff et al. on simulated CARTOSAT-1 stereo pairs: the paper's numbers beside ours.
+"""Tables 2 to 6 of Willneff et al. on simulated CARTOSAT-1 stereo pairs, compared with the paper.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the places of the
-69 points and the noise of their measurement; orbit, cameras, terrain and the vendor's RPCs stay. As in the paper, image
-points have 0.5 px and control 0.3 m a priori, check points are ties, and one stochastic model serves all. `KNOBS` lists
-all settings, and the rows that they were fitted to.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the positions of
+the 69 points and their measurement noise; orbit, cameras, terrain and the vendor's RPCs are fixed. As in the paper,
+image points have 0.5 px and control points 0.3 m a priori, check points are ties, and one stochastic model serves all.
+`KNOBS` lists all settings, and the rows to which they were fitted.
 """
 
 from __future__ import annotations

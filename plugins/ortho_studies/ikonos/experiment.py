@@ -1,8 +1,8 @@
-"""Table 2 and figure 4 of Amini and Hashemi on simulated IKONOS Geo scenes: the paper's numbers beside ours.
+"""Table 2 and figure 4 of Amini and Hashemi on simulated IKONOS Geo scenes, compared with the paper.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws what the paper does
-not tell: the hills, the places of the points, the azimuth of the satellite, the direction of its scan and the vendor's
-error; and the noise. `KNOBS` lists all settings, and the two rows that two of them were fitted to.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the noise and
+what the paper does not state: hills, positions of the points, azimuth of the satellite, direction of its scan, and the
+vendor's error. `KNOBS` lists all settings, and the two rows to which two of them were fitted.
 """
 
 from __future__ import annotations

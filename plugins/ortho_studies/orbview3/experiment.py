@@ -1,8 +1,8 @@
 """Table 1, figures 4 to 7 and section 3.1 of Bueyueksalih, Akcin and Jacobsen, on simulated OrbView-3 scenes.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 34 places, their
-noise, and the attitude error of both scenes. `KNOBS` lists all settings, and the rows that they were fitted to: most of
-table 1, for the paper tells little of how the satellite turned.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 34 positions,
+their noise, and the attitude error of both scenes. `KNOBS` lists all settings, and the rows to which they were fitted:
+most of table 1, because the paper states little about the rotation of the satellite.
 """
 
 from __future__ import annotations
