@@ -235,7 +235,7 @@ def test_a_scene_is_fitted_as_the_command_does() -> None:
     np.testing.assert_array_equal(found.values, expected.values)
     assert found.model_name == "rpc+shift"
     assert scene.fit(points, "none").param_names == ()
-    with pytest.raises(InputError, match="no correction 'shfit'"):
+    with pytest.raises(InputError, match="unknown correction 'shfit'"):
         scene.fit(points, "shfit")
     with pytest.raises(InputError, match="no parameters of its own"):
         scene.fit(points, "model")
@@ -243,7 +243,7 @@ def test_a_scene_is_fitted_as_the_command_does() -> None:
 
 def test_a_fit_that_adjusts_nothing_says_so() -> None:
     scene, points = op.open_scene("sample_data/scene.tif"), op.read_points("sample_data/gcps.geojson")
-    with pytest.raises(InputError, match="Scene is no sensor model") as error:
+    with pytest.raises(InputError, match="Scene is not a sensor model") as error:
         op.fit(scene, points)
     assert 'scene.fit(points, "shift")' in str(error.value)
     assert [notice.code for notice in op.fit(scene.model, points).warnings if notice.code == "nothing-adjusted"]

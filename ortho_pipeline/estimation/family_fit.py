@@ -164,9 +164,9 @@ def ridge_of(text: str) -> float | str | None:
     return weight
 
 
-def _leave_one_out(found: Fit) -> float:
+def _leave_one_out(result: Fit) -> float:
     """Return the leave-one-out RMSE; 0 without redundancy."""
-    loo = found.rmse("loo")
+    loo = result.rmse("loo")
     return loo.total if loo is not None else 0.0
 
 
@@ -251,18 +251,18 @@ def prune(found: Fit, *, significance: float | None = None) -> Pruned:
         found = _again(found, worst)
 
 
-def _again(found: Fit, without: str) -> Fit:
+def _again(result: Fit, without: str) -> Fit:
     """Fit again to the same points, without a parameter."""
     again = fit(
-        found.model.without([without]),
-        found.points,
-        priors={name: prior for name, prior in found.priors.items() if name != without},
+        result.model.without([without]),
+        result.points,
+        priors={name: prior for name, prior in result.priors.items() if name != without},
         robust=False,
-        name=found.model_name,
-        ridge=found.ridge,
-        exclude=dict(found.rejected),
+        name=result.model_name,
+        ridge=result.ridge,
+        exclude=dict(result.rejected),
     )
-    return replace(again, raw_residuals=found.raw_residuals, significance=found.significance)
+    return replace(again, raw_residuals=result.raw_residuals, significance=result.significance)
 
 
 # -- cross-validation ------------------------------------------------------------------------------------------------

@@ -99,12 +99,12 @@ class Fit:
     @property
     def reservations(self) -> tuple[str, ...]:
         """Reasons not to trust the model, whatever its residuals: ``unstable``, ``uncertain at a corner``."""
-        found = []
+        reasons = []
         if len(self.param_names) > 1 and self.condition > UNSTABLE:
-            found.append("unstable")
+            reasons.append("unstable")
         if not self.corner_ratio <= EXTRAPOLATION_WARNING:
-            found.append("uncertain at a corner")
-        return tuple(found)
+            reasons.append("uncertain at a corner")
+        return tuple(reasons)
 
     @property
     def effective_points(self) -> float:
@@ -175,7 +175,7 @@ class Fit:
             if which == "matched":
                 checks = self.points.check & ~checks
             elif which == "agreeing":
-                off = {one.id for one in self.outlying}
+                off = {point.id for point in self.outlying}
                 checks = checks & np.array([name not in off for name in self.points.ids], dtype=bool)
             residuals = self.residuals[checks]
             # A point that does not project has no residual; a warning names it.
@@ -206,7 +206,7 @@ class Fit:
         """Return the tests of the parameters; values that are not finite become None."""
         t, p = self.student
         named = {"total_correlation": self.total_correlation, "t": t, "p": p}
-        found: dict[str, Any] = {
+        statistics: dict[str, Any] = {
             "correlation": json_value(self.correlation),
             **{key: dict(zip(self.param_names, json_value(values), strict=True)) for key, values in named.items()},
             "significance": self.significance,
@@ -218,11 +218,11 @@ class Fit:
             "corner_ratio": json_value(self.corner_ratio),
         }
         if self.common_error is not None:
-            found["common_error"] = CommonErrorRecord.of(self.common_error)
+            statistics["common_error"] = CommonErrorRecord.of(self.common_error)
         return (
-            Statistics(**found)
+            Statistics(**statistics)
             if self.shared_errors is None
-            else GroupedStatistics(**found, shared_errors=self.shared_errors)
+            else GroupedStatistics(**statistics, shared_errors=self.shared_errors)
         )
 
     def __repr__(self) -> str:
@@ -473,11 +473,11 @@ def _result(
 
 
 def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list[Notice]:
-    found = []
+    notices = []
     for role, mask in (("control", points.control & ~usable), ("check", points.check & ~projected)):
         if mask.any():
             names = [points.ids[i] for i in np.flatnonzero(mask)]
-            found.append(
+            notices.append(
                 Notice(
                     "no-projection",
                     f"the model cannot project these {role} points (no height, or outside its domain): "
@@ -486,4 +486,4 @@ def _unusable(points: Points, usable: np.ndarray, projected: np.ndarray) -> list
                     points=names,
                 )
             )
-    return found
+    return notices

@@ -127,14 +127,14 @@ def minimise(
         If the iteration does not converge.
     """
     params = np.asarray(start, dtype=float)
-    found = _gauss_newton(residuals, slopes, params)
-    if found is not None:
-        return found
+    solution = _gauss_newton(residuals, slopes, params)
+    if solution is not None:
+        return solution
     # Far from the solution, the damped steps of Levenberg and Marquardt work better than halved ones.
     params, arrived = _levenberg_marquardt(residuals, slopes, params)
-    found = _gauss_newton(residuals, slopes, params)
-    if found is not None:
-        return found
+    solution = _gauss_newton(residuals, slopes, params)
+    if solution is not None:
+        return solution
     # In a flat valley, the caller reports undetermined parameters from the condition number of the design.
     if arrived or condition_of(slopes(params)) > singular:
         return params

@@ -92,7 +92,7 @@ def scene_faults(
         yield f"model_source must name the file or tag with the model, not {scene.model_source!r}"
     for name, kind in (("warnings", str), ("pieces", Piece)):
         items = getattr(scene, name)
-        if not isinstance(items, tuple) or not all(isinstance(one, kind) for one in items):
+        if not isinstance(items, tuple) or not all(isinstance(item, kind) for item in items):
             yield f"{name} must be a tuple of {kind.__name__}, not {_shown(items)}"
     for name in ("facts", "unsuited"):
         if not isinstance(getattr(scene, name), Mapping):
@@ -230,7 +230,9 @@ def _is_pair_of_vectors(domain: Any) -> bool:
     return (
         isinstance(domain, tuple)
         and len(domain) == 2
-        and all(isinstance(one, np.ndarray) and one.shape == (3,) and one.dtype.kind in "fiu" for one in domain)
+        and all(
+            isinstance(vector, np.ndarray) and vector.shape == (3,) and vector.dtype.kind in "fiu" for vector in domain
+        )
     )
 
 

@@ -52,8 +52,8 @@ def camera_of(name: str) -> Path | None:
         beside = listing(image.parent)
     except (OSError, ValueError, InputError):
         return None
-    found = (image.parent / name for ending in ENDINGS for name in beside.named(f"{image.stem}{ending}"))
-    return next((one for one in found if one.is_file() and _kind(one)), None)
+    candidates = (image.parent / name for ending in ENDINGS for name in beside.named(f"{image.stem}{ending}"))
+    return next((path for path in candidates if path.is_file() and _kind(path)), None)
 
 
 def _kind(path: Path) -> str | None:

@@ -107,10 +107,10 @@ def open_scene(
     metadata = read_metadata(path)
     size = dataset.RasterXSize, dataset.RasterYSize
     view = view or view_of(name, metadata)
-    found, source, warnings = _rpc(dataset, rpc, rpc_origin)
-    models: dict[str, SensorModel] = {} if found is None else {"rpc": found}
+    model, source, warnings = _rpc(dataset, rpc, rpc_origin)
+    models: dict[str, SensorModel] = {} if model is None else {"rpc": model}
     try:
-        models["pushbroom"] = pushbroom(metadata, view, size, HEIGHTS if found is None else found.height_range, sigmas)
+        models["pushbroom"] = pushbroom(metadata, view, size, HEIGHTS if model is None else model.height_range, sigmas)
     except InputError as error:
         if not models:
             raise
@@ -120,10 +120,10 @@ def open_scene(
             *metadata.size, *size
         )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=metadata.size))
-    if found is None:
+    if model is None:
         text = "there is no readable RPC. The model is only a start: adjust it to at least nine control points"
         warnings.append(Notice("only-a-start", text))
-    facts = _facts(name, metadata, warnings) | ({} if found is None else {"rpc_origin": int(rpc_origin)})
+    facts = _facts(name, metadata, warnings) | ({} if model is None else {"rpc_origin": int(rpc_origin)})
     facts = {"view": view} | facts if view else facts
     if "pushbroom" in models:
         facts["soft_constraints"] = soft_facts(sigmas)
@@ -145,27 +145,27 @@ def _facts(name: str, metadata: Metadata, warnings: list[Notice]) -> dict[str, o
 
 def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | None, str | None, list[Notice]]:
     if choice is None:
-        found, path, warnings = rpc_of(dataset.GetDescription())
+        model, path, warnings = rpc_of(dataset.GetDescription())
         source = None if path is None else str(path)
     else:
-        found, source = rpc_of_dataset(dataset, choice)
+        model, source = rpc_of_dataset(dataset, choice)
         warnings = []
-    if found is not None and choice is None:
-        warnings += _compared_with_gdal(dataset, found, str(source))
-    if found is not None and origin == "1":
-        found = found._replace(col_off=found.col_off - 1.0, row_off=found.row_off - 1.0)
-    return found, source, warnings
+    if model is not None and choice is None:
+        warnings += _compared_with_gdal(dataset, model, str(source))
+    if model is not None and origin == "1":
+        model = model._replace(col_off=model.col_off - 1.0, row_off=model.row_off - 1.0)
+    return model, source, warnings
 
 
-def _compared_with_gdal(dataset: gdal.Dataset, found: RPC, source: str) -> list[Notice]:
+def _compared_with_gdal(dataset: gdal.Dataset, model: RPC, source: str) -> list[Notice]:
     """Return a warning if GDAL reads another RPC than this plugin."""
     try:
         other = rpc_of_fields(dataset.GetMetadata("RPC") or {})
     except (InputError, RuntimeError):
         # There is none, or the file is encrypted.
         return []
-    centre = np.array([[found.lon_off, found.lat_off, found.h_off]])
-    apart = float(np.abs(other.ground_to_image(centre) - found.ground_to_image(centre)).max())
+    centre = np.array([[model.lon_off, model.lat_off, model.h_off]])
+    apart = float(np.abs(other.ground_to_image(centre) - model.ground_to_image(centre)).max())
     if apart <= DISAGREEMENT:
         return []
     text = f"this image uses the RPC in {Path(source).name}; GDAL reads another one, which differs by {apart:.1f} px"

@@ -99,8 +99,8 @@ def partner_of(image: str | PathLike[str], metadata: Metadata) -> Path | None:
         folders = sorted(folder for folder in own.parent.iterdir() if folder != own and folder.is_dir())
     except OSError:
         return None
-    found = [folder / name for folder in folders[:MAX_FOLDERS] if _is_partner(folder / name, metadata)]
-    return found[0] if len(found) == 1 else None
+    partners = [folder / name for folder in folders[:MAX_FOLDERS] if _is_partner(folder / name, metadata)]
+    return partners[0] if len(partners) == 1 else None
 
 
 def _is_partner(candidate: Path, metadata: Metadata) -> bool:

@@ -28,7 +28,7 @@ SOFT: dict[str, tuple[str, float, str]] = {
 NONE = "none"
 
 
-def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
+def soft_sigmas(options: Mapping[str, str | None]) -> SoftSigmas:
     """Return the sigmas of the sensor options, each a positive number or ``none``.
 
     Raises
@@ -37,7 +37,7 @@ def soft_sigmas(given: Mapping[str, str | None]) -> SoftSigmas:
         If a value is neither.
     """
     sigmas = asdict(DEFAULT)
-    for option, text in given.items():
+    for option, text in options.items():
         name, unit, _ = SOFT[option]
         if text is None:
             continue
@@ -99,6 +99,6 @@ def pushbroom(
 
 def _tilt(metadata: Metadata, view: str) -> float:
     """Return the tilt along the track in degrees, forward positive: as the file gives it, or the nominal one."""
-    given = metadata.number("ViewAngleAlongTrack", low=-60, high=60)
+    angle = metadata.number("ViewAngleAlongTrack", low=-60, high=60)
     # Signs differ between processors; which way a camera looks is known.
-    return TILTS_DEG[view] if not given else float(np.copysign(given, TILTS_DEG[view]))
+    return TILTS_DEG[view] if not angle else float(np.copysign(angle, TILTS_DEG[view]))

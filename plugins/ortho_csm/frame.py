@@ -57,7 +57,7 @@ def read_frame(state: StateFields) -> FrameCamera:
         raise state.error("mirrored, rotated or skewed pixels are not supported", "m_iTransS, m_iTransL")
     centre = state.numbers("m_ccdCenter", 2)
     sums = [state.number(f"m_detector{name}Summing", 1.0) for name in ("Sample", "Line")]
-    if not all(one > 0 for one in sums):
+    if not all(value > 0 for value in sums):
         raise state.error("the summing must be positive", "m_detectorSampleSumming")
     column = (
         sample[0]

@@ -307,6 +307,6 @@ def _quaternions(turns: Array) -> Array:
     """Return quaternions ``(N, 4)``, scalar last, each on the side of the one before."""
     from scipy.spatial.transform import Rotation
 
-    found = Rotation.from_matrix(turns).as_quat()
-    flips = np.cumprod(np.where((found[1:] * found[:-1]).sum(axis=1) < 0, -1.0, 1.0))
-    return np.asarray(np.vstack([found[:1], found[1:] * flips[:, None]]))
+    quaternions = Rotation.from_matrix(turns).as_quat()
+    flips = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0))
+    return np.asarray(np.vstack([quaternions[:1], quaternions[1:] * flips[:, None]]))

@@ -28,12 +28,12 @@ class StateFields:
         value = self.fields.get(field)
         if not isinstance(value, list) or len(value) > MOST_VALUES or (count is not None and len(value) != count):
             raise self.error(f"this must be a list of {count or 'at most ' + str(MOST_VALUES)} numbers", field)
-        if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
+        if not all(isinstance(number, int | float) and not isinstance(number, bool) for number in value):
             raise self.error("this is not a list of numbers", field)
-        found = np.array(value, dtype=np.float64)
-        if not (np.abs(found) < 1e15).all():
+        values = np.array(value, dtype=np.float64)
+        if not (np.abs(values) < 1e15).all():
             raise self.error("a number is too large", field)
-        return found
+        return values
 
     def number(self, field: str, default: float | None = None) -> float:
         """Return a number."""
@@ -44,13 +44,13 @@ class StateFields:
 
     def size(self) -> tuple[int, int]:
         """Return columns and rows."""
-        found = []
+        sizes = []
         for field in ("m_nSamples", "m_nLines"):
             value = self.number(field)
             if value != int(value) or not 1 <= value <= 10_000_000:
                 raise self.error("this is not an image size", field)
-            found.append(int(value))
-        return found[0], found[1]
+            sizes.append(int(value))
+        return sizes[0], sizes[1]
 
     def heights(self, default: tuple[float, float]) -> tuple[float, float]:
         """Return lowest and highest ellipsoidal height of the ground, within those of mountains."""

@@ -80,17 +80,17 @@ def metadata_of(name: str) -> tuple[Path, str] | None:
         return None
     try:
         wanted = f"{start}-METADATA.XML"
-        found = next((image.parent / one for one in listing(image.parent).named(wanted)), None)
+        path = next((image.parent / one for one in listing(image.parent).named(wanted)), None)
     except (OSError, ValueError, InputError):
         return None
-    return None if found is None else (found, detector)
+    return None if path is None else (path, detector)
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
     """Return whether this is the image of an EnMAP detector with its metadata beside it."""
-    found = metadata_of(dataset.GetDescription())
+    metadata = metadata_of(dataset.GetDescription())
     try:
-        return found is not None and b"level_X" in read_bounded(found[0], 1000)
+        return metadata is not None and b"level_X" in read_bounded(metadata[0], 1000)
     except InputError:
         return False
 
@@ -98,10 +98,10 @@ def recognises(dataset: gdal.Dataset) -> bool:
 def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
     """Open the image of a detector with the RPC of one of its bands."""
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
-    found = metadata_of(name)
-    if found is None:
+    metadata = metadata_of(name)
+    if metadata is None:
         raise InputError("there is no METADATA.XML beside this image", file=name, remedy="add it from the delivery")
-    path, detector = found
+    path, detector = metadata
     rpcs, facts = read_enmap(path)
     its = _of_detector(rpcs, facts, detector, dataset.RasterCount, path)
     number = _chosen(band, len(its))

@@ -75,8 +75,8 @@ def open_scene(
     if camera is None and exterior is not None and is_reconstruction(exterior):
         camera = exterior
     if camera is None or exterior is None or vertical is None:
-        given = {"camera": camera, "exterior": exterior, "vertical": vertical}
-        missing = [key for key, value in given.items() if not value]
+        required = {"camera": camera, "exterior": exterior, "vertical": vertical}
+        missing = [key for key, value in required.items() if not value]
         raise InputError(
             f"a frame image needs {', '.join(missing)}",
             file=name,
@@ -186,8 +186,8 @@ def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
 
 def _pair(text: str) -> tuple[float, float]:
     """Return two numbers; NaN if there are not two."""
-    found = numbers_of(text)
-    return (found[0], found[1]) if len(found) == 2 else (math.nan, math.nan)
+    numbers = numbers_of(text)
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else (math.nan, math.nan)
 
 
 def _facts(model: FrameCamera, pose: Pose | Shot, heights: str | None) -> dict[str, object]:

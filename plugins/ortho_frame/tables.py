@@ -97,17 +97,17 @@ def read_camera(path: str | PathLike[str], width: int, height: int, name: str | 
         If the file is not a camera, a field is missing, unknown or wrong, or the proportions differ.
     """
     document = _json(path)
-    given = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
-    if given.width * height != given.height * width:
+    interior = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
+    if interior.width * height != interior.height * width:
         raise InputError(
-            f"the camera has {given.width} x {given.height} pixels, but the image {width} x {height}",
+            f"the camera has {interior.width} x {interior.height} pixels, but the image {width} x {height}",
             file=path,
             field="width, height",
             remedy="give the camera of this image; crops of a frame are not supported",
         )
-    ratio = given.width / width
-    fields = {**given.to_dict(), "width": width, "height": height}
-    return Interior(**{**fields, "pitch_x": given.pitch_x * ratio, "pitch_y": given.pitch_y * ratio})
+    ratio = interior.width / width
+    fields = {**interior.to_dict(), "width": width, "height": height}
+    return Interior(**{**fields, "pitch_x": interior.pitch_x * ratio, "pitch_y": interior.pitch_y * ratio})
 
 
 def _own(path: str | PathLike[str], document: Any) -> Interior:
@@ -236,11 +236,11 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
     header, rows = _table(path)
     geographic, columns = _columns(path, header)
     wanted = Path(image)
-    found = [(line, row) for line, row in rows if row and row[0] in (wanted.name, wanted.stem)]
-    if len(found) != 1:
-        what = "appears twice" if found else "is not in this table"
+    matches = [(line, row) for line, row in rows if row and row[0] in (wanted.name, wanted.stem)]
+    if len(matches) != 1:
+        what = "appears twice" if matches else "is not in this table"
         raise InputError(f"the image {wanted.name} {what}", file=path, field=header[0], remedy="give one row per image")
-    line, row = found[0]
+    line, row = matches[0]
     values = []
     for name, column in columns:
         try:
@@ -287,8 +287,8 @@ def _shot(path: str | PathLike[str], image: Path) -> Shot:
 
 
 def _object(parent: Any, key: str) -> dict[str, Any]:
-    found = parent.get(key) if isinstance(parent, dict) else None
-    return found if isinstance(found, dict) else {}
+    value = parent.get(key) if isinstance(parent, dict) else None
+    return value if isinstance(value, dict) else {}
 
 
 def _triple(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float, float]:
@@ -317,9 +317,9 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
 
 def _columns(path: str | PathLike[str], header: list[str]) -> tuple[bool, list[tuple[str, int]]]:
     for geographic, wanted in ((False, MAP_COLUMNS), (True, GEOGRAPHIC_COLUMNS)):
-        found = [(names[0], header.index(name)) for names in wanted for name in names if name in header]
-        if len(found) == len(wanted):
-            return geographic, found
+        columns = [(names[0], header.index(name)) for names in wanted for name in names if name in header]
+        if len(columns) == len(wanted):
+            return geographic, columns
     raise InputError(
         f"unexpected columns: {', '.join(header)[:120]}",
         file=path,

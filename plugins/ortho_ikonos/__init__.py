@@ -147,8 +147,8 @@ def _rpc(dataset: gdal.Dataset, choice: str | None) -> tuple[RPC, str] | None:
     """Return the RPC and its source; GDAL does not attach a sidecar to every format."""
     if choice is not None or has_rpc(dataset):
         return rpc_of_dataset(dataset, choice)
-    found = rpc_file(place(dataset.GetDescription()))
-    return None if found is None else (read_rpc(found), str(found))
+    path = rpc_file(place(dataset.GetDescription()))
+    return None if path is None else (read_rpc(path), str(path))
 
 
 def _lacking(position: Position, source: SourceImage) -> list[str]:
@@ -180,14 +180,14 @@ def _plane(dataset: gdal.Dataset, position: Position, source: SourceImage, heigh
 def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[float, float]:
     plane = position.reference_height or 0.0
     if text is not None:
-        given = numbers_of(text)
-        if len(given) != 2 or not given[0] < given[1]:
+        numbers = numbers_of(text)
+        if len(numbers) != 2 or not numbers[0] < numbers[1]:
             raise InputError(
                 f"{text!r} is not a height range",
                 field="heights",
                 remedy="give low,high in metres, such as heights=0,800",
             )
-        low, high = given
+        low, high = numbers
     else:
         low, high = vendor.height_range if vendor else (plane - HALF_RANGE, plane + HALF_RANGE)
     return min(low, plane), max(high, plane)
@@ -231,7 +231,7 @@ def _pieces(
     image: OrderImage, delivery: Delivery, component: Component, position: Position, with_models: bool
 ) -> tuple[tuple[Piece, ...], list[Notice]]:
     """Return the other files of the acquisition (same plane, maybe other pixels), and warnings."""
-    found: list[Piece] = []
+    pieces: list[Piece] = []
     warnings: list[Notice] = []
     others = list(image.others())
     # Only images with pixels of this size bring models: a component without one cannot be predicted.
@@ -241,7 +241,7 @@ def _pieces(
         if len(known) != 1 or known[0].product_image != component.product_image or other.component not in alike:
             continue
         if other.component == image.component and other.grid == image.grid:
-            found.append(Piece(other.path))
+            pieces.append(Piece(other.path))
             continue
         try:
             opened = open_dataset(other.path)
@@ -253,8 +253,8 @@ def _pieces(
             continue
         if place is not None:
             size = opened.RasterXSize, opened.RasterYSize
-            found.append(Piece(other.path, place[:2], size, vendor[0] if vendor else None, place[2]))
-    return tuple(found), warnings
+            pieces.append(Piece(other.path, place[:2], size, vendor[0] if vendor else None, place[2]))
+    return tuple(pieces), warnings
 
 
 # -- facts and warnings ----------------------------------------------------------------------------------------------

@@ -57,17 +57,17 @@ class SectionRecord:
             If the key appears twice with different values.
         """
         for key in keys:
-            found = [entry for entry in self.entries if entry.key.lower() == key.lower() and entry.value]
-            if len({entry.value for entry in found}) > 1:
-                lines = ", ".join(str(entry.line) for entry in found)
+            entries = [entry for entry in self.entries if entry.key.lower() == key.lower() and entry.value]
+            if len({entry.value for entry in entries}) > 1:
+                lines = ", ".join(str(entry.line) for entry in entries)
                 raise InputError(
                     f"this key has different values in lines {lines}",
                     file=self.file,
                     field=f"{self.name}: {key}",
                     remedy="remove the wrong one",
                 )
-            if found:
-                return found[0].value
+            if entries:
+                return entries[0].value
         return None
 
     def number(self, *keys: str, units: tuple[str, ...] = ("",), low: float = -1e9, high: float = 1e9) -> float | None:
@@ -187,10 +187,10 @@ class Delivery:
         InputError
             If there is none, or several.
         """
-        found = [one for one in self.components if name is None or one.component == name]
-        if len(found) != 1:
+        components = [one for one in self.components if name is None or one.component == name]
+        if len(components) != 1:
             known = ", ".join(one.component for one in self.components[:10])
-            problem = "no component" if not found else "more than one component"
+            problem = "no component" if not components else "more than one component"
             raise InputError(
                 f"{problem} is called {name} (there are {known or 'none'})"
                 if name is not None
@@ -201,7 +201,7 @@ class Delivery:
                 if name is not None
                 else "name the image po_<order>_<band>_<component of 7 digits>.tif",
             )
-        return found[0]
+        return components[0]
 
     def source_of(self, component: Component) -> SourceImage:
         """Return the acquisition that a component shows, by its product image.
@@ -211,16 +211,16 @@ class Delivery:
         InputError
             If the link is broken.
         """
-        found = [one for one in self.sources if one.product_image == component.product_image]
-        if len(found) != 1:
+        sources = [one for one in self.sources if one.product_image == component.product_image]
+        if len(sources) != 1:
             raise InputError(
                 f"component {component.component} is of product image {component.product_image}, which "
-                f"{'no source image has' if not found else 'several source images have'}",
+                f"{'no source image has' if not sources else 'several source images have'}",
                 file=self.file,
                 field=f"{SOURCES}: Product Image ID",
                 remedy="get the complete metadata file",
             )
-        return found[0]
+        return sources[0]
 
 
 @reads("copy the _metadata.txt again from the delivery")
@@ -237,10 +237,10 @@ def read_metadata(path: str | PathLike[str]) -> Delivery:
     sections = _sections(str(path), text)
     order = _head(path, sections, ORDER)
     space = _head(path, sections, SPACE, needed=False)
-    sources = [_source(one) for one in _records(path, sections, SOURCES)[1:]]
+    sources = [_source(record) for record in _records(path, sections, SOURCES)[1:]]
     title = COMPONENTS if COMPONENTS in sections else SPACE
     parts = _records(path, sections, title)
-    components = [_component(one) for one in parts[1:]]
+    components = [_component(record) for record in parts[1:]]
     _check_counts(path, sections, len(sources), len(components))
     notes = []
     if not text.rstrip().endswith("====="):
@@ -378,14 +378,14 @@ def _head(
 def _check_counts(
     path: str | PathLike[str], sections: dict[str, list[SectionRecord]], sources: int, components: int
 ) -> None:
-    for title, key, found in (
+    for title, key, count in (
         (SOURCES, "Number of Source Images", sources),
         (COMPONENTS, "Number of Components", components),
     ):
         stated = _head(path, sections, title, needed=False).count(key, units=("",))
-        if found == 0 or (stated is not None and stated != found):
+        if count == 0 or (stated is not None and stated != count):
             raise InputError(
-                f"the file describes {found} of these, but {'at least one' if stated is None else stated} "
+                f"the file describes {count} of these, but {'at least one' if stated is None else stated} "
                 f"should be there",
                 file=path,
                 field=f"{title}: {key}",

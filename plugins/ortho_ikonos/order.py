@@ -68,8 +68,8 @@ def beside(path: Path, name: str) -> Path:
 
 def rpc_file(path: Path) -> Path | None:
     """Return the ``_rpc.txt`` of an image; None without one."""
-    found = beside(path, f"{path.stem}_rpc.txt")
-    return found if found.is_file() else None
+    rpc = beside(path, f"{path.stem}_rpc.txt")
+    return rpc if rpc.is_file() else None
 
 
 def bands_of(image: OrderImage, wanted: str) -> tuple[Path, ...]:
@@ -179,11 +179,11 @@ def _factor(stated: MapPlacement, size: tuple[int, int], path: Path, own_pixel: 
         return 1
     factor = round(stated.size[0] / size[0])
     fits = factor > 1 and all(
-        abs(whole - factor * part) < factor for whole, part in zip(stated.size, size, strict=True)
+        abs(total - factor * part) < factor for total, part in zip(stated.size, size, strict=True)
     )
     if own_pixel is not None and stated.pixel is not None:
         fits &= all(
-            math.isclose(own, factor * one, rel_tol=1e-3) for own, one in zip(own_pixel, stated.pixel, strict=True)
+            math.isclose(own, factor * step, rel_tol=1e-3) for own, step in zip(own_pixel, stated.pixel, strict=True)
         )
     else:
         image = OrderImage.of(path)

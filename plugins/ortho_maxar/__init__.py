@@ -61,21 +61,21 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
             "begin at the first corner".format(*isd.size, *size)
         )
         warnings.append(Notice("maybe-a-crop", text, metadata_size=list(isd.size)))
-    found, source = _rpc(dataset, isd, rpc, tile)
-    models: dict[str, SensorModel] = {} if found is None else {"rpc": found}
+    model, source = _rpc(dataset, isd, rpc, tile)
+    models: dict[str, SensorModel] = {} if model is None else {"rpc": model}
     facts = isd.facts
     try:
         first = (0, 0) if tile is None else (tile.left, tile.top)
         rigorous = read_isd_pushbroom(isd, size=size, first=first)
-        warnings += _compared(rigorous, found)
+        warnings += _compared(rigorous, model)
         models["pushbroom"] = rigorous
         facts["rigorous_model"] = path.name
     except InputError as error:
-        if found is None:
+        if model is None:
             raise
         text = f"the rigorous model in {path.name} is not used: {error.field or 'model'}: {error.message}"
         warnings.append(Notice("rigorous-left-out", text, file=path.name))
-    parts, said = parts_beside(isd, image, rigorous=found is None) if tile is None else ([], [])
+    parts, notices = parts_beside(isd, image, rigorous=model is None) if tile is None else ([], [])
     colours = colours_beside(isd, image, next(iter(models.values())))
     return Scene(
         "maxar",
@@ -84,7 +84,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
         models,
         source,
         facts,
-        (*warnings, *said),
+        (*warnings, *notices),
         pieces=(*tiles_beside(isd, image, tile), *parts, *colours),
         sources=(path,) if source != str(path) else (),
     )

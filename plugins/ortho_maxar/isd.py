@@ -95,7 +95,7 @@ class Isd:
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:
         """The files of the product."""
-        found = []
+        tiles = []
         for entry in self.file.all("TIL/TILE", 10_000):
             edges = [
                 self.file.number(name, entry) for name in ("ULCOLOFFSET", "ULROWOFFSET", "LRCOLOFFSET", "LRROWOFFSET")
@@ -104,8 +104,8 @@ class Isd:
             if any(edge != int(edge) or not 0 <= edge < 1e7 for edge in edges) or right < left or bottom < top:
                 raise self.file.error("this is not a possible tile position", "TIL/TILE")
             name = self.file.text("FILENAME", entry).replace("\\", "/").rpartition("/")[2]
-            found.append(Tile(name, int(left), int(top), int(right - left) + 1, int(bottom - top) + 1))
-        return tuple(found)
+            tiles.append(Tile(name, int(left), int(top), int(right - left) + 1, int(bottom - top) + 1))
+        return tuple(tiles)
 
     @cached_property
     def rpc(self) -> RPC | None:
@@ -117,7 +117,7 @@ class Isd:
         """Time of the first centre (seconds of the day) and seconds per row, which are negative in a reverse scan."""
         start = self.file.time("IMD/IMAGE/TLCTIME")
         listed = self.file.all("IMD/IMAGE/TLCLISTList/TLCLIST", 10_000)
-        pairs = np.array([self.file.numbers_of(one.text or "", "TLCLIST", 2) for one in listed]).reshape(-1, 2)
+        pairs = np.array([self.file.numbers_of(entry.text or "", "TLCLIST", 2) for entry in listed]).reshape(-1, 2)
         steps, times = np.diff(pairs, axis=0).T
         if len(pairs) < 2 or not (steps > 0).all() or not ((times > 0).all() or (times < 0).all()):
             raise self.file.error(
@@ -237,7 +237,7 @@ def _rows_of(file: XmlFields, part: str, name: str, count: int) -> tuple[Array, 
     """Return times (seconds of the day) and the values of a list, without their numbers."""
     step = file.number(f"{part}/TIMEINTERVAL")
     entries = file.all(f"{part}/{name}List/{name}")
-    values = np.array([file.numbers_of(one.text or "", f"{name}List", count + 1) for one in entries])
+    values = np.array([file.numbers_of(entry.text or "", f"{name}List", count + 1) for entry in entries])
     if len(values) < 4 or not 0 < step < 1000:
         raise file.error(f"{len(values)} rows, {step} s apart, are not a valid table", f"{name}List")
     if (np.abs(values[:, 0]) > 1e6).any():

@@ -45,20 +45,20 @@ def metadata_of(name: str) -> Path | None:
         return None
     try:
         image = place(name)
-        beside = [image.parent / one for one in listing(image.parent).matching(_XML)]
+        beside = [image.parent / name for name in listing(image.parent).matching(_XML)]
     except (OSError, ValueError, InputError):
         return None
-    own = [one for one in beside if one.stem.lower() == image.stem.lower() and is_isd(one)]
+    own = [path for path in beside if path.stem.lower() == image.stem.lower() and is_isd(path)]
     if own:
         return own[0]
     named = _PART.fullmatch(image.stem)
-    for one in beside:
-        other = _PART.fullmatch(one.stem)
+    for path in beside:
+        other = _PART.fullmatch(path.stem)
         # Tiles are named R1C1-, R1C2- ... after their time.
-        if named and other and named["part"] == other["part"] and is_isd(one):
+        if named and other and named["part"] == other["part"] and is_isd(path):
             try:
-                if any(tile.name.lower() == image.name.lower() for tile in Isd(one).tiles):
-                    return one
+                if any(tile.name.lower() == image.name.lower() for tile in Isd(path).tiles):
+                    return path
             except InputError:
                 continue
     return None
@@ -133,8 +133,8 @@ def cut(rpc: RPC, tile: Tile | None) -> RPC:
 def _of_other_bands(path: Path) -> Iterator[Path]:
     """Yield the ISD XML of an order's part in other bands, by their names."""
     folders = [path.parent.absolute()]  # a folder that is entered has no name of its own
-    if found := re.fullmatch(r"(?i)(.*_)(PAN|MUL)", folders[0].name):
-        twin = folders[0].with_name(found[1] + ("MUL" if found[2].upper() == "PAN" else "PAN"))
+    if match := re.fullmatch(r"(?i)(.*_)(PAN|MUL)", folders[0].name):
+        twin = folders[0].with_name(match[1] + ("MUL" if match[2].upper() == "PAN" else "PAN"))
         folders += [twin] if twin.is_dir() else []
     own = _PART.fullmatch(path.stem)
     for one in (folder / name for folder in folders for name in listing(folder).matching(_XML) if own):
@@ -158,4 +158,4 @@ def _other_parts(path: Path) -> Iterator[Path]:
 
 def _file(image: Path, name: str) -> Path | None:
     """Return the file of this name beside an image, whatever the case of its letters."""
-    return next((image.parent / one for one in listing(image.parent).named(name)), None)
+    return next((image.parent / file for file in listing(image.parent).named(name)), None)

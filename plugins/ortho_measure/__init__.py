@@ -1,8 +1,8 @@
-"""Measuring by hand: a local page on which points are clicked in a scene and its reference, with the fit live.
+"""Measure points by hand: a local page for clicking points in a scene and its reference, with a live fit.
 
-The page shows the reference rendered into the scene's own pixels, so that a click in one predicts itself in the other.
-This module declares the command `ortho measure`, and imports no more: ``ortho --help`` imports it. starlette and
-uvicorn, an extra, are loaded when a page is served.
+The page shows the reference rendered into the pixels of the scene, so a click in one view predicts the other position.
+This module only declares the command `ortho measure`, because ``ortho --help`` imports it. starlette and uvicorn (an
+extra) are loaded when the page is served.
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""The command `ortho measure`: points of one image or several by hand in the browser."""
+"""The command `ortho measure`: measure points of one or several images in the browser."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def measure(
 
 
 def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -> None:
-    """Open the address by way of a file: everybody on this machine can read the command line of a browser."""
+    """Open the address through a file, because every user of this machine can read a browser's command line."""
     import webbrowser
 
     from ortho_measure.serving.entry import private_file
@@ -106,7 +106,7 @@ def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -
 
 
 def _first(scene: SceneOptions | list[SceneOptions]) -> SceneOptions:
-    """Return the options of the first image; what may be opened is the same for all."""
+    """Return the options of the first image; permissions are the same for all images."""
     return scene if isinstance(scene, SceneOptions) else scene[0]
 
 
@@ -118,7 +118,7 @@ def _session(
     surface: SurfaceOptions,
     match: MatchOptions,
 ) -> Project:
-    """Open the session of one image, or of several."""
+    """Open the session of one or several images."""
     name = output or "_".join([*(Path(image).stem for image in images[:2]), "points.geojson"])
     if len(images) == 1:
         from ortho_measure.session import open_session
@@ -135,7 +135,7 @@ def _session(
             )
     if points.gcps is not None and not isinstance(points.gcps, str):
         raise InputError("for several images, this must be a file of points", field="points.gcps", remedy="give a file")
-    asked = BlockOptions(
+    options = BlockOptions(
         points=points.gcps,
         crs=points.crs,
         vertical=points.vertical,
@@ -143,4 +143,4 @@ def _session(
         check=points.check,
         correction=points.correction,
     )
-    return open_block_session(images, name, scene=scene, points=asked, surface=surface, match=match)
+    return open_block_session(images, name, scene=scene, points=options, surface=surface, match=match)

@@ -1,8 +1,8 @@
-"""The journal: every action on its own line, on disk before it is shown, so that nothing that was seen is lost.
+"""The journal: every action on its own line, written to disk before it is shown, so that nothing is lost.
 
-A line is a JSON object with a checksum of itself. What a killed process or a power cut leaves of the last line is cut
-off when the journal is opened again; a line that is wrong anywhere else is an error, because what follows rests on it.
-One process holds the lock and writes; another one reads.
+A line is a JSON object with a checksum. An incomplete last line, from a killed process or a power cut, is removed when
+the journal is opened again. A wrong line anywhere else is an error, because later actions depend on it. One process
+holds the lock and writes; others can read.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from typing import Any
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import Lock, allowed, parse_json, sync_folder
 
-#: Beyond this many bytes it is no journal of hands.
+#: A larger file (bytes) is not a journal of manual measurements.
 MAX_BYTES = 256_000_000
-#: What is appended to the name of a journal for what follows an impossible action.
+#: Suffix of the file for actions after an impossible one.
 REST = ".rest"
-#: What helps where a journal cannot be opened.
+#: Remedy if a journal cannot be opened.
 REMEDY = "move the journal away to start again, or restore it from a backup"
 
 
 class Journal:
-    """A journal that is open.
+    """An open journal.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ class Journal:
     Attributes
     ----------
     actions : list of dict
-        Those that it holds, in their order.
+        Its actions, in order.
     read_only : bool
-        Whether another process holds it.
+        Whether another process holds the lock.
     healed : int
-        Bytes of an unfinished last line that were cut off.
+        Bytes of an incomplete last line that were removed.
 
     Raises
     ------
@@ -69,12 +69,12 @@ class Journal:
             sync_folder(path.parent)
 
     def append(self, action: Mapping[str, Any]) -> None:
-        """Write an action and wait until it is on disk; where that fails nothing of it is left.
+        """Write an action and wait until it is on disk; if that fails, nothing of it remains.
 
         Raises
         ------
         InputError
-            If another process holds the journal, or it cannot be written.
+            If another process holds the lock, or the journal cannot be written.
         """
         if self._lock is None:
             raise InputError(
@@ -89,7 +89,7 @@ class Journal:
         self.actions.append(dict(action))
 
     def more(self) -> list[dict[str, Any]]:
-        """Return what another process has written since, and keep it; a line that is not whole yet is left for later.
+        """Return and keep what another process has written since; an incomplete line is left for later.
 
         Raises
         ------
@@ -108,9 +108,9 @@ class Journal:
         return new
 
     def set_aside(self, count: int) -> None:
-        """Keep so many actions; what follows them is moved to the end of a file beside the journal.
+        """Keep this many actions; move the others to the end of a file beside the journal.
 
-        A journal that another process writes stays as it is.
+        A journal that another process writes is not changed.
         """
         kept, rest = (b"".join(map(_line, part)) for part in (self.actions[:count], self.actions[count:]))
         self.actions = self.actions[:count]
@@ -127,7 +127,7 @@ class Journal:
             raise _unwritable(path, error) from error
 
     def close(self) -> None:
-        """Let go of the file and of its lock."""
+        """Close the file and release its lock."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
@@ -148,31 +148,31 @@ def _whole(descriptor: int, path: Path) -> bytes:
 
 
 def _lines(data: bytes, path: Path) -> tuple[int, list[dict[str, Any]]]:
-    """Return how many bytes are sound, and the actions in them."""
-    found: list[dict[str, Any]] = []
+    """Return the number of valid bytes, and their actions."""
+    actions: list[dict[str, Any]] = []
     start = 0
     while start < len(data):
         end = data.find(b"\n", start)
         if end < 0:
-            return start, found
+            return start, actions
         action = _action(data[start:end])
         if action is None:
             if end + 1 == len(data):
-                # A power cut can leave the length of a line without its bytes.
-                return start, found
+                # After a power cut, a line can have its length but not its bytes.
+                return start, actions
             raise InputError(
                 "the journal is damaged at this line, and later actions depend on it",
                 file=path,
-                field=f"line {len(found) + 1}",
+                field=f"line {len(actions) + 1}",
                 remedy=REMEDY,
             )
-        found.append(action)
+        actions.append(action)
         start = end + 1
-    return start, found
+    return start, actions
 
 
 def _action(line: bytes) -> dict[str, Any] | None:
-    """Return the action of a line, None where it is not what was written."""
+    """Return the action of a line; None if its checksum is wrong."""
     try:
         document = parse_json(line, "journal", REMEDY)
     except InputError:

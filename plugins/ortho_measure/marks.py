@@ -1,7 +1,7 @@
-"""Marks: what a person measured, point by point, and the actions that change it.
+"""Marks: measured points, and the actions that change them.
 
-A mark may lack its image or its ground, may be off, and knows how it was made; those that are whole and on are the
-points of the adjustment. Tables never change: each action gives another one, so that undoing is to go back.
+A mark can lack its image or ground position, can be off, and records how it was measured. Complete marks that are on
+are the points of the adjustment. Tables never change: each action returns a new one, so undo goes back to the old one.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.image_errors import says_more, sigma_of_covariance
 from ortho_pipeline.points.rows import is_writable, plain_id
 
-#: What ground is in: longitude, latitude (degrees) and height above the ellipsoid (m), as GeoJSON has it.
+#: CRS of ground: longitude, latitude (degrees) and ellipsoidal height (m), as in GeoJSON.
 GROUND_CRS = "EPSG:4979"
-#: More marks than this are no work of hands, and longer words no names.
+#: Limits on the number of marks, and on the lengths of names and notes.
 MOST_MARKS, LONGEST_ID, LONGEST_NOTE = 20_000, 64, 500
-#: Standard deviations of an image (px) are within these, and groups have numbers below this.
+#: Limits on standard deviations in the image (px), and on group numbers.
 _SIGMAS, _GROUPS = (1e-6, 1e6), 1 << 31
 
 
 class RayMark(Record):
-    """A point as it was measured in one of several images: as `Mark` has it of a single one."""
+    """A measurement in one of several images; for a single image, `Mark` has these fields itself."""
 
     image: tuple[float, float]
     sigma_image: float | None = None
@@ -48,12 +48,13 @@ class RayMark(Record):
 
 
 class Mark(Record):
-    """One point as it was measured.
+    """A measured point.
 
-    `image` is column, row from the outer corner of the first pixel (px), `ground` as `GROUND_CRS`; None is not
-    measured. `covariance` has the variances of column and row and their covariance (px^2), `sigma_image` (px) counts
-    where it is None. `how` says who gave the image, `ground_from` who gave the ground, `score` how alike chips were.
-    Of several images `rays` has what was measured, by the names of the images, in place of all that is of one image.
+    `image` is column, row from the outer corner of the first pixel (px), `ground` in `GROUND_CRS`; None means not
+    measured. `covariance` has the variances of column and row and their covariance (px^2); if it is None, `sigma_image`
+    (px) counts. `how` is the method of the image position, `ground_from` the source of the ground, `score` the
+    correlation of the match. With several images, `rays` has the measurements by image name, instead of the fields for
+    one image.
     """
 
     id: str
@@ -77,7 +78,7 @@ class Mark(Record):
 
     @property
     def whole(self) -> bool:
-        """Whether both places are known; of several images: whether it says something of them."""
+        """Whether image and ground are known; with several images, whether there are enough measurements."""
         if not self.rays:
             return self.image is not None and self.ground is not None
         if self.role == "tie" or self.ground is None:
@@ -86,7 +87,7 @@ class Mark(Record):
 
     @property
     def counts(self) -> bool:
-        """Whether it is a point of the adjustment."""
+        """Whether the mark takes part in the adjustment."""
         return self.whole and not self.off
 
     @property
@@ -96,14 +97,14 @@ class Mark(Record):
 
     @property
     def places(self) -> set[tuple[object, ...]]:
-        """Where it is, as no other point may be: a file with both would be refused by whoever reads it."""
+        """Its positions, which no other point may have: readers would refuse a file with both."""
         images = {name: ray.image for name, ray in self.rays.items()} if self.rays else {"": self.image}
-        found: set[tuple[object, ...]] = {
+        positions: set[tuple[object, ...]] = {
             ("image", name, *np.round(place, 6).tolist()) for name, place in images.items() if place is not None
         }
         if self.ground is not None and not (self.rays and self.role == "tie"):
-            found.add(("ground", *np.round(self.ground, 8).tolist()))
-        return found
+            positions.add(("ground", *np.round(self.ground, 8).tolist()))
+        return positions
 
 
 def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) -> np.ndarray:
@@ -114,8 +115,8 @@ def _matrix(sigma: float | None, covariance: tuple[float, float, float] | None) 
 
 
 def errors_of(measured: Sequence[Mark | RayMark]) -> tuple[np.ndarray, np.ndarray]:
-    """Return standard deviations ``(N,)`` and covariances ``(N, 2, 2)`` of measurements, as a file of them says."""
-    covariance = np.array([one.matrix for one in measured], dtype=float).reshape(-1, 2, 2)
+    """Return standard deviations ``(N,)`` and covariances ``(N, 2, 2)`` of measurements, as written to files."""
+    covariance = np.array([mark.matrix for mark in measured], dtype=float).reshape(-1, 2, 2)
     sigma = sigma_of_covariance(covariance)
     for k in np.flatnonzero(~says_more(covariance)).tolist():
         sigma[k] = measured[k].sigma_image or sigma[k] if measured[k].covariance is None else sigma[k]
@@ -123,12 +124,12 @@ def errors_of(measured: Sequence[Mark | RayMark]) -> tuple[np.ndarray, np.ndarra
 
 
 def checked(mark: Mark) -> Mark:
-    """Return a mark whose values are possible.
+    """Return a mark after checking its values.
 
     Raises
     ------
     InputError
-        With the field that is not.
+        With the wrong field.
     """
     name = plain_id(mark.id)
     if not name or name != mark.id or len(name) > LONGEST_ID or not is_writable(name):
@@ -160,18 +161,18 @@ def checked(mark: Mark) -> Mark:
     return mark
 
 
-def _check_measurement(one: Mark | RayMark, where: str) -> None:
-    if one.image is not None and max(map(abs, one.image)) > 1e8:
+def _check_measurement(mark: Mark | RayMark, where: str) -> None:
+    if mark.image is not None and max(map(abs, mark.image)) > 1e8:
         raise InputError("this is not an image position", field=f"{where}image")
     least, most = _SIGMAS
-    if one.sigma_image is not None and not least <= one.sigma_image <= most:
+    if mark.sigma_image is not None and not least <= mark.sigma_image <= most:
         raise InputError(
             "a standard deviation must be positive", field=f"{where}sigma_image", remedy="give it in pixels"
         )
-    if one.covariance is not None:
-        column, row, both = one.covariance
+    if mark.covariance is not None:
+        column, row, both = mark.covariance
         possible = least**2 <= min(column, row) and max(column, row) <= most**2
-        # A power of a float, unlike a root, has no result beyond 1e308.
+        # Use a root: a power of a float can overflow 1e308.
         if not (possible and abs(both) < math.sqrt(column * row * (1 - 1e-9))):
             raise InputError("this is not a covariance", field=f"{where}covariance")
 
@@ -192,15 +193,15 @@ def mark_of(document: Any) -> Mark:
 
 @dataclass(frozen=True)
 class Marks:
-    """All marks by their ids, in the order of their making, and the correction that the person chose."""
+    """All marks by id, in the order of measurement, and the chosen correction."""
 
     by_id: Mapping[str, Mark] = field(default_factory=dict)
     correction: str | None = None
 
     def points(self, source: str) -> Points:
-        """Return the points of the adjustment: marks that are whole and on.
+        """Return the points of the adjustment: complete marks that are on.
 
-        Ground that was read off the reference errs with it: such a point has a group, its own, as a match has.
+        Ground from the reference has the error of the reference, so such a point gets its own group, like a match.
         """
         used = [mark for mark in self.by_id.values() if mark.counts]
         groups = np.array([-1 if mark.group is None else mark.group for mark in used], dtype=np.int64)
@@ -223,9 +224,9 @@ class Marks:
         )
 
     def document(self, source: str) -> dict[str, Any]:
-        """Return the GeoJSON of the points, each with its provenance; readers of points ignore what is not theirs.
+        """Return the GeoJSON of the points, each with its provenance; readers of points ignore unknown members.
 
-        What is off or not whole stands in ``left_out``, which is no part of the collection.
+        Marks that are off or incomplete are in ``left_out``, outside the collection.
         """
         points = self.points(source)
         features = [feature_of(point) for point in points]
@@ -242,7 +243,7 @@ class Marks:
 
 
 class Written:
-    """Marks as JSON values, each made once: after an action nearly all of them are as they were."""
+    """Marks as JSON values, each converted once, because an action changes few of them."""
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[Mark, dict[str, Any]]] = {}
@@ -260,13 +261,13 @@ def marks_of(points: Points, at: str) -> list[Mark]:
     Parameters
     ----------
     at : str
-        When they were read.
+        Time of reading.
     """
     more = says_more(points.covariance_image)
-    found = []
+    marks = []
     for k, point in enumerate(points.to_crs(GROUND_CRS)):
         (column, both), (_, row) = point.covariance_image
-        found.append(
+        marks.append(
             checked(
                 Mark(
                     id=point.id,
@@ -286,14 +287,14 @@ def marks_of(points: Points, at: str) -> list[Mark]:
                 )
             )
         )
-    return found
+    return marks
 
 
 # -- actions ---------------------------------------------------------------------------------------------------------
 
 
 class History:
-    """Marks as they are now, were before, and were before something was undone."""
+    """The marks now, and the earlier and undone states."""
 
     def __init__(self) -> None:
         self._states: list[Marks] = [Marks()]
@@ -301,26 +302,26 @@ class History:
 
     @property
     def marks(self) -> Marks:
-        """As they are now."""
+        """The marks now."""
         return self._states[self._now]
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is something to go back to; what was begun with, the first action, stays."""
+        """Whether an action can be undone; the first action, which loads points, cannot."""
         return self._now > 1
 
     @property
     def can_redo(self) -> bool:
-        """Whether something was undone."""
+        """Whether an undone action can be repeated."""
         return self._now + 1 < len(self._states)
 
     def after(self, action: Mapping[str, Any]) -> Marks | int:
-        """Return what an action would lead to: other marks, or a step back (-1) or forward (1); nothing changes.
+        """Return the result of an action: other marks, or a step back (-1) or forward (1); nothing changes yet.
 
         Raises
         ------
         InputError
-            If it cannot be done.
+            If the action is not possible.
         """
         if action.get("do") in ("undo", "redo"):
             _require_members(action, set())
@@ -330,7 +331,7 @@ class History:
         return _changed(self.marks, action)
 
     def take(self, step: Marks | int) -> None:
-        """Go where `after` said."""
+        """Apply a result of `after`."""
         if isinstance(step, int):
             self._now += step
             return
@@ -347,7 +348,7 @@ def _changed(marks: Marks, action: Mapping[str, Any]) -> Marks:
     if kind == "begin":
         if marks.by_id or not isinstance(action.get("marks"), list):
             raise InputError("points can only be loaded into an empty table", field="marks")
-        return _begun([mark_of(one) for one in action["marks"]])
+        return _begun([mark_of(document) for document in action["marks"]])
     if kind == "put":
         return replace(marks, by_id=_with(marks.by_id, mark_of(action.get("mark")), action.get("was")))
     if kind == "remove":
@@ -371,14 +372,14 @@ def _require_members(action: Mapping[str, Any], members: set[str]) -> None:
 
 
 def _begun(marks: Sequence[Mark]) -> Marks:
-    found = {mark.id: mark for mark in marks}
-    if len(found) != len(marks) or len(found) > MOST_MARKS:
+    by_id = {mark.id: mark for mark in marks}
+    if len(by_id) != len(marks) or len(by_id) > MOST_MARKS:
         raise InputError(f"{counted(len(marks), 'point')}: too many, or two with the same name", field="marks")
-    return Marks(found)
+    return Marks(by_id)
 
 
 def _with(marks: Mapping[str, Mark], mark: Mark, was: object) -> dict[str, Mark]:
-    """Return marks with another one, in the place of the one that it replaces."""
+    """Return the marks with a new one, in the place of the one that it replaces."""
     before = mark.id if was is None else str(was)
     if was is not None and before not in marks:
         raise InputError(f"unknown point {before}", field="was")
@@ -393,7 +394,7 @@ def _with(marks: Mapping[str, Mark], mark: Mark, was: object) -> dict[str, Mark]
 
 
 def _refuse_twin(others: Sequence[Mark], mark: Mark) -> None:
-    """Refuse a point at the place of another one: a file with both would be refused by whoever reads it."""
+    """Raise an error for a point at the position of another: readers would refuse a file with both."""
     if not mark.counts:
         return
     for other in others:

@@ -19,36 +19,36 @@ from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import meet_surface
 
-#: What a person may type for a CRS or a height datum: names and codes.
+#: Accepted input for a CRS or a height datum: names and codes.
 _NAMED = r"[a-z]{2,12}:[0-9]{1,9}(\+[0-9]{1,9})?|ellipsoid|egm96|egm2008"
 
-#: So often a height is read where the last one puts a place: each is some ten times as near.
+#: Iterations for the height; each one reduces the error about ten times.
 _ROUNDS = 2
-#: Pixels to either side by which it is asked how one geometry lies in another.
+#: Step (px) for the derivatives of one geometry in another.
 _STEP = 8.0
 
 
 class Geometry(Protocol):
-    """What ground is shown in: pixels of an image by a model, or of a map."""
+    """A geometry that shows ground: pixels of an image by a model, or of a map."""
 
     def image_of(self, ground: ArrayLike) -> Array:
-        """Return the pixels ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN where there are none."""
+        """Return the pixels ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN if there are none."""
         ...
 
     def ground_of(self, image: ArrayLike) -> Array:
-        """Return the ground ``(N, 3)`` in `GROUND_CRS` that pixels ``(N, 2)`` show; NaN where they show none."""
+        """Return the ground ``(N, 3)`` in `GROUND_CRS` of pixels ``(N, 2)``; NaN if there is none."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A reference in its own pixels: a map, north up where the file is.
+    """A reference in its own pixels, as a map.
 
     Parameters
     ----------
     reference : Reference
     surface : Surface
-        The heights of what the map shows.
+        Heights of the map.
     """
 
     reference: Reference
@@ -60,29 +60,29 @@ class Sheet:
         return self.reference.intensity.width, self.reference.intensity.height
 
     def image_of(self, ground: ArrayLike) -> Array:
-        """Return the pixels ``(N, 2)`` of ground ``(N, 3)``; NaN where the map does not reach."""
-        found = self.reference.project(np.asarray(ground, dtype=float).reshape(-1, 3), GROUND_CRS)
+        """Return the pixels ``(N, 2)`` of ground ``(N, 3)``; NaN outside the map."""
+        pixels = self.reference.project(np.asarray(ground, dtype=float).reshape(-1, 3), GROUND_CRS)
         with np.errstate(invalid="ignore"):
-            found[~((found >= 0) & (found <= self.size)).all(axis=1)] = np.nan
-        return found
+            pixels[~((pixels >= 0) & (pixels <= self.size)).all(axis=1)] = np.nan
+        return pixels
 
     def ground_of(self, image: ArrayLike) -> Array:
         """Return the ground ``(N, 3)`` of pixels ``(N, 2)``, with the heights of the surface."""
-        given = np.asarray(image, dtype=float).reshape(-1, 2)
+        pixels = np.asarray(image, dtype=float).reshape(-1, 2)
         linear, offset = self.reference.pixel_from_map[:, :2], self.reference.pixel_from_map[:, 2]
-        plan = (given - offset) @ np.linalg.inv(linear).T
+        plan = (pixels - offset) @ np.linalg.inv(linear).T
         heights = self.surface.heights(plan, self.reference.crs)
         return ground_transform(self.reference.crs, GROUND_CRS)(np.column_stack([plan, heights]))
 
 
 @dataclass(frozen=True, eq=False)
 class SceneGeometry:
-    """A scene, and what shows the same ground, as one geometry.
+    """A scene and the references that show the same ground, as one geometry.
 
     Parameters
     ----------
     view : SceneView
-        The scene by the model that the reference is rendered with.
+        The scene, with the model used to render the reference.
     references : tuple of Target
         Orthoimages, or other scenes.
     """
@@ -92,7 +92,7 @@ class SceneGeometry:
 
     @property
     def model(self) -> SensorModel:
-        """The model that puts ground into the image."""
+        """The model that projects ground into the image."""
         return self.view.model
 
     @property
@@ -101,46 +101,46 @@ class SceneGeometry:
         return self.view.surface
 
     def by(self, model: SensorModel) -> SceneGeometry:
-        """Return the same by another model."""
+        """Return this geometry with another model."""
         return replace(self, view=replace(self.view, model=model))
 
     def image_of(self, ground: ArrayLike) -> Array:
-        """Return the image ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN where there is none."""
-        given = np.asarray(ground, dtype=float).reshape(-1, 3)
-        return self.model.ground_to_image(ground_transform(GROUND_CRS, self.model.crs)(given))
+        """Return the image ``(N, 2)`` of ground ``(N, 3)`` in `GROUND_CRS`; NaN if there is none."""
+        positions = np.asarray(ground, dtype=float).reshape(-1, 3)
+        return self.model.ground_to_image(ground_transform(GROUND_CRS, self.model.crs)(positions))
 
     def ground_of(self, image: ArrayLike) -> Array:
-        """Return the ground ``(N, 3)`` in `GROUND_CRS` that image points ``(N, 2)`` see; NaN where they see none."""
+        """Return the ground ``(N, 3)`` in `GROUND_CRS` of image points ``(N, 2)``; NaN if there is none."""
         met = meet_surface(self.model, np.asarray(image, dtype=float).reshape(-1, 2), self.surface)
-        found = np.full(met.shape, np.nan)
+        ground = np.full(met.shape, np.nan)
         good = np.isfinite(met).all(axis=1)
-        found[good] = ground_transform(self.model.crs, GROUND_CRS)(met[good])
-        return found
+        ground[good] = ground_transform(self.model.crs, GROUND_CRS)(met[good])
+        return ground
 
     def ground_about(self, image: ArrayLike, heights: ArrayLike) -> Array:
-        """Return the ground that image points ``(N, 2)`` see as `ground_of`, where its height ``(N,)`` is about known.
+        """Return the ground of image points ``(N, 2)`` like `ground_of`, from approximate heights ``(N,)``.
 
-        On slopes so steep that a ray meets the surface more than once this is one of these places.
+        If a ray meets a steep slope more than once, this is one of these positions.
         """
-        given, height = np.asarray(image, dtype=float), np.asarray(heights, dtype=float)
+        points, height = np.asarray(image, dtype=float), np.asarray(heights, dtype=float)
         to_ground = ground_transform(self.model.crs, GROUND_CRS)
         for _ in range(_ROUNDS):
-            found = to_ground(self.model.image_to_ground(given, height))
-            there = self.surface.heights(found[:, :2], horizontal(parse_crs(GROUND_CRS)))
+            ground = to_ground(self.model.image_to_ground(points, height))
+            there = self.surface.heights(ground[:, :2], horizontal(parse_crs(GROUND_CRS)))
             height = np.where(np.isfinite(there), there, height)
-        return to_ground(self.model.image_to_ground(given, height))
+        return to_ground(self.model.image_to_ground(points, height))
 
     def moved(self, shift: ArrayLike) -> SceneGeometry:
-        """Return the same where the model puts everything `shift` (column, row; px) farther."""
+        """Return this geometry with the model shifted by `shift` (column, row; px)."""
         step = np.zeros(6)
         step[[0, 3]] = np.asarray(shift, dtype=float)
         return self.by(ImageCorrection(self.model, "shift", (0.0, 0.0), step))
 
 
 def linked(one: Geometry, other: Geometry, place: ArrayLike) -> dict[str, Any]:
-    """Return how a geometry lies in another one about a place: its `place` there and the partial derivatives.
+    """Return the position of a place in another geometry (`place`) and the partial derivatives (`matrix`).
 
-    Both are null where the place is not seen there.
+    Both are null if the place is not visible there.
     """
     steps = np.array([(0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)]) * _STEP
     there = other.image_of(one.ground_of(np.asarray(place, dtype=float) + steps))
@@ -151,22 +151,22 @@ def linked(one: Geometry, other: Geometry, place: ArrayLike) -> dict[str, Any]:
 
 
 def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None, surface: Surface) -> Array:
-    """Return typed coordinates x, y and height as ground ``(3,)`` in `GROUND_CRS`; a height of None is the surface's.
+    """Return entered coordinates x, y and height as ground ``(3,)`` in `GROUND_CRS`; None means the surface height.
 
     Parameters
     ----------
     crs : str
         Of x and y.
     vertical : str, optional
-        What the height is measured above; the ellipsoid without one.
+        Height datum; default: the ellipsoid.
 
     Raises
     ------
     InputError, CrsError, DatumError
-        If a value is missing, or what it is in is not known.
+        If a value is missing, or its CRS or datum is unknown.
     """
     for field, text in (("crs", crs), ("vertical", vertical or "ellipsoid")):
-        # What else PROJ understands may name files, and a page opens none.
+        # Other definitions could refer to files, which the page must not open.
         if not re.fullmatch(_NAMED, text.strip(), re.ASCII | re.IGNORECASE):
             raise InputError(
                 "unknown CRS" if field == "crs" else "unknown height datum",

@@ -1,4 +1,4 @@
-"""Planning: where the next point tells most, and what it would gain."""
+"""Planning: the best place for the next point, and the gain."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Places per side at which it is asked how certain the image is.
+#: Grid positions per side at which the uncertainty is computed.
 _SIDE = 12
-#: Uncertainties within this part of the largest are alike: the place farthest from all points is taken then.
+#: Uncertainties within this part of the largest count as equal; then the place farthest from all points is best.
 ALIKE = 0.1
-#: Places that are offered, the best first.
+#: Number of offered places, the best first.
 OFFERED = 6
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningGrid:
-    """Places of a scene that a reference shows, and all over the scene.
+    """Candidate places of a scene with a reference, and a regular grid over the scene.
 
     Parameters
     ----------
     image, ground : (n, 2), (n, 3)
-        In each cell of the scene the place with the most structure, px; and its ground in the CRS of the model.
+        The place with the most structure in each cell of the scene, px, and its ground in the CRS of the model.
     everywhere : (m, 3)
-        Ground of a regular grid, where it is asked how certain the image is.
+        Ground of a regular grid for the uncertainty.
     """
 
     image: Array
@@ -43,7 +43,7 @@ class PlanningGrid:
 
     @classmethod
     def over(cls, places: SceneGeometry, side: int = _SIDE) -> PlanningGrid:
-        """Return the places of a scene, one in each of `side` x `side` cells."""
+        """Return one place in each of `side` x `side` cells of a scene."""
         width, height = places.view.size
         steps = (np.arange(side) + 0.5) / side
         columns, rows = np.meshgrid(steps * width, steps * height)
@@ -64,7 +64,7 @@ class PlanningGrid:
 
 
 def _shown(places: SceneGeometry, image: Array) -> tuple[Array, Array]:
-    """Return those of image points whose ground a reference shows, and that ground."""
+    """Return the image points whose ground a reference shows, and this ground."""
     ground = meet_surface(places.model, image, places.surface)
     good = np.flatnonzero(np.isfinite(ground).all(axis=1))
     good = good[shown_by(places.references, ground[good], places.model.crs)]
@@ -73,11 +73,11 @@ def _shown(places: SceneGeometry, image: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Next:
-    """Where to measure: column and row (px) of image `number`; what is known there, and would be with a point there.
+    """A place to measure: column and row (px) of image `number`, and the uncertainty before and after a measurement.
 
-    `height` (m) is that of the surface there, by the model as it was delivered.
-    `sigma` (px) is the standard deviation (both axes together) of the prediction at this place, `largest` that at the
-    worst place of the scene, `then` the same after a measurement of this `role` here; None where there is no fit yet.
+    `height` (m) is that of the surface there, by the delivered model. `sigma` (px) is the standard deviation (both axes
+    together) of the prediction at this place, `largest` that at the worst place of the scene, and `then` the same after
+    a measurement of this `role` here; None without a fit.
     """
 
     image: tuple[float, float]
@@ -90,12 +90,12 @@ class Next:
 
 
 def measure_next(grid: PlanningGrid, fit: Fit | None, taken: Array) -> list[Next]:
-    """Return places whose predicted image is least certain, the best first; none where the references show nothing.
+    """Return the places with the most uncertain prediction, the best first; none without data of references.
 
     Parameters
     ----------
     taken : (k, 2)
-        Image points that there are.
+        Existing image points.
 
     Notes
     -----
@@ -111,21 +111,21 @@ def measure_next(grid: PlanningGrid, fit: Fit | None, taken: Array) -> list[Next
     noise = np.eye(2) * (sigma * (1.0 if fit.sigma0 is None else fit.sigma0)) ** 2
     largest = _root(_variances(everywhere, fit.covariance).max(initial=0.0))
     left = np.arange(len(grid.image))
-    found: list[Next] = []
-    while len(left) and len(found) < OFFERED:
+    places: list[Next] = []
+    while len(left) and len(places) < OFFERED:
         alike = left[variance[left] >= (1 - ALIKE) * variance[left].max()]
         best = int(alike[apart(grid.image[alike], taken, 1)[0]])
         there = partials[best] @ fit.covariance
         gain = there.T @ np.linalg.solve(there @ partials[best].T + noise, there)
         then = _root(_variances(everywhere, fit.covariance - gain).max(initial=0.0))
         height = float(grid.ground[best, 2])
-        found.append(Next(_pair(grid.image[best]), _root(variance[best]), largest, then, height=height))
+        places.append(Next(_pair(grid.image[best]), _root(variance[best]), largest, then, height=height))
         taken, left = np.concatenate([taken, grid.image[[best]]]), left[left != best]
-    return found
+    return places
 
 
 def _variances(partials: Array, covariance: Array) -> Array:
-    """Return the variance ``(n,)`` px^2 of both axes together of predictions with partials ``(n, 2, P)``."""
+    """Return the variance ``(n,)`` px^2 (both axes together) of predictions with partials ``(n, 2, P)``."""
     return np.einsum("nip,pq,niq->n", partials, covariance, partials)
 
 
@@ -134,7 +134,7 @@ def _root(variance: float) -> float:
 
 
 def apart(image: Array, taken: Array, count: int = OFFERED) -> NDArray[np.int_]:
-    """Return some image points, each the farthest from those taken and chosen; without any taken the middle first."""
+    """Return some image points, each farthest from all taken and chosen ones; the middle first if none is taken."""
     chosen: list[int] = []
     distance = np.full(len(image), np.inf)
     if len(taken):

@@ -1,4 +1,4 @@
-"""A project of measured points: each action is journaled, then solved, then shown in all geometries that there are."""
+"""A project of measured points: each action is solved, written to the journal, and shown in all geometries."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
 
-#: What is appended to the name of the points for their journal.
+#: Suffix of the journal of a file of points.
 JOURNAL = ".journal"
-#: What is rendered by a model is rendered anew where it moves by more than this (px).
+#: Render again if the model moves anything by more than this (px).
 _MOVED = 0.2
 
 
 class _Shown(abc.ABC):
-    """What a page is shown of a project: its points, their places in every view, and the figures."""
+    """What the page shows of a project: its points, their positions in every view, and the figures."""
 
     views: tuple[SceneView, ...]
     sheets: tuple[Sheet, ...]
@@ -49,59 +49,59 @@ class _Shown(abc.ABC):
 
     @property
     def marks(self) -> Marks:
-        """The points as they are now."""
+        """The points now."""
         return self._history.marks
 
     @property
     @abc.abstractmethod
     def version(self) -> int:
-        """Number of the models that references are rendered with now."""
+        """Version of the models that render the references now."""
 
     @abc.abstractmethod
     def places_of(self, number: int) -> SceneGeometry:
-        """Return the geometry of an image as it is adjusted now."""
+        """Return the geometry of an image with the present adjustment."""
 
     @abc.abstractmethod
     def _figures(self) -> dict[str, Any]:
-        """Return what is shown of the solution, as JSON values."""
+        """Return the figures of the solution, as JSON values."""
 
     @abc.abstractmethod
     def _ahead(self) -> list[Next]:
-        """Return places where to measure next, the best first."""
+        """Return the next places to measure, the best first."""
 
     def _grounds(self, marks: Sequence[Mark]) -> Array:
-        """Return the ground ``(N, 3)`` at which marks are shown; NaN where there is none."""
+        """Return the ground ``(N, 3)`` of marks; NaN if there is none."""
         return np.array([mark.ground or (np.nan,) * 3 for mark in marks], dtype=float).reshape(-1, 3)
 
     def _shown(self) -> dict[str, Any]:
-        """Return what `state` does, but for the number of actions."""
+        """Return the document of `state` without the number of actions."""
         marks, history, version = list(self.marks.by_id.values()), self._history, self.version
         shown, ahead = self._places(version, self._grounds(marks)), self._ahead()
         there = np.full((len(ahead), 3), np.nan)
-        for number in {one.number for one in ahead}:
-            rows = [k for k, one in enumerate(ahead) if one.number == number]
+        for number in {place.number for place in ahead}:
+            rows = [k for k, place in enumerate(ahead) if place.number == number]
             there[rows] = self.places_of(number).ground_about(
                 [ahead[k].image for k in rows], [ahead[k].height for k in rows]
             )
-        told = [self._written.of(mark) for mark in marks]
+        documents = [self._written.of(mark) for mark in marks]
         return {
-            "marks": [{**mark, "places": places} for mark, places in zip(told, shown, strict=True)],
+            "marks": [{**mark, "places": places} for mark, places in zip(documents, shown, strict=True)],
             "version": version,
             "undo": history.can_undo,
             "redo": history.can_redo,
             **self._figures(),
             "next": [
-                {**json_value(one), "places": places}
-                for one, places in zip(ahead, self._places(version, there), strict=True)
+                {**json_value(place), "places": places}
+                for place, places in zip(ahead, self._places(version, there), strict=True)
             ],
         }
 
     # -- places ------------------------------------------------------------------------------------------------------
 
     def _places(self, version: int, ground: Array) -> list[dict[str, list[float] | None]]:
-        """Return where each ground ``(N, 3)`` lies in all geometries; null where it does not."""
-        found = {name: one.image_of(ground) for name, one in self._geometries(version).items()}
-        return [{name: json_position(places[k]) for name, places in found.items()} for k in range(len(ground))]
+        """Return the positions of each ground ``(N, 3)`` in all geometries; null if it is outside."""
+        positions = {name: geometry.image_of(ground) for name, geometry in self._geometries(version).items()}
+        return [{name: json_position(places[k]) for name, places in positions.items()} for k in range(len(ground))]
 
     def _geometry(self, name: str, version: int) -> Geometry:
         known = self._geometries(version)
@@ -116,7 +116,7 @@ class _Shown(abc.ABC):
         place: Sequence[float] | None = None,
         ground: Sequence[float] | None = None,
     ) -> dict[str, Any]:
-        """Return where a place of a geometry, or of the ground, lies in all of them.
+        """Return the positions of a place of one geometry, or of ground, in all geometries.
 
         Parameters
         ----------
@@ -128,44 +128,43 @@ class _Shown(abc.ABC):
         Returns
         -------
         dict
-            `ground`; `places` by geometry, px; `sigma`, of the prediction in the first image; null is what cannot be
-            said.
+            `ground`; `places` by geometry, px; `sigma` of the prediction in the first image; null if unknown.
         """
         with self._lock:
             if ground is not None:
-                found = np.array([ground], dtype=float)
+                positions = np.array([ground], dtype=float)
             else:
-                found = self._geometry(str(at), version).ground_of(np.array([place], dtype=float))
+                positions = self._geometry(str(at), version).ground_of(np.array([place], dtype=float))
             return {
-                "ground": json_position(found[0]),
-                "places": self._places(version, found)[0],
-                "sigma": self._sigma(found),
+                "ground": json_position(positions[0]),
+                "places": self._places(version, positions)[0],
+                "sigma": self._sigma(positions),
             }
 
     @abc.abstractmethod
     def _sigma(self, ground: Array) -> list[float] | None:
-        """Return the standard deviations (px) of the predicted image of ground ``(1, 3)``, if they are known."""
+        """Return the standard deviations (px) of the predicted image of ground ``(1, 3)``, if known."""
 
     def link(self, version: int, at: str, place: Sequence[float], to: str) -> dict[str, Any]:
-        """Return how one geometry lies in another about a place, as `places.linked`."""
+        """Return the relation of two geometries at a place, as `places.linked`."""
         with self._lock:
             return linked(self._geometry(at, version), self._geometry(to, version), place)
 
     def typed(self, values: Sequence[float | None], crs: str, vertical: str | None) -> list[float]:
-        """Return typed coordinates as ground in `GROUND_CRS`."""
+        """Return entered coordinates as ground in `GROUND_CRS`."""
         return ground_typed(values, crs or GROUND_CRS, vertical, self.surface).tolist()
 
 
 class Project(_Shown):
-    """Points that are measured, with their journal.
+    """Measured points with their journal.
 
-    Geometries have names: ``scene-K`` is image K as it is adjusted now, ``reference-K`` what is rendered into its
-    pixels by an earlier model, its version, ``map-R`` reference R in its own pixels.
+    Geometries have names: ``scene-K`` is image K with the present adjustment, ``reference-K`` is the reference rendered
+    into its pixels by a version of the model, ``map-R`` is reference R in its own pixels.
 
     Parameters
     ----------
     output : Path
-        The GeoJSON of the points; its journal lies beside it.
+        The GeoJSON of the points; the journal is beside it.
     surface : Surface
         The heights.
     views : sequence of SceneView
@@ -176,7 +175,7 @@ class Project(_Shown):
     Attributes
     ----------
     stopped : str
-        Which action of the journal was impossible, if one was: the points are those before it.
+        Message about an impossible action of the journal, if any; only the actions before it are loaded.
     """
 
     _solution: Any
@@ -190,23 +189,23 @@ class Project(_Shown):
         self.journal = Journal(output.with_name(output.name + JOURNAL))
         self._history, self._written = History(), Written()
 
-    # -- what differs ------------------------------------------------------------------------------------------------
+    # -- one image or several ----------------------------------------------------------------------------------------
 
     @abc.abstractmethod
     def _identity(self) -> dict[str, Any]:
-        """Say which images a journal is of."""
+        """Return the identity of the images of a journal."""
 
     @abc.abstractmethod
     def _source(self) -> dict[str, Any] | None:
-        """Say which file of points it begins with; None for none."""
+        """Return the identity of the file of points at the start; None without one."""
 
     @abc.abstractmethod
     def _given(self) -> list[Mark] | None:
-        """Return the points that it begins with; None if none were given."""
+        """Return the points at the start; None if none were given."""
 
     @abc.abstractmethod
     def _require_possible(self, marks: Iterable[Mark], correction: str | None) -> None:
-        """Refuse marks, and a correction, that images such as these cannot have.
+        """Raise an error for marks or a correction that these images cannot have.
 
         Raises
         ------
@@ -215,7 +214,7 @@ class Project(_Shown):
 
     @abc.abstractmethod
     def _solve(self) -> None:
-        """Adjust to the points as they are."""
+        """Adjust to the present points."""
 
     @abc.abstractmethod
     def _geometries(self, version: int) -> Mapping[str, Geometry]:
@@ -223,12 +222,12 @@ class Project(_Shown):
 
     @abc.abstractmethod
     def rendering(self, name: str, version: int) -> SceneGeometry | None:
-        """Return what a view is rendered from by a model; None if it is the raster itself.
+        """Return the geometry from which a view is rendered; None if it is the raster itself.
 
         Raises
         ------
         InputError
-            If there is no such version.
+            If the version is unknown.
         """
 
     @abc.abstractmethod
@@ -237,16 +236,16 @@ class Project(_Shown):
 
     @abc.abstractmethod
     def compared(self) -> dict[str, Any]:
-        """Return the models, or corrections, that the points could be fitted with, compared, and the one to take."""
+        """Return a comparison of models or corrections on the points, with a recommendation."""
 
     @abc.abstractmethod
     def ortho(self, progress: Progress, number: int = 0) -> Result:
         """Make the ortho of an image with the saved points, in a folder beside them."""
 
-    # -- beginning and end -------------------------------------------------------------------------------------------
+    # -- opening and closing -----------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
-        """Do again what the journal holds; a new one begins with the points that were given."""
+        """Repeat the actions of the journal; a new journal starts with the given points."""
         try:
             source = self._source()
             if not self.journal.actions:
@@ -276,7 +275,7 @@ class Project(_Shown):
         self._solve()
 
     def _take(self, actions: Sequence[Mapping[str, Any]]) -> int:
-        """Do actions of the journal up to one that is impossible; return how many were done."""
+        """Apply actions of the journal until one is impossible; return the number of applied ones."""
         for number, action in enumerate(actions):
             try:
                 self._history.take(self._step(_plain(action)))
@@ -289,7 +288,7 @@ class Project(_Shown):
         return len(actions)
 
     def _step(self, action: Mapping[str, Any]) -> Marks | int:
-        """Return what an action leads to, as `History.after`, if images such as these can have it."""
+        """Return the result of an action, as `History.after`, after checking that these images can have it."""
         step, known = self._history.after(action), self.marks.by_id
         if isinstance(step, Marks):
             changed = (mark for name, mark in step.by_id.items() if known.get(name) is not mark)
@@ -297,9 +296,9 @@ class Project(_Shown):
         return step
 
     def _first(self) -> dict[str, Any]:
-        """Return the action that a journal begins with."""
-        given = self._given()
-        if given is None and self.output.exists():
+        """Return the first action of a journal."""
+        marks = self._given()
+        if marks is None and self.output.exists():
             raise InputError(
                 "this file already exists and was not made by ortho measure",
                 file=self.output,
@@ -310,14 +309,14 @@ class Project(_Shown):
             )
         return {
             "do": "begin",
-            "marks": [mark.to_json() for mark in given or ()],
+            "marks": [mark.to_json() for mark in marks or ()],
             "source": self._source(),
             "image": self._identity(),
             "at": now(),
         }
 
     def save(self) -> None:
-        """Write the GeoJSON, whole, unless it holds all actions already."""
+        """Write the GeoJSON, unless it already has all actions."""
         with self._lock:
             if self.journal.read_only or self._saved == len(self.journal.actions):
                 return
@@ -326,19 +325,19 @@ class Project(_Shown):
             self._saved = count
 
     def close(self) -> None:
-        """Write what is not written, and let go of the journal."""
+        """Save, and close the journal."""
         self.save()
         self.journal.close()
 
     # -- actions -----------------------------------------------------------------------------------------------------
 
     def act(self, action: Mapping[str, Any]) -> dict[str, Any]:
-        """Do an action and return what there is to show after it.
+        """Apply an action and return the new state.
 
         Raises
         ------
         InputError
-            If it cannot be done or written down; nothing has changed then.
+            If it is not possible or cannot be written; then nothing has changed.
         """
         with self._lock:
             if action.get("do") == "begin":
@@ -350,7 +349,7 @@ class Project(_Shown):
             before = self._history, self._solution, self.rendered
             self._history = copy.copy(self._history)
             try:
-                # What is in the journal has to open again: it was solved, and all that is shown of it was made.
+                # Write to the journal last, so that only actions that can be solved and shown are in it.
                 self._history.take(step)
                 self._solve()
                 shown = self._shown()
@@ -361,31 +360,31 @@ class Project(_Shown):
             return {**shown, "actions": len(self.journal.actions)}
 
     def _follow(self) -> None:
-        """Do what another process has done since, if that one writes."""
+        """Apply what another process has written since."""
         new = [] if self.stopped else self.journal.more()
         if new:
             self._take(new)
             self._solve()
 
     def state(self) -> dict[str, Any]:
-        """Return all that changes with the points, as JSON values."""
+        """Return everything that depends on the points, as JSON values."""
         with self._lock:
             self._follow()
             return {**self._shown(), "actions": len(self.journal.actions)}
 
 
 def _plain(action: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an action without what the journal says about it."""
+    """Return an action without the fields of the journal."""
     return {key: value for key, value in action.items() if key not in ("at", "image", "source")}
 
 
 def points_file(output: str | os.PathLike[str]) -> Path:
-    """Return the path that measured points are written to.
+    """Return the path for measured points.
 
     Raises
     ------
     InputError
-        If it is not named as GeoJSON.
+        If its name is not that of GeoJSON.
     """
     path = Path(output)
     if path.suffix.lower() != ".geojson":
@@ -396,11 +395,11 @@ def points_file(output: str | os.PathLike[str]) -> Path:
 
 
 def moved(before: SensorModel, after: SensorModel, ground: Array) -> bool:
-    """Tell whether a model puts ground of its CRS ``(N, 3)`` elsewhere than another one, so far that people see it."""
+    """Return whether two models project ground of their CRS ``(N, 3)`` visibly apart."""
     step = after.ground_to_image(ground) - before.ground_to_image(ground)
     return bool(len(step)) and not np.nanmax(np.abs(step), initial=0.0) <= _MOVED
 
 
 def now() -> str:
-    """Return the time as files have it."""
+    """Return the present time in the format of the files."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,10 +1,9 @@
-"""Proposals: the sub-pixel place of one click, with its score and covariance, by the matcher's own functions.
+"""Proposals: the sub-pixel position of a click, with score and covariance, by the functions of the matcher.
 
-The chip of the scene about the click is looked for in the reference, which is rendered into the scene's pixels where
-the click says that it belongs; two rounds of least-squares matching measure the shift, the second from where the first
-led. What least-squares matching states for its covariance is too small by a factor that only a scatter tells: so the
-neighbours of the chip are measured too, and the scatter of their shifts gives the factor. What is alike in all of them
-(an error of the reference or of the heights) is not in it; it shows in the residuals of the fit.
+The chip of the scene around the click is searched in the reference, which is rendered into the pixels of the scene at
+that place. Repeated least-squares matching measures the shift. The covariance of least-squares matching is too small by
+an unknown factor. So the neighbours of the chip are also measured, and the scatter of their shifts gives the factor.
+Errors common to all neighbours (of the reference or the heights) are not included; the residuals of the fit show them.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ from ortho_pipeline.imaging.matching.targets import chip_factor
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
 
-#: Chip px about where it should be: of the search where both places are clicked, and the farthest of all.
+#: Search radius in chip px: if both positions are clicked, and the largest.
 NEAR, FARTHEST = 6, 48
-#: Neighbours whose scatter tells how good a match is: fewer than this tell nothing.
+#: Least number of neighbours for a scatter.
 _FEWEST = 4
-#: No match by hand is claimed to be better than this (px per axis).
+#: Lower limit of the standard deviation of a match (px per axis).
 _LEAST = 0.02
 _ROUNDS = 3
-#: Neighbours of a chip, in sides of it, the nearest first; so many of them are measured.
+#: Neighbours of a chip, in chip sides, the nearest first; `_NEIGHBOURS` of them are measured.
 _AROUND = np.array(
     sorted(((x, y) for y in range(-2, 3) for x in range(-2, 3) if x or y), key=lambda step: step[0] ** 2 + step[1] ** 2)
 )
@@ -49,15 +48,15 @@ class Proposal:
     Parameters
     ----------
     shift : (2,)
-        Where the reference shows what the scene has at the click, minus the click: px. NaN if it was not found.
+        Position of the match in the reference minus the click, px. NaN without a match.
     covariance : (2, 2)
         px^2.
     score : float
         Correlation of the chips, -1 to 1.
     reason : str
-        Why it is not to be believed, in words; empty if it is.
+        Why the match is not reliable, in words; empty if it is.
     scattered : int
-        So many neighbours told the size of the covariance; 0 where none did, and it is that of a measurement by hand.
+        Number of neighbours behind the covariance; 0 if it is that of a manual measurement.
     """
 
     shift: Array
@@ -68,28 +67,28 @@ class Proposal:
 
 
 def propose(places: SceneGeometry, image: Sequence[float], radius: float) -> Proposal:
-    """Match the scene about an image point with the references, which are looked through so many px about it.
+    """Match the scene at an image point with the references, within a radius (px).
 
     Parameters
     ----------
     places : SceneGeometry
-        With a model that puts the wanted ground at the click, as well as is known.
+        With a model that projects the wanted ground approximately to the click.
     """
     factor = chip_factor(places.view, places.references, np.asarray(image, dtype=float)[None])
     reach = int(np.clip(np.ceil(radius / factor), NEAR, FARTHEST))
     origin = np.round(np.asarray(image, dtype=float) - SIDE * factor / 2).astype(int)[None]
     scene = scene_chips(places.view, origin, SIDE, factor)
     wide = _rendered(places, origin, 2 * reach, factor)
-    found = found_again(scene, wide, reach)
+    match = found_again(scene, wide, reach)
     around = scene_chips(places.view, origin - reach * factor, SIDE + 2 * reach, factor)
-    doubt = str(doubts(found, wide, around, reach)[0])
+    doubt = str(doubts(match, wide, around, reach)[0])
     if not np.isfinite(wide).any():
         return _nothing("the reference has no data here")
-    shift, measured = found.shift[0] * factor, None
+    shift, measured = match.shift[0] * factor, None
     for _ in range(_ROUNDS):
         measured = _measured(places, origin, shift, factor, scene)
         if not np.isfinite(measured.shift).all():
-            return _nothing(REASONS[doubt or "not measured"], float(found.score[0]))
+            return _nothing(REASONS[doubt or "not measured"], float(match.score[0]))
         shift = shift + measured.shift[0] * factor
         if np.abs(measured.shift).max() < 0.02:
             break
@@ -106,41 +105,41 @@ def proposal_of(places: SceneGeometry, click: Array | None, ground: Array | None
     click : (2,), optional
         px of the scene.
     ground : (3,), optional
-        Clicked or typed: its image is looked for about the click, within `NEAR`, or without a click about where the
-        model puts it, within `radius` px. Without a ground that of the click is looked for, within `radius` px.
+        Clicked or entered: its image is searched within `NEAR` of the click, or without a click within `radius` px of
+        the predicted position. Without a ground, the ground of the click is searched within `radius` px.
 
     Raises
     ------
     InputError
-        If there is neither.
+        If neither is given.
     """
     if ground is not None:
         expected = places.image_of([ground])[0]
         if click is None and not np.isfinite(expected).all():
             raise InputError("this place is outside the scene", field="ground", remedy="click it in the scene")
         about = expected if click is None else click
-        found = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
-        place, on_ground = about - found.shift, ground
+        match = propose(places.moved(about - expected), about.tolist(), radius if click is None else NEAR)
+        place, on_ground = about - match.shift, ground
     elif click is None:
         raise InputError("no position to match", field="image")
     else:
-        found = propose(places, click.tolist(), radius)
+        match = propose(places, click.tolist(), radius)
         place, on_ground = click, np.full(3, np.nan)
-        if np.isfinite(found.shift).all():
-            on_ground = places.ground_of([click + found.shift])[0]
-    reason = found.reason or ("" if np.isfinite(on_ground).all() else "the DEM does not cover this place")
-    (column, both), (_, row) = found.covariance
-    told: dict[str, Any] = json_value(
+        if np.isfinite(match.shift).all():
+            on_ground = places.ground_of([click + match.shift])[0]
+    reason = match.reason or ("" if np.isfinite(on_ground).all() else "the DEM does not cover this place")
+    (column, both), (_, row) = match.covariance
+    document: dict[str, Any] = json_value(
         {
             "image": json_position(place),
             "ground": json_position(on_ground),
-            "score": found.score,
+            "score": match.score,
             "covariance": json_position([column, row, both]),
-            "scattered": found.scattered,
+            "scattered": match.scattered,
             "reason": reason,
         }
     )
-    return told
+    return document
 
 
 def _rendered(places: SceneGeometry, origins: NDArray[np.int_], radius: int, factor: int) -> NDArray[np.float32]:
@@ -151,7 +150,7 @@ def _rendered(places: SceneGeometry, origins: NDArray[np.int_], radius: int, fac
 def _measured(
     places: SceneGeometry, origins: NDArray[np.int_], shift: Array, factor: int, scene: NDArray[np.float32]
 ) -> Measured:
-    """Measure what is left of a shift (px) where the reference is rendered with it taken out."""
+    """Measure the remaining shift (px) with the reference rendered at the present shift."""
     wide = _rendered(places.moved(-shift), origins, MEASURED, factor)
     return measure(scene, wide, np.zeros((len(origins), 2)))
 
@@ -159,21 +158,21 @@ def _measured(
 def _covariance(
     places: SceneGeometry, origin: NDArray[np.int_], shift: Array, factor: int, measured: Measured
 ) -> tuple[Array, int]:
-    """Return the covariance ``(2, 2)`` px^2 of a match, and how many neighbours it is from."""
+    """Return the covariance ``(2, 2)`` px^2 of a match, and the number of neighbours behind it."""
     own = measured.covariance[0] * factor**2
     origins = origin + _AROUND * SIDE * factor
     inside = ((origins >= 0) & (origins + SIDE * factor <= places.view.size)).all(axis=1)
     origins = origins[inside][:_NEIGHBOURS]
     scene = scene_chips(places.view, origins, SIDE, factor)
     full = np.flatnonzero(np.isfinite(scene).all(axis=(1, 2)))
-    found = _measured(places, origins[full], shift, factor, scene[full]) if len(full) else None
-    good = np.zeros(0, dtype=int) if found is None else np.flatnonzero(np.isfinite(found.shift).all(axis=1))
-    if found is None or len(good) < _FEWEST:
+    neighbours = _measured(places, origins[full], shift, factor, scene[full]) if len(full) else None
+    good = np.zeros(0, dtype=int) if neighbours is None else np.flatnonzero(np.isfinite(neighbours.shift).all(axis=1))
+    if neighbours is None or len(good) < _FEWEST:
         return np.eye(2) * DEFAULT_SIGMA_IMAGE**2, 0
-    offsets, stated = found.shift[good] * factor, found.covariance[good] * factor**2
-    # About their median, as neighbours on other ground (a roof, a tree that moved) may be far off.
+    offsets, stated = neighbours.shift[good] * factor, neighbours.covariance[good] * factor**2
+    # Relative to the median, because neighbours on other ground (a roof, a tree) may be far off.
     distance = squared_distances(offsets - np.median(offsets, axis=0), stated)
-    # The median of a chi-squared of two degrees of freedom is 2 log 2; the mean of few takes part of the scatter away.
+    # The median of chi-squared with two degrees of freedom is 2 log 2; the sample median removes part of the scatter.
     size = float(np.median(distance)) / (2 * np.log(2)) * len(good) / (len(good) - 1)
     grown = own * max(size, 1.0)
     return grown + np.eye(2) * max(0.0, _LEAST**2 - float(np.linalg.eigvalsh(grown)[0])), len(good)

@@ -1,4 +1,4 @@
-"""A session: one scene, its reference, the heights and the marks together."""
+"""A session with one scene: the scene, its reference, the heights and the marks."""
 
 from __future__ import annotations
 
@@ -36,29 +36,29 @@ from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, Sur
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
 
-#: A click is looked for within this many standard deviations of the prediction, and the pixels of a hand.
+#: Search radius of a click: this many standard deviations of the prediction, plus the error of a click (px).
 _SIGMAS, _HAND = 3.0, 4.0
 
 
 class Session(Project):
-    """Points that are measured in one scene.
+    """Points measured in one scene.
 
     Parameters
     ----------
     scene : Scene
     places : SceneGeometry
-        By the model as delivered.
+        With the delivered model.
     output : Path
-        The GeoJSON of the points; its journal lies beside it.
+        The GeoJSON of the points; the journal is beside it.
     request : Request
-        How image and heights were opened, what is adjusted (as for `ortho fit`), and how far the model may be off.
+        Options of image and heights, the correction (as for `ortho fit`), and the search distance.
     """
 
     _solution: LiveAdjustment
     rendered: list[SensorModel]
 
     def __init__(self, scene: Scene, places: SceneGeometry, output: Path, request: Request) -> None:
-        maps = [Sheet(one, places.surface) for one in places.references if isinstance(one, Reference)]
+        maps = [Sheet(reference, places.surface) for reference in places.references if isinstance(reference, Reference)]
         super().__init__(output, places.surface, [places.view], maps)
         self.scene, self.places = scene, places
         self._request = request
@@ -68,7 +68,7 @@ class Session(Project):
         self._solution = LiveAdjustment(scene.model, None)
         self._begin()
 
-    # -- as any project ----------------------------------------------------------------------------------------------
+    # -- methods of a project ----------------------------------------------------------------------------------------
 
     def _identity(self) -> dict[str, Any]:
         return {"name": Path(self.scene.path).name, "size": [self.scene.width, self.scene.height]}
@@ -111,7 +111,7 @@ class Session(Project):
 
     @property
     def solution(self) -> LiveAdjustment:
-        """The adjustment to the points as they are now."""
+        """The adjustment to the present points."""
         return self._solution
 
     @property
@@ -134,7 +134,7 @@ class Session(Project):
         return self.places.by(self._solution.model)
 
     def at(self, version: int) -> SceneGeometry:
-        """Return the geometry that the reference was rendered with."""
+        """Return the geometry used to render the reference."""
         if not 0 <= version < len(self.rendered):
             raise InputError("unknown rendering", field="version", remedy="reload the page")
         return self.places.by(self.rendered[version])
@@ -155,9 +155,9 @@ class Session(Project):
     def proposal(self, image: Sequence[float] | None, ground: Sequence[float] | None = None) -> dict[str, Any]:
         """Return a sub-pixel match for a click in the scene: its `image` and `ground`, score and covariance.
 
-        With a ground (clicked in the reference, or typed) its image is looked for about the click, or where the model
-        expects it; without one, the ground of the click where the model, as well as it is known, puts it. `reason` says
-        why a match is not to be believed, and is empty if it is.
+        With a ground (clicked in the reference, or entered), its image is searched near the click, or near the
+        predicted position. Without one, the ground of the click is searched near its prediction. `reason` states why a
+        match is not reliable; it is empty for a reliable one.
         """
         known = self.places_of(0)
         click = None if image is None else np.asarray(image, dtype=float)
@@ -166,18 +166,18 @@ class Session(Project):
         return proposal_of(known, click, place, self._radius(about))
 
     def compared(self) -> dict[str, Any]:
-        """Return the document of `ortho compare` for the points as they are now."""
-        asked = PointOptions(gcps=self.marks.points(self._called), significance=self._request.points.significance)
-        return compare(self.scene, asked).to_json()
+        """Return the document of `ortho compare` for the present points."""
+        options = PointOptions(gcps=self.marks.points(self._called), significance=self._request.points.significance)
+        return compare(self.scene, options).to_json()
 
     def ortho(self, progress: Progress, number: int = 0) -> Result:
-        """Make what `ortho rectify` makes with the saved points, in a folder beside them."""
+        """Run `ortho rectify` with the saved points, into a folder beside them."""
         from ortho_pipeline.commands.rectification import rectify
 
         with self._lock:
             self.save()
             correction = self.marks.correction or self._request.points.correction
-        # The saved points say themselves where they are and which of them check.
+        # The saved points state their CRS and roles themselves.
         points = replace(
             self._request.points,
             gcps=self.output,
@@ -199,7 +199,7 @@ class Session(Project):
             )
 
     def _radius(self, click: Array | None) -> float:
-        """Return within how many px of the prediction a click is looked for."""
+        """Return the search radius (px) around the prediction of a click."""
         fit = self._solution.fit
         if click is None or fit is None or not len(fit.param_names):
             return self.search.distance / metres_per_pixel(self.places.view)
@@ -216,7 +216,7 @@ def open_session(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
 ) -> Session:
-    """Open scene, reference and heights, and go on with the points that a journal beside the output has.
+    """Open scene, reference and heights, and continue with the points of the journal beside the output.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def open_session(
     Raises
     ------
     InputError
-        For whatever the user can correct.
+        For every mistake that the user can correct.
     """
     path = points_file(output)
     if points.fit_model is not None:

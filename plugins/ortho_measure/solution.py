@@ -1,4 +1,4 @@
-"""The solution that is shown: the adjustment of `ortho fit` to the points as they are now, and figures about it."""
+"""The solution on the page: the adjustment of `ortho fit` to the present points, and its figures."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 from ortho_pipeline.surface.base import Surface
 
-#: With fewer check points the headline is the error of control points that are left out in turn, where there is one.
+#: With fewer check points, the headline is the leave-one-out error of control points, if there is one.
 LEAST_CHECK_POINTS = 3
-#: Chance that a good point is shown as suspicious.
+#: Chance that a good point is marked as suspicious.
 SUSPICIOUS = 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class LiveAdjustment:
-    """An adjustment, or why there is none.
+    """An adjustment, or the reason why there is none.
 
     Parameters
     ----------
     model : SensorModel
-        The adjusted model; as it was delivered where nothing was adjusted.
+        The adjusted model; the delivered one without an adjustment.
     adjusted : Adjusted, optional
     error : str
-        What keeps it from being made, as people read it.
+        Why there is no adjustment, for people.
     """
 
     model: SensorModel
@@ -50,12 +50,12 @@ class LiveAdjustment:
 
     @property
     def fit(self) -> Fit | None:
-        """The fit, None where there is none."""
+        """The fit; None without one."""
         return None if self.adjusted is None else self.adjusted.fit
 
 
 def solve(scene: Scene, points: Points, request: Request, surface: Surface, correction: str | None) -> LiveAdjustment:
-    """Adjust the model of a scene to points as `ortho fit` does."""
+    """Adjust the model of a scene to points, like `ortho fit`."""
     if not len(points):
         return LiveAdjustment(scene.model, None)
     chosen = request.points.correction if correction is None else correction
@@ -65,13 +65,13 @@ def solve(scene: Scene, points: Points, request: Request, surface: Surface, corr
     except OrthoError as error:
         return LiveAdjustment(scene.model, None, error.message)
     except np.linalg.LinAlgError as error:
-        # What is in the journal has to open again, whatever it is.
+        # The journal must open again, whatever points it has.
         return LiveAdjustment(scene.model, None, f"the points cannot be adjusted ({error})")
     return LiveAdjustment(done.model, done)
 
 
 def figures(solution: LiveAdjustment, surface: Surface) -> dict[str, Any]:
-    """Return what the page shows of a solution, as JSON values."""
+    """Return the figures of a solution for the page, as JSON values."""
     fit = solution.fit
     if fit is None or solution.adjusted is None:
         return {"error": solution.error, "points": {}, "headline": _headline(None), "notices": []}
@@ -90,8 +90,8 @@ def figures(solution: LiveAdjustment, surface: Surface) -> dict[str, Any]:
     }
     for name, reason in fit.rejected:
         points[name] |= {"suspicious": True, "reason": reason}
-    for one in fit.outlying:
-        points[one.id] |= {"suspicious": True, "reason": one.reason}
+    for point in fit.outlying:
+        points[point.id] |= {"suspicious": True, "reason": point.reason}
     return {
         "error": "",
         "model": fit.model_name,
@@ -107,16 +107,16 @@ def figures(solution: LiveAdjustment, surface: Surface) -> dict[str, Any]:
         "rmse_m": rmse_metres(fit).given(),
         "sigma0": fit.sigma0,
         "redundancy": fit.redundancy,
-        "notices": [str(one) for one in solution.adjusted.warnings(surface)],
+        "notices": [str(notice) for notice in solution.adjusted.warnings(surface)],
     }
 
 
 def normalised_residuals(fit: Fit) -> Array:
-    """Return the test value w ``(N,)`` of each point: how far it is from the fit, in its own standard deviations.
+    """Return the test value w ``(N,)`` of each point: its distance from the fit, in its own standard deviations.
 
-    Of a control point ``w^2 = v^T C^-1 u / sigma0^2`` with its residual v, its leave-one-out residual u and the
+    For a control point ``w^2 = v^T C^-1 u / sigma0^2``, with its residual v, its leave-one-out residual u and the
     covariance C of its measurement: the test for an error in this point alone (Baarda), chi-squared with two degrees of
-    freedom. Of any other point ``w^2 = v^T (sigma0^2 C + P)^-1 v`` with the covariance P of the prediction.
+    freedom. For other points ``w^2 = v^T (sigma0^2 C + P)^-1 v``, with the covariance P of the prediction.
     """
     points = fit.points
     scale = 1.0 if fit.sigma0 is None else fit.sigma0**2
@@ -126,16 +126,16 @@ def normalised_residuals(fit: Fit) -> Array:
     other = np.where(fit.used[:, None], fit.loo_residuals, fit.residuals)
     total = errors + np.where(fit.used[:, None, None], 0.0, predicted)
     good = np.isfinite(other).all(axis=1) & np.isfinite(fit.residuals).all(axis=1) & np.isfinite(total).all(axis=(1, 2))
-    found = np.full(len(points), np.nan)
+    tests = np.full(len(points), np.nan)
     white = np.linalg.solve(total[good], other[good][:, :, None])[:, :, 0]
-    found[good] = np.sqrt(np.maximum((fit.residuals[good] * white).sum(axis=1), 0.0))
+    tests[good] = np.sqrt(np.maximum((fit.residuals[good] * white).sum(axis=1), 0.0))
     if fit.sigma0 is None:
-        found[fit.used] = np.nan
-    return found
+        tests[fit.used] = np.nan
+    return tests
 
 
 def _headline(fit: Fit | None) -> dict[str, Any]:
-    """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
+    """Return the best available measure of accuracy and its description; never the residuals of the fit itself."""
     if fit is None:
         return {"px": None, "m": None, "what": "no points yet"}
     relative = bool((fit.points.groups[fit.used] >= 0).any())

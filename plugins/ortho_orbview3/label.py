@@ -186,10 +186,10 @@ class _Reader:
         return InputError(f"{message} (line {self.line})", file=self.file, field=field or f"line {self.line}")
 
     def read(self) -> LabelGroup:
-        found = self.group("", 0)
-        if not found.values and not found.groups:
+        group = self.group("", 0)
+        if not group.values and not group.groups:
             raise InputError("this label is empty", file=self.file)
-        return found
+        return group
 
     def group(self, path: str, depth: int) -> LabelGroup:
         """Read statements up to END_GROUP, or to END outside of all groups."""

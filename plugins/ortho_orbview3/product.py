@@ -241,15 +241,15 @@ def _time(group: LabelGroup, key: str) -> datetime.datetime | None:
 
 def _corners(product: LabelGroup) -> Array:
     group = product.group("geodeticCorners")
-    found = np.array(
+    corners = np.array(
         [[group.group(name).number(key) for key in ("longitude", "latitude", "height")] for name in CORNERS]
     )
-    for name, (lon, lat, height) in zip(CORNERS, found.tolist(), strict=True):
+    for name, (lon, lat, height) in zip(CORNERS, corners.tolist(), strict=True):
         if abs(lat) > 90 or abs(lon) > 360 or not -1000 < height < 10_000:
             raise InputError(
                 f"{lon:g}, {lat:g}, {height:g} m is not on Earth", file=group.file, field=group.place(name)
             )
-    return found
+    return corners
 
 
 def _rpc(group: LabelGroup) -> RPC:

@@ -66,10 +66,10 @@ def metadata_of(name: str) -> Path | None:
         return None
     try:
         image = place(name)
-        found = [image.parent / one for one in listing(image.parent).matching(_METADATA)]
+        files = [image.parent / one for one in listing(image.parent).matching(_METADATA)]
     except (OSError, ValueError, InputError):
         return None
-    its = [one for one in found if image.stem.lower().startswith(one.name[: -len("_metadata.json")].lower())]
+    its = [one for one in files if image.stem.lower().startswith(one.name[: -len("_metadata.json")].lower())]
     # The longest name is of the item itself, where one item's name begins with another's.
     return max(its, key=lambda one: len(one.name), default=None)
 

@@ -61,9 +61,9 @@ def _other_bands(file: DimapFile, model: SensorModel) -> Iterator[Piece]:
     folder = place(file.path).parent.absolute()  # a folder that is entered has no name of its own
     near = [folder]
     if folder.name.upper().startswith("IMG_"):
-        others = (folder.parent / one for one in _names(folder.parent).beginning("IMG_") if one != folder.name)
-        near += [one for one in islice(others, _MOST) if one.is_dir()]
-    for beside in (_files(one) for one in near) if strip and bands else ():
+        others = (folder.parent / name for name in _names(folder.parent).beginning("IMG_") if name != folder.name)
+        near += [other for other in islice(others, _MOST) if other.is_dir()]
+    for beside in (_files(other) for other in near) if strip and bands else ():
         for path in _metadata(beside):
             try:
                 other, rpc_file = DimapFile(path), rpc_of_dimap(path)
@@ -88,8 +88,10 @@ def _of_bands(file: DimapFile, beside: dict[str, Path], rpc_file: Path, model: S
 
 def _strip(file: DimapFile) -> str | None:
     """Return the name of the strip of an image."""
-    found = (one for one in file.all(_SOURCES) if (one.findtext("SOURCE_TYPE") or "").strip() == "Strip_Source")
-    return next(((one.findtext("SOURCE_ID") or "").strip() or None for one in found), None)
+    strips = (
+        source for source in file.all(_SOURCES) if (source.findtext("SOURCE_TYPE") or "").strip() == "Strip_Source"
+    )
+    return next(((source.findtext("SOURCE_ID") or "").strip() or None for source in strips), None)
 
 
 def _metadata(beside: dict[str, Path]) -> list[Path]:

@@ -72,7 +72,7 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
         raise InputError("give both longitudes and latitudes", file=name, field="lon, lat", remedy=_REMEDY)
     layout = _layout_of(dataset) if lon is None else None
     files = layout.files if layout else (str(lon), str(lat))
-    sources = tuple(open_dataset(one) for one in files)
+    sources = tuple(open_dataset(file) for file in files)
     if layout is None:
         shape = sources[0].RasterXSize, sources[0].RasterYSize
         step = size[0] / shape[0], size[1] / shape[1]
@@ -87,7 +87,7 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
         Setting("match.reference"),
         f". Relief displacement remains. The model {family} represents them within {worst:.2g} px",
     )
-    facts: dict[str, Any] = {"arrays": [Path(one).name for one in files], "max_error_px": round(worst, 3)}
+    facts: dict[str, Any] = {"arrays": [Path(file).name for file in files], "max_error_px": round(worst, 3)}
     return Scene(
         "geolocation",
         name,
@@ -191,7 +191,7 @@ def _nodes(name: str, layout: Layout, sources: tuple[gdal.Dataset, ...], size: t
 
 def _fitted(image: Array, ground: Array, size: tuple[int, int]) -> tuple[SensorModel, str, float]:
     """Return the lowest polynomial through every other node, its name, and how far it is off the others (px)."""
-    count, found = len(image), None
+    count, best = len(image), None
     ground = np.column_stack([ground, np.zeros(count)])
     half = np.arange(count) % 2 == 0
     points = Points(
@@ -207,12 +207,12 @@ def _fitted(image: Array, ground: Array, size: tuple[int, int]) -> tuple[SensorM
     for family in ("affine2d", "poly2", "poly3", "poly4", "poly5"):
         model = fit_family(family, points, size=size, heights=_HEIGHTS, ridge=None, robust=False).model
         worst = float(np.abs(model.ground_to_image(ground[~half]) - image[~half]).max())
-        if found is None or worst < found[2]:
-            found = model, family, worst
+        if best is None or worst < best[2]:
+            best = model, family, worst
         if worst < _FOLLOWS:
             break
-    if found is None or not found[2] < max(size):
+    if best is None or not best[2] < max(size):
         raise InputError(
             "no polynomial fits the arrays; they are probably damaged", field="GEOLOCATION", remedy=_REMEDY
         )
-    return found
+    return best

@@ -67,7 +67,7 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             candidates[True].append(file)
         elif not any(beside.named(one) for one in named):
             candidates[False].append(file)
-    found: dict[Path, tuple[Pushbroom, float | None]] = {}
+    models: dict[Path, tuple[Pushbroom, float | None]] = {}
     others: dict[str, str] = {}
     for file in candidates[True] or candidates[False]:
         try:
@@ -77,14 +77,14 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             continue
         its = (model.camera.width, model.camera.height)
         if its == size:
-            found[file.path] = model, UNSEEN.get(file.said("Metadata_Identification/METADATA_PROFILE") or "")
+            models[file.path] = model, UNSEEN.get(file.said("Metadata_Identification/METADATA_PROFILE") or "")
         else:
             others[file.path.name] = "it is for {} x {} pixels, but this image has {} x {}".format(*its, *size)
-    if len(found) > 1:
-        several = ", ".join(path.name for path in found)
+    if len(models) > 1:
+        several = ", ".join(path.name for path in models)
         reason = f"there are several rigorous models of this size beside the image, so none is used: {several}"
-        return Rigorous(left=left | {path.name: reason for path in found})
-    for path, (model, limit) in found.items():
+        return Rigorous(left=left | {path.name: reason for path in models})
+    for path, (model, limit) in models.items():
         apart = _apart(model, rpc, _MIDDLE if limit is None else _WITHIN)
         if apart > (DISAGREEMENT if limit is None else limit):
             place = "in the middle of" if limit is None else "within"

@@ -118,13 +118,13 @@ def _look_angles(file: DimapFile, columns: int) -> tuple[Array, Array]:
             raise file.error("an instrument bias with an unknown direction of rotation is not supported", field)
     bands = file.all(f"{base}/Band_Calibration_List/Band_Calibration", 100)
     places = [f"{base}/Band_Calibration_List/Band_Calibration[{k + 1}]" for k in range(len(bands))] or [base]
-    found = []
-    for one in places:
-        _refuse_part_of_a_line(file, f"{one}/Swath_Range", columns)
-        found.append([_angle(file, f"{one}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
-    if any(not np.array_equal(*pair) for other in found for pair in zip(other, found[0], strict=True)):
+    polynomials = []
+    for place in places:
+        _refuse_part_of_a_line(file, f"{place}/Swath_Range", columns)
+        polynomials.append([_angle(file, f"{place}/Polynomial_Look_Angles", name) for name in ("XLOS", "YLOS")])
+    if any(not np.array_equal(*pair) for other in polynomials for pair in zip(other, polynomials[0], strict=True)):
         raise file.error("each band has its own look angles; this is not supported", "Band_Calibration_List")
-    return found[0][0], found[0][1]
+    return polynomials[0][0], polynomials[0][1]
 
 
 def _angle(file: DimapFile, base: str, name: str) -> Array:

@@ -67,8 +67,8 @@ def metadata_of(name: str) -> Path | None:
         return None
     try:
         image = place(name)
-        found = image.with_name(f"{image.stem}_extended.json")
-        return found if found.is_file() else None
+        path = image.with_name(f"{image.stem}_extended.json")
+        return path if path.is_file() else None
     except (OSError, ValueError, InputError):
         return None
 
@@ -101,9 +101,9 @@ def open_scene(
     if product not in ("GEC", "GEO"):
         raise InputError(f"a {product} product is in slant or ground range", file=name, remedy=_PLANE)
     crs, corner, pixel = _map_of(dataset)
-    given = {"incidence_deg": incidence, "azimuth_deg": azimuth, "plane_m": plane}
-    facts |= {fact: _number(text, fact) for fact, text in given.items() if text is not None}
-    missing = [fact for fact in given if not isinstance(facts.get(fact), float)]
+    stated = {"incidence_deg": incidence, "azimuth_deg": azimuth, "plane_m": plane}
+    facts |= {fact: _number(text, fact) for fact, text in stated.items() if text is not None}
+    missing = [fact for fact in stated if not isinstance(facts.get(fact), float)]
     if missing:
         options = ", ".join(fact.rpartition("_")[0] for fact in missing)
         raise InputError(
@@ -149,10 +149,10 @@ def read_extended(path: Path) -> dict[str, Any]:
     document = read_json(path, MAX_SIZE, _REMEDY)
 
     def at(*names: str) -> Any:
-        found = document
+        value = document
         for name in names:
-            found = found.get(name) if isinstance(found, dict) else None
-        return found
+            value = value.get(name) if isinstance(value, dict) else None
+        return value
 
     product = at("product_type")
     facts: dict[str, Any] = {"product": product[:10] if isinstance(product, str) else "unknown"}
@@ -165,8 +165,8 @@ def read_extended(path: Path) -> dict[str, Any]:
     target = _place(at("collect", "image", "center_pixel", "target_position"), path, "center_pixel.target_position")
     places = np.array(
         [
-            _place(one.get("position") if isinstance(one, dict) else None, path, "state_vectors.position")
-            for one in vectors
+            _place(vector.get("position") if isinstance(vector, dict) else None, path, "state_vectors.position")
+            for vector in vectors
         ]
     )
     # The radar is nearest at the middle of the aperture, within the time step of the vectors.
@@ -186,12 +186,12 @@ def read_extended(path: Path) -> dict[str, Any]:
 
 def _place(value: Any, path: Path, field: str) -> NDArray[np.float64]:
     good = isinstance(value, list) and len(value) == 3
-    if not good or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in value):
+    if not good or not all(isinstance(number, int | float) and not isinstance(number, bool) for number in value):
         raise InputError("this must be a list of three numbers", file=path, field=field, remedy=_REMEDY)
-    found = np.array(value, dtype=np.float64)
-    if not 6.2e6 < np.linalg.norm(found) < 5e7:
+    position = np.array(value, dtype=np.float64)
+    if not 6.2e6 < np.linalg.norm(position) < 5e7:
         raise InputError("this position is not near the Earth", file=path, field=field, remedy=_REMEDY)
-    return found
+    return position
 
 
 def _map_of(dataset: gdal.Dataset) -> tuple[str, tuple[float, float], tuple[float, float]]:
@@ -225,8 +225,8 @@ def _warnings(from_file: bool) -> tuple[Notice, ...]:
         "this is a radar image: high objects lean towards the radar. Steep slopes are in layover or in shadow, where "
         "the ground is not visible"
     )
-    found = [Notice("radar-on-a-plane", text)]
+    notices = [Notice("radar-on-a-plane", text)]
     if from_file:
         text = "this metadata reader was never tested with a real product of this kind. Compare with control points"
-        found.append(Notice("unchecked-product", text))
-    return tuple(found)
+        notices.append(Notice("unchecked-product", text))
+    return tuple(notices)

@@ -189,8 +189,8 @@ def _look_angles(file: XmlFields, line: Element, columns: int) -> tuple[Array, A
     angles = np.array([[file.number(name, entry) for name in ("PSI_X", "PSI_Y")] for entry in entries]).reshape(-1, 2)
     if not (np.abs(angles) < 1.2).all():
         raise file.error("a look angle is out of range", field)
-    whole = len(detectors) >= 2 and detectors[0] == 1 and detectors[-1] == columns
-    if not whole or len(detectors) not in (2, columns) or not (np.diff(detectors) > 0).all():
+    complete = len(detectors) >= 2 and detectors[0] == 1 and detectors[-1] == columns
+    if not complete or len(detectors) not in (2, columns) or not (np.diff(detectors) > 0).all():
         raise file.error(
             f"{len(detectors)} detectors do not match the {columns} columns of this image; the first must be "
             f"detector 1",

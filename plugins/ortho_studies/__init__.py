@@ -1,7 +1,7 @@
-"""Studies: scenes of known truth, and the tables of papers computed on them, as commands of ``ortho``.
+"""Studies: simulated scenes with known truth, and the tables of papers computed on them, as commands of ``ortho``.
 
-This module declares the commands, and imports no more: ``ortho --help`` imports it. `hookspecs` has what the author of
-a study reads, `studies` finds and runs studies, `simulation` has what they share, and each paper has a folder.
+This module only declares the commands, because ``ortho --help`` imports it. `hookspecs` is for authors of studies,
+`studies` finds and runs them, `simulation` has their common code, and each paper has a folder.
 """
 
 from collections.abc import Iterable

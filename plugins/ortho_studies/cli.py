@@ -16,15 +16,15 @@ from ortho_pipeline.cli.survey.examples import with_examples
 if TYPE_CHECKING:
     from ortho_studies.hookspecs import Study, StudyOption
 
-#: For the help of every command of a group: what it is for, and its command line, both with the name of the study.
+#: Example in the help of every command of a group: purpose and command line with the name of the study.
 _EXAMPLES = {
     "simulate": ("Always the same scene for the same seed:", "ortho simulate {0} --seed 1 -o {0}_1"),
-    "reproduce": ("Quickly, with less certain percentiles:", "ortho reproduce {0} --realisations 3 -o {0}_page"),
+    "reproduce": ("Fast, with rough percentiles:", "ortho reproduce {0} --realisations 3 -o {0}_page"),
 }
 
 
 class _Studies(Group):
-    """A group whose commands are the studies that have a function of the group's name."""
+    """A group with a command for each study that has a function of the group's name."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [name for name, study in _offered().items() if getattr(study, str(self.name))]
@@ -51,7 +51,7 @@ def simulate() -> None:
 def reproduce() -> None:
     """Recompute the tables of four papers.
 
-    Each table shows the paper's numbers beside ours.
+    Each table compares the numbers of the paper with ours.
     """
 
 
@@ -65,7 +65,7 @@ def _simulation(study: Study) -> click.Command:
     for option in reversed(study.options):
         callback = _option(option)(callback)
     seed_option = click.option(
-        "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything that is drawn."
+        "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random numbers."
     )
     return click.command(study.name, cls=Command, help=_help(study, "simulate"), short_help=study.title)(
         folder_option(seed_option(callback))
@@ -74,14 +74,14 @@ def _simulation(study: Study) -> click.Command:
 
 def _experiment(study: Study) -> click.Command:
     @click.option(
-        "--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the page."
+        "--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder for the page."
     )
     @click.option(
         "--realisations",
         type=click.IntRange(min=1),
         default=study.realisations,
         show_default=True,
-        help="How often noise is drawn.",
+        help="Number of random realisations.",
     )
     @json_option
     def run(folder: str | None, realisations: int, as_json: bool) -> None:
@@ -96,7 +96,7 @@ def _experiment(study: Study) -> click.Command:
 
 
 def _option(option: StudyOption) -> Any:
-    """Return the decorator of click that a declared option stands for."""
+    """Return the click decorator of a declared option."""
     flag = option.flag or f"--{option.name.replace('_', '-')}"
     shown = option.default is not None
     if option.kind is bool:

@@ -1,7 +1,7 @@
-"""All that the author of a study reads.
+"""The hook for studies, and what it returns.
 
-A study is a module that is named in the entry-point group ``ortho_studies`` of an installed distribution
-(``tinysat = "ortho_tinysat_study"`` under ``[project.entry-points.ortho_studies]``). The whole of one::
+A study is a module in the entry-point group ``ortho_studies`` of an installed distribution
+(``tinysat = "ortho_tinysat_study"`` under ``[project.entry-points.ortho_studies]``). A complete one::
 
     from ortho_studies.hookspecs import Simulated, Study, hookimpl
 
@@ -12,7 +12,7 @@ A study is a module that is named in the entry-point group ``ortho_studies`` of 
     def ortho_studies():
         yield Study("tinysat", "A TinySat-1 scene over Rome", simulate)
 
-The papers of `ortho_studies` are registered in the same way.
+The studies of `ortho_studies` are registered in the same way.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 import pluggy
 
 PROJECT_NAME = "ortho_studies"
-#: The entry-point group, and the hook that is called in its modules.
+#: The entry-point group, with the hook of its modules.
 GROUPS = {PROJECT_NAME: ("ortho_studies",)}
 hookspec = pluggy.HookspecMarker(PROJECT_NAME)
 hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
@@ -33,7 +33,7 @@ hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 @dataclass(frozen=True)
 class Simulated:
-    """The outcome of a simulation: its files by name, and what to try with them (text for the terminal)."""
+    """Result of a simulation: its files by name, and text for the terminal with commands to try."""
 
     files: Mapping[str, Path]
     text: str
@@ -41,7 +41,7 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Reproduced:
-    """The outcome of an experiment: a document of JSON values, its text for the terminal, and its page of HTML."""
+    """Result of an experiment: a document of JSON values, text for the terminal, and an HTML page."""
 
     document: Mapping[str, Any]
     text: str
@@ -55,19 +55,19 @@ class StudyOption:
     Parameters
     ----------
     name : str
-        The keyword; on the command line with dashes, unless `flag` says otherwise.
+        The keyword; with dashes on the command line, unless `flag` is given.
     help : str
         One line.
     kind : type
         int, float, or bool (a switch).
     default : optional
-        None where the simulation has a default of its own.
+        None if the simulation has its own default.
     low, high : float, optional
-        The least and the greatest value.
+        Smallest and largest value.
     unit : str
         Shown in place of the value.
     flag : str
-        The switch as it is typed (``--rpc/--no-rpc``).
+        The switch on the command line (``--rpc/--no-rpc``).
     """
 
     name: str
@@ -82,9 +82,9 @@ class StudyOption:
 
 @dataclass(frozen=True)
 class Study:
-    """Scenes of known truth of one sensor, and the experiment of a paper on them.
+    """Simulated scenes of one sensor with known truth, and the experiment of a paper on them.
 
-    The first line of the docstrings of both functions is what ``--help`` says.
+    ``--help`` shows the first line of the docstrings of both functions.
 
     Parameters
     ----------
@@ -93,13 +93,13 @@ class Study:
     title : str
         One line for the lists of both commands.
     simulate : callable(folder, *, seed, **options) -> Simulated, optional
-        Writes a product with its DEM and points. Its files appear together, or none does.
+        Writes a product with its DEM and points. Its files appear together or not at all.
     reproduce : callable(realisations, *, progress) -> Reproduced, optional
-        Computes what a paper has tables of; calls `progress` with the share that is done (0 to 1).
+        Computes the tables of a paper; calls `progress` with the finished share (0 to 1).
     options : tuple of StudyOption
-        Of `simulate`, besides the seed.
+        Options of `simulate`, besides the seed.
     realisations : int
-        How often noise is drawn where the user does not say.
+        Default number of random realisations.
     """
 
     name: str
@@ -112,5 +112,5 @@ class Study:
 
 @hookspec
 def ortho_studies() -> Iterable[Study]:
-    """Return studies; called for ``ortho simulate`` and ``ortho reproduce`` alone."""
+    """Return studies; only called for ``ortho simulate`` and ``ortho reproduce``."""
     raise NotImplementedError

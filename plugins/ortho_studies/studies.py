@@ -1,4 +1,4 @@
-"""Find the studies that installed packages offer in the hook ``ortho_studies``, and run them."""
+"""Find the studies of installed packages (hook ``ortho_studies``), and run them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from ortho_studies.hookspecs import Study
 
 @functools.cache
 def studies() -> Mapping[str, Study]:
-    """Return the studies of all installed packages by name; they are looked for once per process.
+    """Return the studies of all installed packages by name; they are searched once per process.
 
     Raises
     ------
     PluginError
-        If a package offers what is no study, two offer one name, or a hook is misspelt.
+        If an offer is not a study, two packages use the same name, or a hook is misspelt.
     """
     registry = Registry(False, specs=hookspecs)
     registry.register_installed()
@@ -36,28 +36,28 @@ def simulate(name: str, folder: str | os.PathLike[str], *, seed: int = 0, **opti
     Parameters
     ----------
     name : str
-        Of a study that simulates (``ortho simulate --help``).
+        A study that can simulate (``ortho simulate --help``).
     seed : int
-        Of everything that is drawn.
+        Seed of all random numbers.
     options
-        Those that the study declares; None is its own default.
+        Options of the study; None means its default.
 
     Raises
     ------
     InputError
-        If there is no such simulation or option, such a scene is not possible, or the folder cannot be written.
+        If the study or an option is unknown, the scene is not possible, or the folder cannot be written.
     """
     study = _study(name, "simulate")
     known = {option.name for option in study.options}
     for option in options:
         if option not in known:
             listed = ", ".join(sorted(known)) or "none"
-            raise InputError(f"the study {name!r} has no option {option!r} (its options: {listed})", field=option)
+            raise InputError(f"the study {name!r} has no option {option!r}; its options: {listed}", field=option)
     assert study.simulate
     with together(folder, "simulated"):
-        given = {option: value for option, value in options.items() if value is not None}
-        made = study.simulate(folder, seed=seed, **given)
-    return Result(dict(made.files), {}, made.text)
+        chosen = {option: value for option, value in options.items() if value is not None}
+        simulated = study.simulate(folder, seed=seed, **chosen)
+    return Result(dict(simulated.files), {}, simulated.text)
 
 
 def reproduce(
@@ -67,21 +67,21 @@ def reproduce(
     realisations: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Result:
-    """Compute the tables of a paper on simulated scenes, beside the paper's numbers.
+    """Compute the tables of a paper on simulated scenes, and compare them with the paper's numbers.
 
     Parameters
     ----------
     name : str
-        Of a study that has an experiment (``ortho reproduce --help``).
+        A study with an experiment (``ortho reproduce --help``).
     folder : path, optional
-        Where ``<name>.json`` and the page ``<name>.html`` go.
+        Folder for ``<name>.json`` and the page ``<name>.html``.
     realisations : int, optional
-        How often noise is drawn; the study's own number without it.
+        Number of random realisations; default: that of the study.
 
     Returns
     -------
     Result
-        `document` is the study's own; those of the bundled plugins have paper, settings, summary and tables
+        `document` depends on the study; bundled ones have paper, settings, summary and tables
         (docs/engineering/formats.md).
     """
     study = _study(name, "reproduce")
@@ -89,20 +89,20 @@ def reproduce(
     files = (
         {} if folder is None else {ending: allowed(Path(folder) / f"{name}.{ending}") for ending in ("json", "html")}
     )
-    found = study.reproduce(realisations or study.realisations, progress=progress)
+    reproduced = study.reproduce(realisations or study.realisations, progress=progress)
     if folder is None:
-        return Result({}, dict(found.document), found.text)
+        return Result({}, dict(reproduced.document), reproduced.text)
     with together(folder, name):
-        write_json(files["json"], found.document)
-        write_text(files["html"], found.page())
-    return Result(files, dict(found.document), found.text)
+        write_json(files["json"], reproduced.document)
+        write_text(files["html"], reproduced.page())
+    return Result(files, dict(reproduced.document), reproduced.text)
 
 
 def _study(name: str, field: Literal["simulate", "reproduce"]) -> Study:
-    """Return the study of a name that can do what the field is for."""
+    """Return the study of a name, if it has the function `field`."""
     offered = studies()
     if name not in offered or getattr(offered[name], field) is None:
         able = ", ".join(key for key, study in offered.items() if getattr(study, field)) or "none"
         what = {"simulate": "simulates", "reproduce": "reproduces a paper"}[field]
-        raise InputError(f"no installed study {name!r} {what}", field="name", remedy=f"there are: {able}")
+        raise InputError(f"no installed study {name!r} {what}", field="name", remedy=f"use one of: {able}")
     return offered[name]

@@ -46,9 +46,9 @@ _PART = 500
 #: What is wrong with a file as a whole, and so with no field of it.
 WHOLE = re.compile(
     r"cannot be read|not read|not text|binary|UTF-16|not UTF-8|well-formed|no RPC|no points"
-    r"|(more|larger) than .* (MB|bytes)|plain ASCII|is a JSON object|is empty|no such file|GDAL cannot open"
+    r"|(more|larger) than .* (MB|bytes)|plain ASCII|(is|must be) a JSON object|is empty|no such file|GDAL cannot open"
     r"|cannot hold points of several images|is not in this table"
-    r"|this is no|this is not|there is no .* in this file|nothing in|cut off|too large, or not text|no text"
+    r"|this (is|file is|file has) no|there is no .* in this file|nothing in|cut off|too large, or not text|no text"
 )
 _VARYING = re.compile(r"'[^']*'|\".*|[(].*|[0-9.]+")
 

@@ -53,7 +53,7 @@ class Served:
         leading = folder / "open.html"
         leading.write_text(leading_to(self.address))
         page.goto(leading.as_uri())
-        self.says("#what", "no points yet")
+        self.says("#what", "no points yet|no redundancy")
 
     def says(self, where: str, text: str) -> None:
         playwright.expect(self.page.locator(where)).to_have_text(re.compile(text), timeout=_SLOW_MACHINE)

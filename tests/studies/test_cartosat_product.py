@@ -257,7 +257,7 @@ def test_reproduction_as_text_json_and_page(document, tmp_path, monkeypatch):
     vectors = {model: (np.full((4, 2), 3000.0), np.ones((4, 2))) for model in ("rpc affine", "affine3d geographic")}
     html = page(document, vectors)
     assert "Table 6: Generic pushbroom model" in html
-    assert "without a cause that we know of" not in html
+    assert "the cause is unknown" not in html
     monkeypatch.setattr(cartosat, "reproduce", partial(reproduce, counts=(9, 15)))
     said = json.loads(run("reproduce", "cartosat", "--realisations", 1, "-o", tmp_path, "--json"))
     assert said["realisations"] == 1

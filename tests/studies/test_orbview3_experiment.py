@@ -271,7 +271,7 @@ def test_the_page_has_figures_and_reasons(reproduced):
     assert html.count('data-plot="vectors"') == 3
     assert html.count('data-plot="curve"') == 2
     assert "20 metres" in html
-    assert "Beyond the factor without a cause" not in html
+    assert "the cause is unknown" not in html
 
 
 def test_reproduce_writes_page_and_numbers(reproduced):

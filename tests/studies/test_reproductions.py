@@ -102,9 +102,9 @@ def test_text_marks_what_does_not_agree(document):
     said = text(document)
     assert said.count("\n!") == 3
     assert said.count("\n f") == 1
-    assert "Of 3 numbers that no setting was fitted to, 1 (33 %) are within a factor 1.5" in said
-    assert "naive guess without any simulation has 2 (67 %) and 1 (33 %): a guess." in said
-    assert "1 are reproduced, 1 hold by the settings and 1 are not reproduced" in said
+    assert "3 numbers of the paper are predicted (no setting was fitted to them): 1 (33 %) agree within" in said
+    assert "naive guess without simulation agrees for 2 (67 %) and 1 (33 %). The guess: a guess." in said
+    assert "1 are reproduced, 1 are true because of the settings, and 1 are not reproduced" in said
 
 
 def test_page_explains_what_does_not_agree(document):
@@ -116,7 +116,7 @@ def test_page_explains_what_does_not_agree(document):
         reasons=[Reason("affine mean", "The bias is drawn.")],
     )  # fmt: skip
     assert "The bias is drawn." in html
-    assert "Beyond the factor without a cause" in html
+    assert "the cause is unknown" in html
     assert "Not reproduced" in html
     assert "&lt;b&gt;once" in html
     assert html.count("<svg") == 2
@@ -178,8 +178,8 @@ def test_published_pages_are_those_of_the_settings_in_the_code(name):
         assert document["summary"][role] == count([row for _, row in rows if row["role"] == role])
     assert all(one["why"] for one in document["statements"] if one["verdict"] != VERDICTS[0])
     html = (PAGES / f"{name}.html").read_text(encoding="utf-8")
-    assert f"Of {document['summary']['predicted']['rows']} numbers that no setting was fitted to" in html
-    assert "without a cause that we know of" not in html
+    assert f"{document['summary']['predicted']['rows']} numbers of the paper are predicted" in html
+    assert "the cause is unknown" not in html
 
 
 @pytest.mark.parametrize(

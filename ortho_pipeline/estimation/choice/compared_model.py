@@ -38,7 +38,7 @@ class ComparedModel(Record):
     @classmethod
     def of(cls, model: str, size: tuple[int, int, int], fitted: Fit | str) -> Self:
         """Return that of a fit, or of the reason why there is none; `size` as `available_models` has it."""
-        found = fitted if isinstance(fitted, Fit) else None
+        fit = fitted if isinstance(fitted, Fit) else None
         parameters, minimum, dimensions = size
         return cls.model_validate(
             {
@@ -46,16 +46,16 @@ class ComparedModel(Record):
                 "parameters": parameters,
                 "minimum_points": minimum,
                 "dimensions": dimensions,
-                "error": None if found else fitted,
-                "rmse": found.rmses if found else Rmses(control=None, check=None, loo=None),
-                "rmse_m": rmse_metres(found) if found else RmsesOnGround(control=None, check=None, loo=None),
-                "condition": found and json_value(float(found.condition)),
-                "redundancy": found and found.redundancy,
-                "sigma0": found and found.sigma0,
-                "fitted_as": found and found.model_name,
-                "ridge": found and found.ridge,
-                "effective_parameters": found and json_value(float(found.effective_parameters)),
-                **to_document(found.warnings if found else ()),
-                "fit": found,
+                "error": None if fit else fitted,
+                "rmse": fit.rmses if fit else Rmses(control=None, check=None, loo=None),
+                "rmse_m": rmse_metres(fit) if fit else RmsesOnGround(control=None, check=None, loo=None),
+                "condition": fit and json_value(float(fit.condition)),
+                "redundancy": fit and fit.redundancy,
+                "sigma0": fit and fit.sigma0,
+                "fitted_as": fit and fit.model_name,
+                "ridge": fit and fit.ridge,
+                "effective_parameters": fit and json_value(float(fit.effective_parameters)),
+                **to_document(fit.warnings if fit else ()),
+                "fit": fit,
             }
         )

@@ -91,16 +91,16 @@ def available_models(own: SensorModel | None = None) -> dict[str, tuple[int, int
     own : SensorModel, optional
         The scene's own model. It comes first: as delivered, with each correction, and with its own parameters.
     """
-    found: dict[str, tuple[int, int, int]] = {}
+    models: dict[str, tuple[int, int, int]] = {}
     if own is not None:
         for correction in CORRECTIONS:
             count = len(ImageCorrection.identity(own, correction, (0.0, 0.0)).param_names)
-            found[own_name(own, correction)] = count, max(1, math.ceil(count / 2)), 3
+            models[own_name(own, correction)] = count, max(1, math.ceil(count / 2)), 3
         if own.param_names:
-            found[own_name(own, OWN)] = len(own.param_names), own.minimum_points, 3
+            models[own_name(own, OWN)] = len(own.param_names), own.minimum_points, 3
     for family in families():
-        found[family.name] = family.parameters, family.minimum_points, family.dimensions
-    return found
+        models[family.name] = family.parameters, family.minimum_points, family.dimensions
+    return models
 
 
 def own_name(own: SensorModel, correction: str) -> str:
@@ -175,19 +175,19 @@ def compare(
     known = available_models(own)
     job = _Job(own, dict(priors or {}), size, crs, heights, ridge)
     first = {name: job.attempt(name, points, robust) for name in models}
-    blunders = _blunders([found for found in first.values() if isinstance(found, Fit)])
+    blunders = _blunders([outcome for outcome in first.values() if isinstance(outcome, Fit)])
     kept = points.select(~np.isin(np.array(points.ids), list(blunders))) if blunders else points
     rows = []
     for name in models:
-        found = first[name]
-        if blunders or not isinstance(found, Fit) or found.rejected:
-            found = job.attempt(name, kept, False)
-        if isinstance(found, Fit):
-            found = replace(found, significance=significance)
-        if isinstance(found, Fit) and unsuited and name in unsuited:
+        outcome = first[name]
+        if blunders or not isinstance(outcome, Fit) or outcome.rejected:
+            outcome = job.attempt(name, kept, False)
+        if isinstance(outcome, Fit):
+            outcome = replace(outcome, significance=significance)
+        if isinstance(outcome, Fit) and unsuited and name in unsuited:
             warning = Notice("unsuited-model", unsuited[name], model=name)
-            found = replace(found, warnings=(*found.warnings, warning))
-        rows.append(ComparedModel.of(name, known[name], found))
+            outcome = replace(outcome, warnings=(*outcome.warnings, warning))
+        rows.append(ComparedModel.of(name, known[name], outcome))
     corrections = () if own is None else [own_name(own, name) for name in (*CORRECTIONS, OWN)]
     recommended, reason, criterion = recommend(rows, preferred=corrections, unsuited=tuple(unsuited or ()), size=size)
     return ComparisonRecord(
@@ -240,21 +240,21 @@ def _blunders(fits: Sequence[Fit]) -> dict[str, str]:
 
     Poor models cannot see gross errors, so only models with about the smallest errors vote.
     """
-    able = [found for found in fits if found.redundancy >= 4 and found.model.params.size]
-    sizes = [_median_error(found) for found in able]
+    able = [result for result in fits if result.redundancy >= 4 and result.model.params.size]
+    sizes = [_median_error(result) for result in able]
     limit = _CLEAR_SIGHTED * min(sizes, default=0.0)
-    voting = [found for found, size in zip(able, sizes, strict=True) if size <= limit]
-    votes = Counter(name for found in voting for name, _ in found.rejected)
+    voting = [result for result, size in zip(able, sizes, strict=True) if size <= limit]
+    votes = Counter(name for result in voting for name, _ in result.rejected)
     reasons: dict[str, str] = {}
-    for found in voting:
-        for name, reason in found.rejected:
+    for result in voting:
+        for name, reason in result.rejected:
             if votes[name] > len(voting) / 2:
                 reasons.setdefault(name, reason)
     return reasons
 
 
-def _median_error(found: Fit) -> float:
+def _median_error(result: Fit) -> float:
     """Return the median prediction error (px) of all control points, including rejected ones."""
-    errors = np.where(found.used[:, None], found.loo_residuals, found.residuals)[found.points.control]
+    errors = np.where(result.used[:, None], result.loo_residuals, result.residuals)[result.points.control]
     sizes = np.hypot(*np.where(np.isfinite(errors), errors, np.inf).T)
     return float(np.median(sizes))

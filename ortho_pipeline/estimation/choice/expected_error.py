@@ -76,19 +76,19 @@ class Expectation:
         return max(mean_square / (self.stated + self.tested), least) * (self.stated + self.scene) + self.unseen
 
 
-def expectation(found: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | None) -> Expectation:
+def expectation(fit: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | None) -> Expectation:
     """Return the statistics of a fit that the points of the mask `tests` ``(N,)`` test, in an image of this size."""
-    points, model = found.points, found.model
-    measured = points.select(found.used | tests)
+    points, model = fit.points, fit.model
+    measured = points.select(fit.used | tests)
     stated = float(np.trace(ImageErrors.of(model, measured).covariance, axis1=1, axis2=2).mean())
-    places = _places(found, size)
+    places = _places(fit, size)
     return Expectation(
-        _criterion(found),
-        _noise(found),
+        _criterion(fit),
+        _noise(fit),
         stated,
-        _variance(found, points.ground[tests]),
-        _variance(found, places),
-        _unseen(found, places),
+        _variance(fit, points.ground[tests]),
+        _variance(fit, places),
+        _unseen(fit, places),
     )
 
 
@@ -104,58 +104,58 @@ def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[s
         return list(expected), 1.0
     names = [
         name
-        for name, one in expected.items()
-        if one.criterion <= lowest + _CONTRADICTED or one.noise <= worth**2 * expected[best].noise
+        for name, statistics in expected.items()
+        if statistics.criterion <= lowest + _CONTRADICTED or statistics.noise <= worth**2 * expected[best].noise
     ]
     return names, min(1.0, expected[best].noise)
 
 
-def _criterion(found: Fit) -> float:
-    freedom, count = found.degrees_of_freedom, int(found.used.sum())
-    parameters = found.effective_parameters + 1
+def _criterion(fit: Fit) -> float:
+    freedom, count = fit.degrees_of_freedom, int(fit.used.sum())
+    parameters = fit.effective_parameters + 1
     # Points that share errors are fewer observations than their number.
-    observations = 2 * found.effective_points + _STATED
+    observations = 2 * fit.effective_points + _STATED
     left = observations - parameters - 1
-    if found.sigma0 is None or not count or left <= 0:
+    if fit.sigma0 is None or not count or left <= 0:
         return math.inf
-    squares = found.sigma0**2 * freedom * found.effective_points / count
+    squares = fit.sigma0**2 * freedom * fit.effective_points / count
     penalty = 2 * parameters * (1 + (parameters + 1) / left)
     return observations * math.log((squares + _STATED) / observations) + penalty
 
 
-def _noise(found: Fit) -> float:
-    return math.inf if found.sigma0 is None else found.sigma0**2
+def _noise(fit: Fit) -> float:
+    return math.inf if fit.sigma0 is None else fit.sigma0**2
 
 
-def _variance(found: Fit, ground: Array) -> float:
+def _variance(fit: Fit, ground: Array) -> float:
     """Return the mean variance (px²) from the parameters at places, for the stated noise; 0 without parameters."""
-    if not len(found.model.params):
+    if not len(fit.model.params):
         return 0.0
     if not len(ground):
         return math.inf
-    partials = found.model.param_partials(ground)
-    factors = found.relative_covariance / (1.0 if found.sigma0 is None else found.sigma0**2)
+    partials = fit.model.param_partials(ground)
+    factors = fit.relative_covariance / (1.0 if fit.sigma0 is None else fit.sigma0**2)
     return float(np.einsum("nij,jk,nik->n", partials, factors, partials).mean())
 
 
-def _places(found: Fit, size: tuple[int, int] | None) -> Array:
+def _places(fit: Fit, size: tuple[int, int] | None) -> Array:
     """Return positions ``(n, 3)`` spread evenly over the domain of a model, within its image."""
-    centre, half = found.model.domain
+    centre, half = fit.model.domain
     side = (np.arange(_PLACES) + 0.5) / _PLACES * 2 - 1
     level = (np.arange(_LEVELS) + 0.5) / _LEVELS * 2 - 1
     places = centre + half * np.array(list(itertools.product(side, side, level)))
-    image = found.model.ground_to_image(places)
+    image = fit.model.ground_to_image(places)
     seen = np.isfinite(image).all(axis=1)
     if size is not None:
         seen &= ((image >= 0) & (image <= size)).all(axis=1)
     return np.asarray(places[seen])
 
 
-def _unseen(found: Fit, places: Array) -> float:
+def _unseen(fit: Fit, places: Array) -> float:
     """Return the mean square displacement (px²) by heights without control points, for a model that ignores heights."""
-    heights = found.points.ground[found.used, 2]
-    if found.model.uses_height or not len(places):
+    heights = fit.points.ground[fit.used, 2]
+    if fit.model.uses_height or not len(places):
         return 0.0
     missing = places[:, 2].var() - heights.var()
-    scale, _ = metre_partials(found.model, places)
+    scale, _ = metre_partials(fit.model, places)
     return max(0.0, _VIEW * float(missing)) * float(np.abs(np.linalg.det(scale)).mean())

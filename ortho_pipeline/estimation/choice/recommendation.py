@@ -104,8 +104,8 @@ def _but(
             text += "but these points do not support it"
         else:
             text += f"but its expected error over the scene is {errors[smallest]:.3g} px"
-    found = rows[chosen].fit
-    weak = ", ".join(found.reservations) if found else ""
+    fit = rows[chosen].fit
+    weak = ", ".join(fit.reservations) if fit else ""
     return text + (f". {chosen} is {weak}: measure points there" if weak else "")
 
 
@@ -120,14 +120,14 @@ def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:
     the model with the smallest median are not used.
     """
     fits = {row.model: row.fit for row in rows if row.fit is not None}
-    errors = {name: _squares(found) for name, found in fits.items() if found.redundancy > 0}
+    errors = {name: _squares(fit) for name, fit in fits.items() if fit.redundancy > 0}
     if not errors:
-        errors = {name: np.where(found.points.check, _squares(found), np.nan) for name, found in fits.items()}
+        errors = {name: np.where(fit.points.check, _squares(fit), np.nan) for name, fit in fits.items()}
     errors = {name: values for name, values in errors.items() if np.isfinite(values).any()}
     if not errors:
         return {}, np.zeros(0, dtype=bool), 0
     clearest = fits[min(errors, key=lambda name: float(np.nanmedian(errors[name])))]
-    wrong = [one.id for one in clearest.outlying if one.role == "check"]
+    wrong = [point.id for point in clearest.outlying if point.role == "check"]
     common = np.all([np.isfinite(values) for values in errors.values()], axis=0)
     common &= ~np.isin(np.array(clearest.points.ids), wrong)
     return (
@@ -137,11 +137,11 @@ def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:
     )
 
 
-def _squares(found: Fit) -> Array:
+def _squares(fit: Fit) -> Array:
     """Return squared errors (px²) per point ``(N,)``: check points, control points left out; NaN for others."""
     # A model without parameters is tested by every control point.
-    control = found.loo_residuals if found.model.params.size else np.where(found.used[:, None], found.residuals, np.nan)
-    values = np.where(found.points.check[:, None], found.residuals, control)
+    control = fit.loo_residuals if fit.model.params.size else np.where(fit.used[:, None], fit.residuals, np.nan)
+    values = np.where(fit.points.check[:, None], fit.residuals, control)
     squares: Array = (values**2).sum(axis=1)
     return squares
 
@@ -151,8 +151,8 @@ def _doubts(row: ComparedModel, unsuited: Sequence[str]) -> str:
 
     Uncertainty at a corner is no reason, because it is part of the expected error.
     """
-    found = [one for one in row.fit.reservations if one == "unstable"] if row.fit else []
-    return " and ".join([*found, *(["unsuited to the scene"] if row.model in unsuited else [])])
+    reasons = [reservation for reservation in row.fit.reservations if reservation == "unstable"] if row.fit else []
+    return " and ".join([*reasons, *(["unsuited to the scene"] if row.model in unsuited else [])])
 
 
 def _choose(

@@ -106,8 +106,8 @@ class ImageCommonError(CommonUnknown):
             With the present value of the error.
         """
 
-        def again(found: ImageCommonError, _: Solution) -> Solution:
-            return problem.shifted(-found.offset(problem.model, problem.points)).solve(keep)
+        def again(error: ImageCommonError, _: Solution) -> Solution:
+            return problem.shifted(-error.offset(problem.model, problem.points)).solve(keep)
 
         shared = replace(self, shares=problem.points.sigma_common[keep] > 0)
         return shared.settled_with(solution, ImageCommonError._seen, again, _STANDS)
@@ -120,8 +120,8 @@ class ImageCommonError(CommonUnknown):
         gain = solution.cofactors @ cross
         told = _difference(np.einsum("nik,nil->kl", moved, moved), cross.T @ gain)
         slope = np.einsum("nik,ni->k", moved, solution.errors.whitened(solution.residuals))
-        found = replace(self, told=told)
-        return replace(found, gain=gain @ found.left), slope
+        error = replace(self, told=told)
+        return replace(error, gain=gain @ error.left), slope
 
     def moved(self, solution: Solution) -> Array:
         """Return the displacement of the points of a solution by one sigma ``(n, 2, 2)``, whitened."""
@@ -145,8 +145,8 @@ class ImageCommonError(CommonUnknown):
         return self.gain @ self.gain.T
 
 
-def _difference(whole: Array, part: Array) -> Array:
+def _difference(total: Array, part: Array) -> Array:
     """Return a symmetric matrix minus a part of it, without rounding errors."""
-    values, vectors = np.linalg.eigh(whole - (part + part.T) / 2)
-    values[values < _ROUNDING * np.trace(whole)] = 0.0
+    values, vectors = np.linalg.eigh(total - (part + part.T) / 2)
+    values[values < _ROUNDING * np.trace(total)] = 0.0
     return np.asarray((vectors * values) @ vectors.T)

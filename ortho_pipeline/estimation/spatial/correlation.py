@@ -171,7 +171,7 @@ def analyse(
     verdict: Verdict = "too few points"
     if tested is not None:
         verdict = "systematic" if tested[2] < SIGNIFICANCE else "none found"
-    found = Covariance(
+    analysis = Covariance(
         unit=unit,
         n=len(values),
         near_m=near,
@@ -190,7 +190,7 @@ def analyse(
         verdict=verdict,
         statement="",
     )
-    return found.replaced(statement=" ".join(_sentences(found)))
+    return analysis.replaced(statement=" ".join(_sentences(analysis)))
 
 
 def analyse_fit(fit: Fit, *, near: float | None = None) -> Covariances:
@@ -297,12 +297,12 @@ def _edges(distance: Array, near: float | None) -> Array:
 def _classes(
     distance: Array, products: Array, halves: Array, variance: Array, edges: Array
 ) -> tuple[DistanceClass, ...]:
-    found: list[DistanceClass] = []
+    classes: list[DistanceClass] = []
     for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         # The first class includes its lower edge, because two points may have the same position.
-        within = (distance <= high) & ((distance > low) if found or low > 0 else (distance >= low))
+        within = (distance <= high) & ((distance > low) if classes or low > 0 else (distance >= low))
         if within.any():
-            found.append(
+            classes.append(
                 DistanceClass(
                     from_m=low,
                     to_m=high,
@@ -312,7 +312,7 @@ def _classes(
                     relative=_pair(np.sqrt(halves[within].mean(axis=0))),
                 )
             )
-    return tuple(found)
+    return tuple(classes)
 
 
 def _ratio(products: Array, variance: Array) -> Array:
@@ -446,27 +446,28 @@ def _moran(values: Array, first: NDArray[Any], second: NDArray[Any]) -> Array:
 # -- the statement ---------------------------------------------------------------------------------------------------
 
 
-def _sentences(found: Covariance) -> list[str]:
-    if found.moran is None or found.critical is None:
+def _sentences(analysis: Covariance) -> list[str]:
+    if analysis.moran is None or analysis.critical is None:
         return [
-            f"{counted(found.n, 'point')}: too few to distinguish systematic errors from chance. The test needs "
+            f"{counted(analysis.n, 'point')}: too few to distinguish systematic errors from chance. The test needs "
             f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
-    alike = "{:+.2f} in x and {:+.2f} in y".format(*found.moran)
-    chance = f"chance alone exceeds {found.critical:+.2f} in 1 of {round(1 / SIGNIFICANCE)} cases"
-    result = "Systematic errors remain" if found.verdict == "systematic" else "No systematic error was found"
+    alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
+    chance = f"chance alone exceeds {analysis.critical:+.2f} in 1 of {round(1 / SIGNIFICANCE)} cases"
+    result = "Systematic errors remain" if analysis.verdict == "systematic" else "No systematic error was found"
     sentences = [
         f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) are correlated by {alike}; {chance}."
     ]
-    if found.verdict != "systematic" and found.n < _SHARP:
-        sentences.append(f"With {found.n} points, only a strong systematic error would show.")
-    if found.relative is not None:
-        numbers = "{:.2f} and {:.2f}".format(*found.relative), "{:.2f} and {:.2f}".format(*found.absolute)
+    if analysis.verdict != "systematic" and analysis.n < _SHARP:
+        sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")
+    if analysis.relative is not None:
+        numbers = "{:.2f} and {:.2f}".format(*analysis.relative), "{:.2f} and {:.2f}".format(*analysis.absolute)
         sentences.append(
-            f"Relative to each other, points closer than {found.near_m:g} m are accurate to {numbers[0]} {found.unit} "
-            f"({counted(found.pairs_near, 'pair')}). All points are accurate to {numbers[1]} {found.unit}."
+            f"Relative to each other, points closer than {analysis.near_m:g} m are accurate to {numbers[0]} "
+            f"{analysis.unit} "
+            f"({counted(analysis.pairs_near, 'pair')}). All points are accurate to {numbers[1]} {analysis.unit}."
         )
-    if found.mean_p and min(found.mean_p) < SIGNIFICANCE / 2:
-        off = "{:+.2f} and {:+.2f}".format(*found.mean)
-        sentences.append(f"The mean residual is {off} {found.unit}, more than chance explains.")
+    if analysis.mean_p and min(analysis.mean_p) < SIGNIFICANCE / 2:
+        off = "{:+.2f} and {:+.2f}".format(*analysis.mean)
+        sentences.append(f"The mean residual is {off} {analysis.unit}, more than chance explains.")
     return [text.replace(" -", " −") for text in sentences]

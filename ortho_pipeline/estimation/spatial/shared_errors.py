@@ -110,13 +110,13 @@ def shared_errors(
     sigma = np.full(len(rows), MATCHED_ALIKE) if sigma_alike is None else np.maximum(sigma_alike[rows], MATCHED_ALIKE)
     alike = np.einsum("n,nip,nik->pk", sigma, own, shift[rows])
     parts = np.concatenate([design, own], axis=2)
-    found, excess = shared_by(image[rows], residuals, parts, solution.groups[rows], shift, shift[rows], variance)
+    shared, excess = shared_by(image[rows], residuals, parts, solution.groups[rows], shift, shift[rows], variance)
     if excess is None:
-        covariance = usual * max(found.points / found.groups, 1.0)
+        covariance = usual * max(shared.points / shared.groups, 1.0)
     else:
         count = design.shape[2]
         covariance = usual + positive_part(excess[count:, count:], _root(usual))
-    return found, covariance + alike @ alike.T
+    return shared, covariance + alike @ alike.T
 
 
 def shared_by(

@@ -1,4 +1,4 @@
-r"""Circular errors of a normal distribution in the plane, exactly: the radius that holds a part of it.
+r"""Exact circular errors of a normal distribution in the plane: the radius that contains a share of it.
 
 With principal standard deviations :math:`a \ge b`, the share beyond the radius :math:`r` is
 
@@ -21,9 +21,9 @@ from ortho_pipeline.models.base import Array
 
 #: Ratios of the axes, from 0 to 1, at which the radius is tabulated.
 _RATIOS = 513
-#: Nodes of the integral: of a smooth function over its period, so that few suffice.
+#: Nodes of the integral; few suffice for a smooth periodic function.
 _NODES = 96
-#: Of Newton's method.
+#: Iterations of Newton's method.
 _STEPS = 9
 
 
@@ -44,9 +44,9 @@ def share_beyond(radius: Array, larger: Array, smaller: Array) -> Array:
 
 @functools.cache
 def radii(share: float = 0.9) -> Array:
-    """Return the radius that holds a share of the errors, in larger axes, at `_RATIOS` even ratios of the axes.
+    """Return the radius that contains a share of the errors, in larger axes, at `_RATIOS` even ratios of the axes.
 
-    By Newton's method from the left: beyond one standard deviation the integral is a convex function of the radius.
+    Computed by Newton's method from the left: beyond one standard deviation the integral is convex in the radius.
     """
     ratios = np.linspace(0.0, 1.0, _RATIOS)[:, None]
     angle = (np.arange(_NODES) + 0.5) / _NODES * np.pi / 2
@@ -60,7 +60,7 @@ def radii(share: float = 0.9) -> Array:
 
 
 def circular_error(covariance: Array, share: float = 0.9) -> Array:
-    """Return the radius ``(n,)`` of the circle that holds a share of errors of covariances ``(n, 3)``: xx, yy, xy."""
+    """Return the radius ``(n,)`` of the circle with a share of the errors of covariances ``(n, 3)``: xx, yy, xy."""
     larger, smaller = principal(covariance)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(larger > 0, smaller / larger, 1.0)
@@ -68,12 +68,12 @@ def circular_error(covariance: Array, share: float = 0.9) -> Array:
 
 
 def circular_error_of_all(covariance: Array, share: float = 0.9) -> float:
-    """Return the radius that holds a share of the errors of all places together, of covariances ``(n, 3)``."""
+    """Return the radius that contains a share of the errors of all positions together, of covariances ``(n, 3)``."""
     larger, smaller = principal(covariance)
     low, high = float(circular_error(covariance, share).min()), float(circular_error(covariance, share).max())
 
     def beyond(radius: float) -> float:
         return float(share_beyond(np.array(radius), larger, smaller).mean()) - (1.0 - share)
 
-    # Where all places are alike rounding decides on which side the root lies.
+    # If all positions have the same covariance, rounding decides on which side the root is.
     return float(brentq(beyond, low, high, rtol=1e-6)) if low < high and beyond(low) > 0.0 > beyond(high) else high

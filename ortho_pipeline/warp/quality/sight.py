@@ -1,4 +1,4 @@
-r"""How places of an ortho are seen: their image points, and how these move with the place and with its height.
+r"""Viewing geometry of positions of an ortho: image points, and their derivatives by position and height.
 
 With :math:`A = \partial(\mathrm{image}) / \partial(\mathrm{place})` in image pixels per pixel of the output and
 :math:`b = \partial(\mathrm{image}) / \partial h`, an image point that is off by :math:`\delta` shows a place that is

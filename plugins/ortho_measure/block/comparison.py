@@ -1,7 +1,7 @@
-"""Corrections of a block compared: each adjusted to the same points, judged by what took no part, and one recommended.
+"""Compare corrections of a block: adjust each to the same points, test it at left-out points, and recommend one.
 
-As `ortho compare` does it of one scene (`estimation.choice.comparison`): gross errors are left out for all alike, and
-of corrections within 5 % of the smallest error the one with the fewest parameters is taken.
+The method is like that of `ortho compare` for one scene (`estimation.choice.comparison`): gross errors are left out for
+all corrections. Among corrections within 5 % of the smallest error, the one with the fewest parameters is recommended.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import counted
 
-#: Smaller differences of the error, as a factor, are not worth a parameter (as in `estimation.choice.comparison`).
+#: A smaller improvement of the error (a factor) does not justify more parameters.
 _WORTH = 1.05
-#: Fewer points than this are too few to choose by.
+#: Least number of points for a recommendation.
 _FEWEST = 3
 
 
@@ -36,7 +36,7 @@ class _Tried:
     solution: BlockSolution
 
     def errors(self, role: str) -> Array:
-        """Return how far points ``(n,)`` of a role (m) are from where the block without their ground puts them."""
+        """Return the leave-one-out errors ``(n,)`` (m) of the ground of points of a role."""
         fit, without = self.solution.fit, self.solution.left_out
         if fit is None or without is None:
             return np.zeros(0)
@@ -44,7 +44,7 @@ class _Tried:
 
     @property
     def rays(self) -> Array:
-        """How far rays ``(M,)`` (px) are from where the others put them."""
+        """Leave-one-out errors of rays ``(M,)`` (px)."""
         without = self.solution.left_out
         return np.zeros(0) if without is None else np.asarray(np.linalg.norm(without.rays, axis=1))
 
@@ -55,8 +55,8 @@ class _Tried:
             "loo_m": _rms(self.errors("control")),
             "rays": _rms(self.rays),
         }
-        told = {"model": self.name, "parameters": self.parameters, "error": self.solution.error or None, **figures}
-        return dict(json_value(told))
+        row = {"model": self.name, "parameters": self.parameters, "error": self.solution.error or None, **figures}
+        return dict(json_value(row))
 
 
 def compare_corrections(
@@ -67,7 +67,7 @@ def compare_corrections(
     Parameters
     ----------
     starts_of : callable
-        Of the name of a correction; raises an OrthoError where a model cannot be corrected so.
+        Called with the name of a correction; raises an OrthoError if a model cannot have it.
     """
     known: dict[str, Mapping[str, Start]] = {}
     for name in names:
@@ -94,9 +94,11 @@ def compare_corrections(
 
 
 def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
-    """Return the correction to take, and why."""
-    of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
-    of_rays = {one.name: one.rays for one in tried}
+    """Return the recommended correction, and the reason."""
+    of_ground = {
+        candidate.name: np.concatenate([candidate.errors("check"), candidate.errors("control")]) for candidate in tried
+    }
+    of_rays = {candidate.name: candidate.rays for candidate in tried}
     for errors, what, unit in (
         (of_ground, "points (their ground coordinates left out)", "m"),
         (of_rays, "rays (leave-one-out)", "px"),
@@ -109,8 +111,10 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
             continue
         sizes = {name: _rms(values[common]) or 0.0 for name, values in tested.items()}
         smallest = min(sizes.values())
-        able = [one for one in tried if one.name in sizes and sizes[one.name] <= _WORTH * smallest]
-        chosen = min(able, key=lambda one: (one.parameters, sizes[one.name]))
+        able = [
+            candidate for candidate in tried if candidate.name in sizes and sizes[candidate.name] <= _WORTH * smallest
+        ]
+        chosen = min(able, key=lambda candidate: (candidate.parameters, sizes[candidate.name]))
         text = (
             f"RMSE {sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
         )

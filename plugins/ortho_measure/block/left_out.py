@@ -1,7 +1,7 @@
-r"""Each measurement of a block had it taken no part, and how far it is from all others: its residual left out, and w.
+r"""Leave-one-out residuals and test values w of all measurements of a block.
 
-By `estimation.statistics.left_out`, of each ray and of the known ground of each point. Of a ray that alone gives its
-point a distance nothing is known along the other ray: only the part across it is said.
+They are computed by `estimation.statistics.left_out` for each ray and for the known ground of each point. If a ray
+alone gives its point a distance, its error along the other ray is unknown; only the part across it is known.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.estimation.statistics import left_out, squared_distances
 from ortho_pipeline.models.base import Array
 
-#: In directions in which all others tell less than this share of what a part tells itself, nothing is known without it.
+#: A direction with less redundancy than this is unknown without the measurement.
 _KNOWN = 1e-8
-#: Ground is weighed with this sigma (m) at least: far below any pixel, and what others tell stays above rounding.
+#: Least sigma (m) of ground: far below any pixel, but above rounding.
 _LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOutResiduals:
-    """Residuals of N points and M rays, each as if it had taken no part, and tests.
+    """Leave-one-out residuals and tests of N points and M rays.
 
     Parameters
     ----------
     rays : (M, 2)
-        px, measured minus predicted; NaN where nothing is known of it.
+        px, measured minus predicted; NaN if unknown.
     ground : (N, 3)
-        Known minus adjusted ground, m east, north, up; of check points and of ground that was left out their
-        residuals, which are so already. NaN of ties, and where nothing else tells of all three axes.
+        Known minus adjusted ground, m east, north, up. Residuals of check points and rejected ground need no change.
+        NaN for ties, and if the others do not determine all three axes.
     w, chance : (N,)
-        The test value of the part of a point that is farthest from all others, in standard deviations, and how probable
-        one that is as far would be of a good part. NaN without redundancy.
+        The largest test value among the measurements of a point, in standard deviations, and its chance for a good
+        measurement. NaN without redundancy.
     """
 
     rays: Array
@@ -54,7 +54,7 @@ class LeftOutResiduals:
 
     @classmethod
     def of(cls, fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -> LeftOutResiduals:
-        """Return those of an adjustment of some starts."""
+        """Return the residuals and tests of an adjustment."""
         problem, linear = _equations(fit, starts, hold)
         step = step_of(linear)
         hats = step.points.hats(step.solution.cofactors)
@@ -77,7 +77,7 @@ class LeftOutResiduals:
 
 
 def _equations(fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -> tuple[BlockProblem, Linear]:
-    """Return the observation equations at the solution, with the sigmas that were found."""
+    """Return the observation equations at the solution, with the estimated sigmas."""
     points, models = fit.points, tuple(fit.models[label] for label in fit.points.images)
     begun = tuple(fit.start[label] for label in points.images)
     priors = {label: start.priors for label, start in starts.items()}
@@ -92,7 +92,7 @@ def _equations(fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -
 
 
 def _of_checks(fit: BlockFit, checks: Index) -> Array:
-    """Return w squared of check points, with the covariance of where the block puts them in it."""
+    """Return w squared of check points, including the covariance of their predicted ground."""
     plan, height = fit.variances.sigma_xy or 0.0, fit.variances.sigma_h or 0.0
     stated = fit.points.sigma_ground[checks]
     own = np.where(stated > 0, stated, (plan, plan, height))
@@ -102,7 +102,7 @@ def _of_checks(fit: BlockFit, checks: Index) -> Array:
 
 
 def _farthest(tests: list[tuple[Index, Array, Index]], count: int, fit: BlockFit) -> tuple[Array, Array]:
-    """Return w and chance ``(N,)`` of the least probable part of each point."""
+    """Return w and chance ``(N,)`` of the least probable measurement of each point."""
     from scipy.special import chdtrc
 
     w, chance = np.full(count, np.nan), np.full(count, np.nan)
@@ -112,6 +112,6 @@ def _farthest(tests: list[tuple[Index, Array, Index]], count: int, fit: BlockFit
     chances = chdtrc(np.maximum(ranks, 1), np.maximum(squares, 0.0))
     order = np.argsort(-chances, kind="stable")
     order = order[(ranks[order] > 0) & np.isfinite(chances[order])]
-    # The last one that is written stays: the least probable.
+    # The last value written is the least probable one.
     w[point[order]], chance[point[order]] = np.sqrt(np.maximum(squares[order], 0.0)), chances[order]
     return w, chance

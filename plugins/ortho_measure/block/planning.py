@@ -1,9 +1,9 @@
-r"""Planning a block: where the next point tells most of all images together, and what it would gain.
+r"""Planning a block: the best place for the next point of all images together, and its gain.
 
-As `measure.planning` has it of one image, with the rows of all images that show a place. Of control, whose ground is
-known with a covariance :math:`\Sigma`, they err by :math:`A C A^T` and are measured with
-:math:`R = s^2 I + B \Sigma B^T`; of a tie the ground is unknown, and what counts is what is left of the rows when it is
-eliminated: how far the rays are predicted to miss each other.
+The method is that for one image (`ortho_measure.planning`), with the rows of all images that show a place. The ground
+of a control point is known with a covariance :math:`\Sigma`: predictions have the covariance :math:`A C A^T`, and are
+measured with :math:`R = s^2 I + B \Sigma B^T`. The ground of a tie is unknown and is eliminated from the rows; the rest
+is the predicted distance of the rays from each other.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from ortho_pipeline.imaging.matching.targets import metres_per_pixel, shown_by
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE
 
-#: Places of all images together, about.
+#: Approximate number of places in all images together.
 _PLACES = 288
 
 
 @dataclass(frozen=True, eq=False)
 class BlockGrid:
-    """Places that two images show at least, and all over the block.
+    """Candidate places that at least two images show, and a regular grid over the block.
 
     Parameters
     ----------
     number : (n,) of int
-        The image in which a place was chosen.
+        The image in which the place was chosen.
     image : (n, 2)
-        The place there, px.
+        Position of the place in it, px.
     ground, everywhere : (n, 3), (m, 3)
         Their ground, and that of a regular grid in all images, as `GROUND_CRS`.
     seen, seen_everywhere : (n, K), (m, K) of bool
         Which of the K images show it.
     reach : float
-        Points are the same place within this (m).
+        Positions closer than this (m) are the same place.
     """
 
     number: NDArray[np.int_]
@@ -60,14 +60,14 @@ class BlockGrid:
 
     @classmethod
     def over(cls, images: Sequence[SceneGeometry], references: Sequence[Target]) -> BlockGrid:
-        """Return the places of a block, where there are references those that these show."""
+        """Return the places of a block; with references, only places that they show."""
         side = int(np.clip(np.sqrt(_PLACES / len(images)), 3, 12))
         scenes = [OtherScene(one.view.intensity, one.model) for one in images]
         parts: list[tuple[Array, Array, Array]] = []
         for number, one in enumerate(images):
             others = (*scenes[:number], *scenes[number + 1 :])
             image, ground, everywhere = np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3))
-            # Images of too different resolutions offer nothing; they can be measured by hand.
+            # Images with very different resolutions have no candidates; they can be measured by hand.
             with contextlib.suppress(InputError):
                 grid = PlanningGrid.over(replace(one, references=others), side)
                 to_ground = ground_transform(one.model.crs, GROUND_CRS)
@@ -84,7 +84,7 @@ class BlockGrid:
         return cls(chosen[:, 0].astype(int), chosen[:, 1:], ground, everywhere, seen, there, reach)
 
     def without(self, taken: Array) -> BlockGrid:
-        """Return the places at which there is no point, of those whose ground is `taken` ``(k, 3)``."""
+        """Return the places without a point; `taken` ``(k, 3)`` is the ground of the points."""
         here, points = self.plan(self.ground), self.plan(taken)
         points = points[np.isfinite(points).all(axis=1)]
         kept = ~(np.abs(here[:, None] - points).max(axis=2) < self.reach).any(axis=1)
@@ -93,7 +93,7 @@ class BlockGrid:
         )
 
     def plan(self, ground: Array) -> Array:
-        """Return ground ``(k, 3)`` east and north (m) of the middle of the block."""
+        """Return ground ``(k, 3)`` as metres east and north of the middle of the block."""
         if not len(self.everywhere):
             return np.zeros((len(ground), 2))
         return GroundFrame.about(self.everywhere).of_geodetic(ground)[:, :2]
@@ -104,14 +104,14 @@ def _seen(scenes: Sequence[OtherScene], ground: Array) -> NDArray[np.bool_]:
 
 
 def next_of_block(grid: BlockGrid, fit: BlockFit | None, taken: Array, *, tie: bool) -> list[Next]:
-    """Return places where a point tells most, the best first; without a fit those that are farthest from all points.
+    """Return the best places for the next point, the best first; without a fit, those farthest from all points.
 
     Parameters
     ----------
     taken : (k, 3)
-        Ground of the points that there are, as `GROUND_CRS`.
+        Ground of the existing points, as `GROUND_CRS`.
     tie : bool
-        Whether the next point is a tie, or one of known ground.
+        Whether the next point is a tie or has known ground.
     """
     left = grid.without(taken)
     places, points = left.plan(left.ground), left.plan(taken)
@@ -124,15 +124,15 @@ def next_of_block(grid: BlockGrid, fit: BlockFit | None, taken: Array, *, tie: b
     everywhere = _Rows(fit, grid.everywhere, grid.seen_everywhere, tie)
     sigmas, largest = rows.sigmas(fit.covariance), everywhere.largest(fit.covariance)
     free = np.flatnonzero(np.isfinite(sigmas))
-    found: list[Next] = []
-    while len(free) and len(found) < OFFERED:
+    offers: list[Next] = []
+    while len(free) and len(offers) < OFFERED:
         alike = free[sigmas[free] ** 2 >= (1 - ALIKE) * sigmas[free].max() ** 2]
         best = int(alike[apart(places[alike], points, 1)[0]])
         then = everywhere.largest(rows.after(fit.covariance, best))
-        told = replace(_next(left, best), sigma=float(sigmas[best]), largest=largest, then=then)
-        found.append(replace(told, role="tie" if tie else "control"))
+        offer = replace(_next(left, best), sigma=float(sigmas[best]), largest=largest, then=then)
+        offers.append(replace(offer, role="tie" if tie else "control"))
         points, free = np.concatenate([points, places[[best]]]), free[free != best]
-    return found
+    return offers
 
 
 def _next(grid: BlockGrid, k: int) -> Next:
@@ -142,10 +142,10 @@ def _next(grid: BlockGrid, k: int) -> Next:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Rows of the places `of` ``(n,)``, which the same images show, by the parameters in some `columns` ``(p,)``.
+    """Rows of the places `of` ``(n,)`` that the same images show, by the parameters in some `columns` ``(p,)``.
 
-    `missing` ``(n, m, p)`` are px by which a prediction errs, `weighed` the same rows as a measurement has them, of
-    unit weight; `rays` is the number of images.
+    `missing` ``(n, m, p)`` are the partials of predictions in px, `weighed` the same rows in units of a measurement;
+    `rays` is the number of images.
     """
 
     of: NDArray[np.int_]
@@ -155,7 +155,7 @@ class _Batch:
     rays: int
 
     def sigmas(self, covariance: Array) -> Array:
-        """Return the root mean square over the images of how far predictions err ``(n,)``, px."""
+        """Return the standard deviation of predictions ``(n,)``, px, as root mean square over the images."""
         own = covariance[np.ix_(self.columns, self.columns)]
         square = ((self.missing @ own) * self.missing).sum(axis=(1, 2))
         return np.asarray(np.sqrt(np.maximum(square, 0.0) / self.rays))
@@ -174,7 +174,7 @@ class _Rows:
         self.batches = []
         for pattern in np.unique(seen, axis=0):
             images = np.flatnonzero(pattern)
-            # One ray of unknown ground says nothing.
+            # A single ray to unknown ground has no information.
             if len(images) < (2 if tie else 1):
                 continue
             of = np.flatnonzero((seen == pattern).all(axis=1))
@@ -202,32 +202,32 @@ class _Rows:
         return _Batch(of, columns, by_params, np.linalg.solve(np.linalg.cholesky(errors), by_params), len(models))
 
     def sigmas(self, covariance: Array) -> Array:
-        """Return by how many px predictions err at each place ``(n,)``; NaN where nothing can be measured."""
+        """Return the standard deviation of predictions at each place ``(n,)``, px; NaN without a possible point."""
         found = np.full(self.count, np.nan)
         for one in self.batches:
             found[one.of] = one.sigmas(covariance)
         return found
 
     def largest(self, covariance: Array) -> float:
-        """Return that at the worst place."""
-        return max((float(one.sigmas(covariance).max()) for one in self.batches), default=0.0)
+        """Return the standard deviation at the worst place."""
+        return max((float(batch.sigmas(covariance).max()) for batch in self.batches), default=0.0)
 
     def after(self, covariance: Array, place: int) -> Array:
         """Return the covariance of the parameters after a measurement at a place."""
-        for one in self.batches:
-            for row in np.flatnonzero(one.of == place):
-                design = one.weighed[row]
-                there = design @ covariance[one.columns]
-                own = there[:, one.columns] @ design.T
+        for batch in self.batches:
+            for row in np.flatnonzero(batch.of == place):
+                design = batch.weighed[row]
+                there = design @ covariance[batch.columns]
+                own = there[:, batch.columns] @ design.T
                 return np.asarray(covariance - there.T @ np.linalg.solve(own + np.eye(len(own)), there))
         return covariance
 
 
 def _ground_sigmas(fit: BlockFit) -> Array:
-    """Return the standard deviations ``(3,)`` (m) that the ground of the next control point will have."""
+    """Return the expected standard deviations ``(3,)`` (m) of the ground of the next control point."""
     control = fit.points.sigma_ground[fit.used_ground]
-    found = np.array([fit.variances.sigma_xy or 0.0, fit.variances.sigma_xy or 0.0, fit.variances.sigma_h or 0.0])
+    sigmas = np.array([fit.variances.sigma_xy or 0.0, fit.variances.sigma_xy or 0.0, fit.variances.sigma_h or 0.0])
     for axis in range(3):
         stated = control[control[:, axis] > 0, axis]
-        found[axis] = np.median(stated) if len(stated) else found[axis]
-    return found
+        sigmas[axis] = np.median(stated) if len(stated) else sigmas[axis]
+    return sigmas

@@ -1,8 +1,8 @@
-r"""Proposals in several images: what one shows at a click is looked for in another, rendered into its pixels.
+r"""Proposals in several images: a click in one image is searched in the others, rendered into its pixels.
 
-As for a reference (`measure.proposals`), with the other image for one. The heights of the DEM bring both together:
-where they are wrong by :math:`\delta` the match lies :math:`\delta\,u` along the epipolar direction, and so far it is
-searched; the tie is right all the same, as in `imaging.ties`.
+The method is that for a reference (`ortho_measure.proposals`), with the other image as the reference. Both are related
+by the heights of the DEM. A height error :math:`\delta` moves the match by :math:`\delta\,u` along the epipolar
+direction, so the search extends along it. The tie is correct in spite of this error, as in `imaging.ties`.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import OtherScene
 from ortho_pipeline.models.base import Array
 
-#: Height (m) over which the epipolar direction is asked for, and pixels over which derivatives are.
+#: Height difference (m) for the epipolar direction, and step (px) for derivatives.
 _HEIGHT, _STEP = 20.0, 4.0
-#: Heights are searched within so many of their standard deviations.
+#: Search range of heights in standard deviations.
 _SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class ProposalPair:
-    """An image and another one that shows the same ground, by their models as they are now.
+    """Two images that show the same ground, with their present models.
 
     Parameters
     ----------
@@ -38,17 +38,17 @@ class ProposalPair:
     second: SceneGeometry
 
     def carried(self, image: Array) -> Array:
-        """Return where the second image has what the first has at ``(N, 2)``, with the ground on the surface."""
+        """Return the positions in the second image of points ``(N, 2)`` of the first, through the surface."""
         return self.second.image_of(self.first.ground_of(image))
 
     def derivatives(self, image: Array) -> Array:
-        """Return those of `carried` ``(2, 2)`` at a place."""
+        """Return the derivatives of `carried` ``(2, 2)`` at a position."""
         steps = np.array([(-_STEP, 0.0), (_STEP, 0.0), (0.0, -_STEP), (0.0, _STEP)])
         there = self.carried(image + steps)
         return np.column_stack([there[1] - there[0], there[3] - there[2]]) / (2 * _STEP)
 
     def parallax(self, image: Array) -> float:
-        """Return by how many px of the first image a metre of height moves what the second shows."""
+        """Return the parallax: pixels of the first image per metre of height."""
         ground = self.first.ground_of(image[None])
         higher = ground + np.array([0.0, 0.0, _HEIGHT])
         apart = self.second.image_of(higher) - self.second.image_of(ground)
@@ -57,17 +57,17 @@ class ProposalPair:
         return float(np.linalg.norm(moved)) / _HEIGHT
 
     def proposal(self, image: Array, radius: float, sigma_height: float, click: Array | None = None) -> dict[str, Any]:
-        """Return where the second image shows what the first has at a place, as JSON values.
+        """Return the position in the second image of a point of the first, as JSON values.
 
-        `image` with `covariance`, `own` the part of it that the place in the first image errs by, `score`, or the
-        `reason` why there is no match; `seen` tells whether the second image shows the place at all.
+        They are `image` with `covariance`, `own` (the part of the covariance from the first image) and `score`, or the
+        `reason` why there is no match; `seen` states whether the second image covers the place.
 
         Parameters
         ----------
         radius : float
-            How far (px) the models may be off against each other.
+            Search radius (px) for the errors of both models.
         click : (2,), optional
-            A click in the second image, near which it is then.
+            A click in the second image; then the search is near it.
         """
         there = self.carried(image[None])[0]
         inside = bool(np.isfinite(there).all() and ((there >= 0) & (there <= self.second.view.size)).all())
@@ -82,39 +82,39 @@ class ProposalPair:
             reach = float(NEAR)
         else:
             reach = radius + _SIGMAS * sigma_height * self.parallax(image)
-        found = propose(local, image.tolist(), reach)
-        if found.reason or not np.isfinite(found.shift).all():
-            return {"seen": True, "reason": found.reason, "score": found.score, "image": None}
-        place = self.second.image_of(local.ground_of(image[None] + found.shift))[0]
-        # The error of a match is that of both chips, half and half.
-        own = found.covariance / 2
-        told: dict[str, Any] = json_value(
+        match = propose(local, image.tolist(), reach)
+        if match.reason or not np.isfinite(match.shift).all():
+            return {"seen": True, "reason": match.reason, "score": match.score, "image": None}
+        place = self.second.image_of(local.ground_of(image[None] + match.shift))[0]
+        # Half of the variance of a match comes from each chip.
+        own = match.covariance / 2
+        document: dict[str, Any] = json_value(
             {
                 "seen": True,
                 "reason": "" if np.isfinite(place).all() else "the DEM does not cover this place",
                 "image": json_position(place),
                 "covariance": _three(jacobian @ own @ jacobian.T),
                 "own": _three(own),
-                "score": found.score,
-                "scattered": found.scattered,
+                "score": match.score,
+                "scattered": match.scattered,
             }
         )
-        return told
+        return document
 
 
 @dataclass(frozen=True, eq=False)
 class TieSearch:
-    """Looks for clicks in all images of a block.
+    """Search for clicks in all images of a block.
 
     Parameters
     ----------
     places : tuple of SceneGeometry
-        By the models as they are now.
+        With the present models.
     labels : tuple of str
     reaches : tuple of float
-        How far (px) models may be off.
+        Search radius (px) of each image.
     sigma_height : float
-        Of the heights (m).
+        Standard deviation of the heights (m).
     referenced : bool
         Whether there are references.
     """
@@ -126,20 +126,20 @@ class TieSearch:
     referenced: bool
 
     def of_click(self, number: int, image: Sequence[float], known: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-        """Return what the other images and the references show at a click in an image.
+        """Return matches of a click in an image, in the other images and the references.
 
         Parameters
         ----------
         number : int
-            Of the image.
+            Number of the image.
         known : mapping of label to (column, row)
-            Where the point was clicked already: with any, the first of them is looked for about the click.
+            Earlier clicks of the point; with any, the first of them is searched near the click.
 
         Returns
         -------
         dict
-            `rays` by label: of the click itself its `covariance`; of the others as `Pair.proposal`. `ground`: as
-            `measure.proposals.proposal_of` for the references, null without any.
+            `rays` by label: the `covariance` of the click itself; for the others as `ProposalPair.proposal`. `ground`:
+            as `ortho_measure.proposals.proposal_of` for the references, null without any.
         """
         labels, click = self.labels, np.asarray(image, dtype=float)
         rays: dict[str, Any] = {}
@@ -165,7 +165,7 @@ class TieSearch:
         return {"rays": json_value(rays), "ground": ground}
 
     def of_ground(self, ground: Sequence[float]) -> dict[str, Any]:
-        """Return where all images show a ground of the reference, by matching: `rays` as `of_click` has them."""
+        """Return matches of a ground position of the reference in all images: `rays` as in `of_click`."""
         place, rays = np.asarray(ground, dtype=float), {}
         for known, label, reach in zip(self.places, self.labels, self.reaches, strict=True):
             there = known.image_of(place)[0]
@@ -174,8 +174,8 @@ class TieSearch:
             elif not self.referenced:
                 rays[label] = {"seen": True, "reason": "there is no reference image", "image": None}
             else:
-                found = proposal_of(known, None, place, reach)
-                rays[label] = {**found, "image": None if found["reason"] else found["image"], "seen": True}
+                match = proposal_of(known, None, place, reach)
+                rays[label] = {**match, "image": None if match["reason"] else match["image"], "seen": True}
         return {"rays": rays, "ground": None}
 
 

@@ -43,13 +43,13 @@ from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.accuracy import typical_sigma
 
-#: What a click may be off in any case (px), once there is an adjustment.
+#: Search radius of a click (px), once there is an adjustment.
 _HAND = 6.0
 
 
 @dataclass(frozen=True, eq=False)
 class BlockImages:
-    """The images of a session: their paths, labels, names in files, scenes, and places by the models as delivered."""
+    """The images of a session: paths, labels, names in files, scenes, and geometries with the delivered models."""
 
     paths: tuple[str, ...]
     labels: tuple[str, ...]
@@ -59,17 +59,17 @@ class BlockImages:
 
 
 class BlockSession(Project):
-    """Points that are measured in several images.
+    """Points measured in several images.
 
     Parameters
     ----------
     images : BlockImages
     references : tuple of Reference
-        None or more.
+        May be empty.
     output : Path
-        The GeoJSON of the points; its journal lies beside it.
+        The GeoJSON of the points; the journal is beside it.
     options : BlockOptions
-        What is adjusted, as for `ortho adjust`; `points` is what it begins with.
+        Options of the adjustment, as for `ortho adjust`; `points` are the first points.
     """
 
     _solution: BlockSolution
@@ -86,33 +86,33 @@ class BlockSession(Project):
         heights: SurfaceOptions = SurfaceOptions(),
     ) -> None:
         surface = images.places[0].surface
-        maps = [Sheet(one, surface) for one in references]
-        super().__init__(output, surface, [one.view for one in images.places], maps)
+        maps = [Sheet(reference, surface) for reference in references]
+        super().__init__(output, surface, [geometry.view for geometry in images.places], maps)
         self.images, self._options, self._heights = images, options, heights
         self._opened = list(opened) or [SceneOptions()] * len(images.paths)
         self._starts: dict[str | None, dict[str, Start]] = {}
         self._search = [
-            search_of(scene, match, metres_per_pixel(one.view)).distance / metres_per_pixel(one.view)
-            for scene, one in zip(images.scenes, images.places, strict=True)
+            search_of(scene, match, metres_per_pixel(geometry.view)).distance / metres_per_pixel(geometry.view)
+            for scene, geometry in zip(images.scenes, images.places, strict=True)
         ]
         usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
         stated = typical_sigma(surface)
         self._sigma_height = usual if stated is None else stated
         self.grid = BlockGrid.over(images.places, references)
-        self._everywhere = [self._spread(one) for one in images.places]
-        self.rendered = [tuple(one.model for one in images.places)]
+        self._everywhere = [self._spread(geometry) for geometry in images.places]
+        self.rendered = [tuple(geometry.model for geometry in images.places)]
         self._solution = BlockSolution(dict(zip(images.labels, self.rendered[0], strict=True)))
         self._begin()
 
     @staticmethod
     def _spread(places: SceneGeometry) -> Array:
-        """Return ground in the CRS of the model, all over an image."""
+        """Return ground in the CRS of the model, spread over an image."""
         width, height = places.view.size
         columns, rows = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
         image = np.column_stack([columns.ravel(), rows.ravel()])
         return places.model.image_to_ground(image, np.full(len(image), places.model.reference_height))
 
-    # -- as any project ----------------------------------------------------------------------------------------------
+    # -- methods of a project ----------------------------------------------------------------------------------------
 
     def _identity(self) -> dict[str, Any]:
         return {
@@ -141,17 +141,17 @@ class BlockSession(Project):
         return os.fspath(self.output)
 
     def starts(self, correction: str | None) -> Mapping[str, Start]:
-        """Return what the adjustment starts from with a correction, as `ortho adjust` has it.
+        """Return the start of the adjustment with a correction, as in `ortho adjust`.
 
         Raises
         ------
         InputError
-            If a model cannot be corrected so.
+            If a model cannot have this correction.
         """
         if correction not in self._starts:
-            asked = replace(self._options, points=None, correction=correction or self._options.correction)
+            options = replace(self._options, points=None, correction=correction or self._options.correction)
             self._starts[correction] = {
-                label: start_of(path, asked, opened, _nothing(), None)
+                label: start_of(path, options, opened, _nothing(), None)
                 for label, path, opened in zip(self.images.labels, self.images.paths, self._opened, strict=True)
             }
         return self._starts[correction]
@@ -166,7 +166,7 @@ class BlockSession(Project):
         table = block_points(self.marks, self.images.labels, self._called)
         self._solution = solve(self.starts(self.marks.correction), table, self._options.hold)
         if self._solution.fit is None:
-            # Heights under the scene are known to the models that were opened for it.
+            # Use the opened models, which know the heights below the scene.
             delivered = dict(zip(self.images.labels, self.rendered[0], strict=True))
             self._solution = replace(self._solution, models=delivered)
         models = tuple(self._solution.models[label] for label in self.images.labels)
@@ -175,7 +175,7 @@ class BlockSession(Project):
 
     @property
     def solution(self) -> BlockSolution:
-        """The adjustment to the points as they are now."""
+        """The adjustment to the present points."""
         return self._solution
 
     @property
@@ -193,17 +193,17 @@ class BlockSession(Project):
         return next_of_block(self.grid, self._solution.fit, taken, tie=not self.sheets)
 
     def _grounds(self, marks: Sequence[Mark]) -> Array:
-        """Return known ground, that of the adjustment for ties, and on the surface for what has one ray alone."""
-        found, fit = super()._grounds(marks), self._solution.fit
+        """Return the ground of marks: known, adjusted (ties), or on the surface (a single ray)."""
+        ground, fit = super()._grounds(marks), self._solution.fit
         adjusted = {} if fit is None else dict(zip(fit.points.ids, fit.ground, strict=True))
         for k, mark in enumerate(marks):
             if mark.ground is not None and mark.role != "tie":
                 continue
-            found[k] = adjusted.get(mark.id, np.full(3, np.nan))
-            if not np.isfinite(found[k]).all() and mark.rays:
+            ground[k] = adjusted.get(mark.id, np.full(3, np.nan))
+            if not np.isfinite(ground[k]).all() and mark.rays:
                 label, ray = next(iter(mark.rays.items()))
-                found[k] = self.places_of(self.images.labels.index(label)).ground_of([ray.image])[0]
-        return found
+                ground[k] = self.places_of(self.images.labels.index(label)).ground_of([ray.image])[0]
+        return ground
 
     def _sigma(self, ground: Array) -> list[float] | None:
         return None
@@ -214,17 +214,17 @@ class BlockSession(Project):
         return self.images.places[number].by(self._solution.models[self.images.labels[number]])
 
     def at(self, version: int, number: int = 0) -> SceneGeometry:
-        """Return the geometry that references were rendered with for an image."""
+        """Return the geometry used to render the references for an image."""
         if not 0 <= version < len(self.rendered):
             raise InputError("unknown rendering", field="version", remedy="reload the page")
         return self.images.places[number].by(self.rendered[version][number])
 
     def _geometries(self, version: int) -> dict[str, Geometry]:
-        found: dict[str, Geometry] = {}
+        geometries: dict[str, Geometry] = {}
         for number in range(len(self.images.labels)):
-            found[f"scene-{number}"] = self.places_of(number)
-            found[f"reference-{number}"] = self.at(version, number)
-        return found | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
+            geometries[f"scene-{number}"] = self.places_of(number)
+            geometries[f"reference-{number}"] = self.at(version, number)
+        return geometries | {f"map-{number}": sheet for number, sheet in enumerate(self.sheets)}
 
     def rendering(self, name: str, version: int) -> SceneGeometry | None:
         kind, number = name.split("-")
@@ -240,17 +240,17 @@ class BlockSession(Project):
         return TieSearch(places, self.images.labels, reaches, self._sigma_height, bool(self.sheets))
 
     def proposal(self, number: int, image: Sequence[float], known: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-        """Return what the other images and the references show at a click in an image, as `TieSearch.of_click`."""
+        """Return matches of a click in an image, as `TieSearch.of_click`."""
         return self._search_of_clicks.of_click(number, image, known)
 
     def of_ground(self, ground: Sequence[float]) -> dict[str, Any]:
-        """Return where all images show a ground of the reference, as `TieSearch.of_ground`."""
+        """Return matches of a ground position in all images, as `TieSearch.of_ground`."""
         return self._search_of_clicks.of_ground(ground)
 
-    # -- what comes of it --------------------------------------------------------------------------------------------
+    # -- results -----------------------------------------------------------------------------------------------------
 
     def _asked(self) -> BlockOptions:
-        """Return how `ortho adjust` is asked for the same with the saved points, which say all of themselves."""
+        """Return the options of `ortho adjust` for the same adjustment with the saved points."""
         return replace(
             self._options,
             points=self.output,
@@ -262,23 +262,23 @@ class BlockSession(Project):
         )
 
     def compared(self) -> dict[str, Any]:
-        """Return the corrections compared on the points as they are now."""
+        """Return a comparison of the corrections on the present points."""
         with self._lock:
             table = block_points(self.marks, self.images.labels, self._called)
         return compare_corrections(self.starts, CORRECTIONS, table, self._options.hold)
 
     def ortho(self, progress: Progress, number: int = 0) -> Result:
-        """Make what `ortho rectify` makes of an image with the model that `ortho adjust` has of the saved points."""
+        """Run `ortho adjust` with the saved points, and `ortho rectify` for an image with its adjusted model."""
         from ortho_pipeline.commands.block import adjust
         from ortho_pipeline.commands.rectification import rectify
 
         with self._lock:
             self.save()
-            asked = self._asked()
+            options = self._asked()
         label, folder = self.images.labels[number], self.output.with_name(f"{self.output.stem}_ortho")
         path, own = self.images.paths[number], self._opened[number]
         with confined(self.output.parent):
-            block = adjust(self.images.paths, folder / "block", asked, self._opened)
+            block = adjust(self.images.paths, folder / "block", options, self._opened)
             opened = SceneOptions(model=block.files[f"{label} model"], allow_network=own.allow_network, roots=own.roots)
             return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
 
@@ -307,19 +307,19 @@ def open_block_session(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
 ) -> BlockSession:
-    """Open images, heights and references, and go on with the points that a journal beside the output has.
+    """Open images, heights and references, and continue with the points of the journal beside the output.
 
     Parameters
     ----------
     output : path
         A ``.geojson`` file.
     scene : SceneOptions or sequence of SceneOptions
-        How all images are opened, or each.
+        Options of all images, or of each.
 
     Raises
     ------
     InputError
-        For whatever the user can correct.
+        For every mistake that the user can correct.
     """
     path = points_file(output)
     require_heights(surface)

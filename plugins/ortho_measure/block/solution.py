@@ -1,4 +1,4 @@
-"""The bundle adjustment that is shown: that of `ortho adjust` to the points as they are now, and figures about it."""
+"""The bundle adjustment on the page: that of `ortho adjust` to the present points, and its figures."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 @dataclass(frozen=True, eq=False)
 class BlockSolution:
-    """An adjustment, or why there is none.
+    """An adjustment, or the reason why there is none.
 
     Parameters
     ----------
     models : mapping of label to SensorModel
-        Adjusted; as they were delivered where nothing was adjusted.
+        Adjusted models; the delivered ones without an adjustment.
     fit : BlockFit, optional
     error : str
-        What keeps it from being made, as people read it.
+        Why there is no adjustment, for people.
     left_out : LeftOutResiduals, optional
-        What each measurement is off by had it taken no part.
+        Leave-one-out residuals of all measurements.
     """
 
     models: Mapping[str, SensorModel]
@@ -46,7 +46,7 @@ class BlockSolution:
 def solve(
     starts: Mapping[str, Start], points: BlockPoints, hold: float | None, *, robust: bool = True
 ) -> BlockSolution:
-    """Adjust images and points as `ortho adjust` does; where not `robust`, gross errors are left in."""
+    """Adjust images and points, like `ortho adjust`; without `robust`, gross errors stay in."""
     models = {label: start.model for label, start in starts.items()}
     if not len(points):
         return BlockSolution(models)
@@ -60,13 +60,13 @@ def solve(
     except OrthoError as error:
         return BlockSolution(models, None, error.message)
     except np.linalg.LinAlgError as error:
-        # What is in the journal has to open again, whatever it is.
+        # The journal must open again, whatever points it has.
         return BlockSolution(models, None, f"the points cannot be adjusted ({error})")
     return BlockSolution(fit.models, fit, "", left_out)
 
 
 def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
-    """Return what the page shows of a solution, as JSON values; `relative` is one to a reference."""
+    """Return the figures of a solution for the page, as JSON values; `relative` means relative to a reference."""
     fit, without = solution.fit, solution.left_out
     if fit is None or without is None:
         return {"error": solution.error, "points": {}, "headline": _headline(solution, relative), "notices": []}
@@ -87,9 +87,9 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
         point, label = points[table.ids[of]], table.images[image]
         point["residuals"][label] = json_position(fit.residuals[ray])
         point["loo"][label] = json_position(without.rays[ray])
-    for one in fit.rejected:
-        where = f" in {one.image}" if one.image else ""
-        points[one.point] |= {"suspicious": True, "reason": f"rejected{where}: {one.reason}"}
+    for error in fit.rejected:
+        where = f" in {error.image}" if error.image else ""
+        points[error.point] |= {"suspicious": True, "reason": f"rejected{where}: {error.reason}"}
     for doubt in fit.outlying:
         text = f"its {doubt.what} differs from the block by {doubt.metres:.2f} m ({doubt.sigmas:.1f} sigmas)"
         points[doubt.point] |= {"suspicious": True, "reason": text}
@@ -110,32 +110,32 @@ def figures(solution: BlockSolution, relative: bool) -> dict[str, Any]:
                 for label in table.images
             }
         ),
-        "notices": [str(one) for one in fit.warnings],
+        "notices": [str(notice) for notice in fit.warnings],
     }
 
 
 def _headline(solution: BlockSolution, relative: bool) -> dict[str, Any]:
-    """Return the best evidence of accuracy that there is, and what it is: never the residuals of the fit itself."""
+    """Return the best available measure of accuracy and its description; never the residuals of the fit itself."""
     fit = solution.fit
     if fit is None or solution.left_out is None:
         return {"px": None, "m": None, "what": "no points yet"}
     to = ", relative to the reference" if relative else ""
-    found = fit.object_rms()
-    if found is None or found.n < LEAST_CHECK_POINTS:
-        without = _left_out_in_turn(fit, solution.left_out, to, 0 if found is None else found.n)
-        if found is None or without["m"] is not None:
+    rmse = fit.object_rms()
+    if rmse is None or rmse.n < LEAST_CHECK_POINTS:
+        without = _left_out_in_turn(fit, solution.left_out, to, 0 if rmse is None else rmse.n)
+        if rmse is None or without["m"] is not None:
             return without
-    rays = [one for one in (fit.image_rms(image, "check") for image in fit.points.images) if one is not None]
-    count = sum(one.n for one in rays)
-    total = float(np.sqrt(sum(one.n * one.total**2 for one in rays) / count)) if count else None
-    few = f". Indicative: fewer than {ENOUGH_CHECK_POINTS} check points" if found.n < ENOUGH_CHECK_POINTS else ""
-    text = f"RMSE in plan; {found.h:.3f} m in height, at {counted(found.n, 'check point')}{to}{few}"
-    told: dict[str, Any] = json_value({"px": total, "m": found.plan, "n": found.n, "what": text})
-    return told
+    rays = [record for record in (fit.image_rms(image, "check") for image in fit.points.images) if record is not None]
+    count = sum(record.n for record in rays)
+    total = float(np.sqrt(sum(record.n * record.total**2 for record in rays) / count)) if count else None
+    few = f". Indicative: fewer than {ENOUGH_CHECK_POINTS} check points" if rmse.n < ENOUGH_CHECK_POINTS else ""
+    text = f"RMSE in plan; {rmse.h:.3f} m in height, at {counted(rmse.n, 'check point')}{to}{few}"
+    document: dict[str, Any] = json_value({"px": total, "m": rmse.plan, "n": rmse.n, "what": text})
+    return document
 
 
 def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks: int) -> dict[str, Any]:
-    """Return the accuracy at control points whose ground was left out in turn, where others tell of all of it."""
+    """Return the leave-one-out accuracy of the ground of control points that the others determine."""
     apart = without.ground[fit.used_ground]
     apart = apart[np.isfinite(apart).all(axis=1)]
     if not len(apart) or not fit.redundancy:
@@ -143,5 +143,5 @@ def _left_out_in_turn(fit: BlockFit, without: LeftOutResiduals, to: str, checks:
     few = f"Only {counted(checks, 'check point')}" if checks else "No check points"
     east, north, up = np.sqrt((apart**2).mean(axis=0)).tolist()
     text = f"RMSE in plan; {up:.3f} m in height, at {counted(len(apart), 'control point')} (leave-one-out){to}. {few}"
-    told: dict[str, Any] = json_value({"px": None, "m": math.hypot(east, north), "n": len(apart), "what": text})
-    return told
+    document: dict[str, Any] = json_value({"px": None, "m": math.hypot(east, north), "n": len(apart), "what": text})
+    return document

@@ -1,4 +1,4 @@
-"""Marks of several images as points of a block: the table that is adjusted, and the file that is read as the same."""
+"""Marks of several images as points of a block: the table for the adjustment, and the file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ortho_pipeline.points.image_errors import says_more
 
 
 def block_points(marks: Marks, labels: Sequence[str], source: str) -> BlockPoints:
-    """Return the points of the adjustment: marks that are whole and on, with images called by their labels."""
+    """Return the points of the adjustment: complete marks that are on, with the labels of their images."""
     used = [mark for mark in marks.by_id.values() if mark.counts]
     rays = [(k, label, mark.rays[label]) for k, mark in enumerate(used) for label in labels if label in mark.rays]
     sigma, covariance = errors_of([ray for _, _, ray in rays])
@@ -36,7 +36,7 @@ def block_points(marks: Marks, labels: Sequence[str], source: str) -> BlockPoint
 
 
 def _known(mark: Mark) -> tuple[float, ...]:
-    """Return the ground that is known of a mark; of a tie there is none."""
+    """Return the known ground of a mark; NaN for a tie."""
     return (np.nan,) * 3 if mark.role == "tie" or mark.ground is None else mark.ground
 
 
@@ -46,11 +46,11 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
     Parameters
     ----------
     names : mapping
-        Labels of the images to what files call them.
+        Labels of the images -> names in files.
     """
     table = block_points(marks, tuple(names), source)
     features = {label: {point.id: feature_of(point) for point in table.in_image(label)} for label in names}
-    found = []
+    collected = []
     for name in table.ids:
         mark = marks.by_id[name]
         for label in names:
@@ -66,9 +66,9 @@ def document(marks: Marks, names: Mapping[str, str], source: str) -> dict[str, A
                 "ground_from": None if mark.role == "tie" else mark.ground_from,
                 **({"note": mark.note} if mark.note else {}),
             }
-            found.append(feature)
+            collected.append(feature)
     left = [mark.to_json() for mark in marks.by_id.values() if not mark.counts]
-    return {"type": "FeatureCollection", "features": found, **({"left_out": left} if left else {})}
+    return {"type": "FeatureCollection", "features": collected, **({"left_out": left} if left else {})}
 
 
 def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
@@ -77,12 +77,12 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
     Parameters
     ----------
     at : str
-        When they were read.
+        Time of reading.
     """
     ground = ground_transform(points.crs, GROUND_CRS)(points.ground)
     covariance = points.covariance_image
     more = says_more(covariance)
-    found = []
+    marks = []
     for k, name in enumerate(points.ids):
         rays = {}
         for ray in np.flatnonzero(points.point == k).tolist():
@@ -94,7 +94,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
                 covariance=(column, row, both) if more[ray] else None,
             )
         known = bool(np.isfinite(ground[k]).all())
-        found.append(
+        marks.append(
             checked(
                 Mark(
                     id=name,
@@ -109,4 +109,4 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
                 )
             )
         )
-    return found
+    return marks

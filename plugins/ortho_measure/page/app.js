@@ -1,8 +1,8 @@
-// The page: what is being measured, requests, keys. The server computes; what is shown here was written down before.
+// The page: the point in progress, requests, keys. The server computes; it saves every action before the page shows it.
 import { Table } from './table.js';
 import { PANES, Views, geometryOf } from './views.js';
 
-/** An element of the page, of whatever kind: that it is there is a test's. @type {(id: string) => any} */
+/** An element of the page; a test checks that it exists. @type {(id: string) => any} */
 const $ = (id) => document.getElementById(id);
 const windowName = crypto.randomUUID();
 /** @type {Facts} */ let facts;
@@ -10,10 +10,10 @@ const windowName = crypto.randomUUID();
 /** @type {Views} */ let views;
 /** @type {Table} */ let table;
 /** @type {string|null} */ let selected = null;
-/** The point under way. @type {Pending|null} */ let pending = null;
-let skipped = 0; // places that were offered and passed over
-let turn = 0; // answers to requests that something newer overtook are not shown
-/** Of each view: bands and contrast. @type {{[view: string]: Look}} */ const looks = {};
+/** The point in progress. @type {Pending|null} */ let pending = null;
+let skipped = 0; // offered places that were skipped
+let turn = 0; // number of the newest request: answers to older ones are not shown
+/** Bands and contrast of each view. @type {{[view: string]: Look}} */ const looks = {};
 const compared = { flicker: false, difference: false, swipe: 0 };
 
 /** @template {keyof Answers} W @param {W} what @param {object} [given] @returns {Promise<Answers[W]>} */
@@ -30,7 +30,7 @@ function say(text, bad = false) {
   $('said').className = bad ? 'bad' : '';
 }
 
-/** Run what may fail, and say so where it does. @template {any[]} G, T @param {(...given: G) => Promise<T>} work @returns {(...given: G) => Promise<T|undefined>} */
+/** Run work that may fail, and show its error. @template {any[]} G, T @param {(...given: G) => Promise<T>} work @returns {(...given: G) => Promise<T|undefined>} */
 const safely = (work) => async (...given) => {
   try { return await work(...given); } catch (error) {
     say(error instanceof TypeError ? 'No answer from ortho measure. All accepted points are saved. Start ortho measure again.' : String(error instanceof Error ? error.message : error), true);
@@ -45,13 +45,13 @@ const markOf = (id) => state.marks.find((mark) => mark.id === id);
 const number = (value, digits) => (value === null || value === undefined ? '–' : value.toFixed(digits));
 
 const look = (name) => (looks[name] ??= { bands: [0], limits: null });
-/** The number of the image that a view is in the geometry of, null for a map. */
+/** Number of the image whose geometry a view has; null for a map. */
 const imageOf = (name) => { const [kind, number] = geometryOf(name).split('-'); return kind === 'scene' ? Number(number) : null; };
 
-/** What the points call the image of a view, where there are several. */
+/** Name of the image of a view in the points, if there are several images. */
 const labelOf = (name) => (facts.labels && name.startsWith('scene-') ? facts.labels[imageOf(name)] : null);
 
-/** The reference in the geometry of the left pane, where there is one: what flickers, and what a difference is from. */
+/** The reference in the geometry of the left pane, if there is one, for flicker and difference. */
 const overlay = () => { const name = `reference-${imageOf(views.shows.scene)}`; return facts.bands[name] ? name : null; };
 
 async function showTiles(names = Object.values(views.shows)) {
@@ -62,7 +62,7 @@ async function showTiles(names = Object.values(views.shows)) {
   }));
 }
 
-/** Where a mark is in a view, and its residual there: measured in an image, where its ground is shown elsewhere. */
+/** Position of a mark in a view, and its residual: measured in an image, otherwise the position of its ground. */
 function placed(mark, name) {
   const label = labelOf(name);
   if (!name.startsWith('scene-')) return { place: mark.places?.[name] ?? null };
@@ -71,7 +71,7 @@ function placed(mark, name) {
   return ray ? { place: ray.image, residual: mark.residuals?.[label] } : { place: mark.places?.[name] ?? null, expected: true };
 }
 
-/** Whether a point has all that it needs. */
+/** Whether a point is complete. */
 function complete(mark) {
   if (!mark) return false;
   if (!facts.labels) return Boolean(mark.image && mark.ground);
@@ -112,7 +112,7 @@ function show(next) {
   $('doubts-title').textContent = `Notices (${items.length})`;
   draw();
   if (rendered) safely(showTiles)([...Object.values(views.shows), overlay()].filter((name) => name?.startsWith('reference-')));
-  // Where the other geometry lies has changed with the model.
+  // The relation of the two geometries has changed with the model.
   if (rendered) views.relink();
 }
 
@@ -170,7 +170,7 @@ function cancel() {
   draw();
 }
 
-/** Take a match into the point under way, or say why it is none. */
+/** Copy a match into the point in progress, or show why there is none. */
 function take(found, wanted) {
   if (found.reason) {
     pending.score = null;
@@ -185,7 +185,7 @@ function take(found, wanted) {
   say(`Matched: score ${found.score.toFixed(3)}, ±${sigma.toFixed(3)} px${found.scattered ? ` (from ${found.scattered} neighbours)` : ' (assumed)'}. Press Enter to accept.`);
 }
 
-/** Take what the images show of a point under way, and tell what they do not. */
+/** Copy matches in all images into the point in progress, and show which images have none. */
 function takeRays({ rays, ground }, clicked) {
   const told = [];
   for (const [label, ray] of Object.entries(rays)) {
@@ -202,7 +202,7 @@ function takeRays({ rays, ground }, clicked) {
   say(`${told.length ? `Matched: ${told.join(', ')}.` : ''}${none}${unknown}${complete(pending) ? ' Press Enter to accept.' : ''}`.trim(), !complete(pending));
 }
 
-/** Measure a place in one of several images, or of the ground in the reference. */
+/** Measure a position in one of several images, or ground in the reference. */
 async function tie(name, place, mine) {
   const label = labelOf(name);
   if (label) {
@@ -230,7 +230,7 @@ async function tie(name, place, mine) {
   await locate(mine);
 }
 
-/** Whether a place of a view is within its image, or half a pixel beside it; a reference says itself what it shows. */
+/** Whether a position is within the image of a view, plus half a pixel; references answer this themselves. */
 function within(name, place) {
   const [kind, number] = name.split('-');
   return kind !== 'scene' || place.every((value, axis) => value >= -0.5 && value <= facts.images[number].size[axis] + 0.5);
@@ -262,7 +262,7 @@ const measure = safely(async (pane, place) => {
   await locate(mine);
 });
 
-/** Ask where the ground of the point under way is shown, and draw it. */
+/** Request the positions of the ground of the point in progress, and draw it. */
 async function locate(mine) {
   const [first] = Object.entries(pending.rays ?? {});
   const seen = first ? { at: `scene-${facts.labels.indexOf(first[0])}`, place: first[1].image } : { at: 'scene-0', place: pending.image };
@@ -273,7 +273,7 @@ async function locate(mine) {
   draw();
 }
 
-/** What the arrow keys move in a pane: the measurement that it shows, if there is one under way. */
+/** The measurement that the arrow keys move in a pane, if one is in progress. */
 function movable(pane) {
   const label = pane && facts.labels && labelOf(views.shows[pane]);
   if (label) return pending?.rays[label] ?? null;
@@ -329,7 +329,7 @@ const accept = safely(async () => {
   draw();
 });
 
-/** Begin to change a point that there is. */
+/** Start to edit an existing point. */
 function edit(id) {
   const mark = markOf(id);
   turn += 1;
@@ -350,20 +350,20 @@ function choose(id) {
 
 const toggleOff = () => { const mark = selected && markOf(selected); if (mark) act({ do: 'put', mark: plain({ ...mark, off: !mark.off }), was: mark.id }).then(() => choose(mark.id)); };
 const remove = () => { if (selected) { const id = selected; cancel(); act({ do: 'remove', id }); } };
-/** Whether an image shows a place that is offered. */
+/** Whether an image shows an offered place. */
 function shownWithin({ places }, number) {
   const place = places[`scene-${number}`];
   return Boolean(place) && place.every((value, axis) => value >= 0 && value <= facts.images[number].size[axis]);
 }
 
-/** Go to the place that tells most; from there to the second best, and so on. */
+/** Go to the best next place; from there to the second best, and so on. */
 function goNext() {
   if (!state.next.length) return;
   const [column, row] = views.middle('scene');
   const [x, y] = nextPlace().places[views.shows.scene] ?? [Infinity, Infinity];
   if (Math.hypot(x - column, y - row) < 1) skipped += 1;
   cancel();
-  // In a block the left view is that of an image which shows the place.
+  // In a block, the left view must show an image that contains the place.
   const there = nextPlace();
   if (facts.labels && !shownWithin(there, imageOf(views.shows.scene))) showIn('scene', `scene-${there.number}`);
   views.goTo(there.places, 1);
@@ -385,7 +385,7 @@ const dragged = safely(async (pane, id, place) => {
     Object.assign(changed, { ground: there.ground, ground_from: 'reference' });
   }
   await act({ do: 'put', mark: plain(changed), was: id });
-  // What is being edited is the point where it lies now: Enter would put it back.
+  // Edit the point at its new position; otherwise Enter would move it back.
   if (pending?.was === id) { edit(id); fill(); draw(); }
 });
 
@@ -430,7 +430,7 @@ const models = safely(async () => {
 const wait = (milliseconds) => new Promise((resolve) => { setTimeout(resolve, milliseconds); });
 let making = false;
 
-/** Make the ortho, and show how far it is, then what it looks like beside the reference. */
+/** Make the ortho, show its progress, then compare it with the reference. */
 const makeOrtho = safely(async () => {
   $('ortho').showModal();
   if (making) return;
@@ -438,7 +438,7 @@ const makeOrtho = safely(async () => {
   try {
     $('ortho-done').hidden = true;
     $('ortho-share').hidden = false;
-    // Of several images that which the left view shows, or is in the geometry of.
+    // With several images, use the one of the left view.
     let told = await ask('make', { number: imageOf(geometryOf(views.shows.scene)) });
     const of = facts.labels ? `${facts.images[told.number].name}: ` : '';
     while (told.state === 'running') {
@@ -479,7 +479,7 @@ const typed = safely(async () => {
   draw();
 });
 
-/** Take the role that is chosen for the point under way, and say whether that has all that it needs. */
+/** Set the chosen role of the point in progress, and show what is missing. */
 function changeRole() {
   const { value } = $('role');
   if (pending) pending.role = value;
@@ -515,7 +515,7 @@ function pressed(event) {
   if (key === 'Enter' && (inMap || target === document.body)) { event.preventDefault(); accept(); } else if (keys[key]) { event.preventDefault(); keys[key](); }
 }
 
-/** What the panes may show: names of views, and what people call them. */
+/** Choices of a pane: names of views, and their titles. */
 function choices(pane) {
   const scenes = facts.images.map((image, number) => [`scene-${number}`, facts.labels ? image.name : 'Scene']);
   if (pane === 'scene') return scenes;
@@ -562,7 +562,7 @@ function banner() {
   $('take').hidden = facts.locked || facts.writes;
 }
 
-/** A window that only reads shows what the other one does. */
+/** A read-only window shows the changes of the other one. */
 setInterval(async () => {
   if (!facts || facts.writes) return;
   const next = await ask('state').catch(() => null);

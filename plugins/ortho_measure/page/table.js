@@ -1,4 +1,4 @@
-// The table of points, sorted by whatever is clicked.
+// The table of points, sorted by the column that is clicked.
 
 const number = (value, digits = 3) => (value === null || value === undefined ? '–' : value.toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
 const length = (pair) => (pair ? Math.hypot(...pair) : null);
@@ -11,17 +11,17 @@ const ONE = [
   ['Column, px', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
   ['Row, px', (mark) => mark.residual?.[1] ?? null, (mark) => number(mark.residual?.[1])],
   ['Ground, m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
-  ['Leave-one-out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
+  ['Left out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
-  ['Method', (mark) => mark.how, (mark) => (hands[mark.how] ?? mark.how)],
+  ['Method', (mark) => mark.how, (mark) => (methods[mark.how] ?? mark.how)],
 ];
 
-const hands = { matched: 'match', manual: 'manual' };
+const methods = { matched: 'match', manual: 'click' };
 const rays = (mark) => Object.values(mark.rays ?? {});
-/** How many rays there are by each method: 2 match, 1 manual. */
+/** How many rays there are by each method: 2 match, 1 click. */
 function counted(mark) {
   const found = {};
-  for (const { how } of rays(mark)) found[hands[how] ?? how] = (found[hands[how] ?? how] ?? 0) + 1;
+  for (const { how } of rays(mark)) found[methods[how] ?? how] = (found[methods[how] ?? how] ?? 0) + 1;
   return Object.entries(found).map(([how, count]) => `${count} ${how}`).join(', ');
 }
 const longest = (of) => { const found = Object.values(of ?? {}).map(length).filter((value) => value !== null); return found.length ? Math.max(...found) : null; };
@@ -31,11 +31,11 @@ const SEVERAL = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
   ['Rays', (mark) => rays(mark).length, counted],
-  ['Residual, px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
-  ['Leave-one-out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
+  ['px', (mark) => longest(mark.residuals), (mark) => number(longest(mark.residuals), 2)],
+  ['Left out, px', (mark) => longest(mark.loo), (mark) => number(longest(mark.loo), 2)],
   ['Plan, m', (mark) => plan(mark.loo_m), (mark) => number(plan(mark.loo_m), 2)],
-  ['Height, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
-  ['± Height, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
+  ['h, m', (mark) => mark.loo_m?.[2] ?? null, (mark) => number(mark.loo_m?.[2], 2)],
+  ['± h, m', (mark) => mark.sigma_m?.[2] ?? null, (mark) => number(mark.sigma_m?.[2], 2)],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
 ];
 

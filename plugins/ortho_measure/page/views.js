@@ -1,6 +1,6 @@
-// Two panes, each with a view by its name: `scene-K` is image K, `reference-K` the reference rendered into its pixels, `map-R`
-// reference R in its own. Panes of one geometry share an OpenLayers view, and so pan and zoom as one; of two, one follows the
-// other by how they lie in each other about the middle. OpenLayers' y goes up: a pixel (column, row) lies at (column, -row).
+// Two panes, each shows a named view: `scene-K` is image K, `reference-K` the reference rendered into its pixels, `map-R`
+// reference R in its own pixels. Panes with the same geometry share an OpenLayers view, so they pan and zoom together. With
+// two geometries, one pane follows the other by their relation at the middle. A pixel (column, row) is at (column, -row) in OpenLayers.
 /* global ol */
 
 const SHAPES = { control: 3, check: 0, tie: 4 };
@@ -9,7 +9,7 @@ const COLOURS = { control: '#ffb000', check: '#35c3ff', tie: '#8be04e' };
 const at = ([column, row]) => [column, -row];
 /** @param {Pair} place */
 export const pixel = ([x, y]) => [x, -y];
-/** Which geometry a view is in. */
+/** The geometry of a view. */
 export const geometryOf = (name) => name.replace(/^reference-/, 'scene-');
 export const PANES = ['scene', 'reference'];
 
@@ -29,7 +29,7 @@ function tiled(name, size, tile, projection) {
   };
 }
 
-/** Dashed is where a point is expected and was not measured. */
+/** Symbol of a point; dashed if it was predicted, not measured. */
 function symbol(mark, selected, expected) {
   const off = mark.off || expected;
   const stroke = new ol.style.Stroke({ color: mark.suspicious ? '#ff3b1f' : COLOURS[mark.role], width: selected ? 4 : 2, lineDash: expected ? [3, 4] : undefined });

@@ -1,9 +1,9 @@
-"""How a browser is let in: by an address that works once, and then by a cookie.
+"""Access of a browser: by an address that works once, and then by a cookie.
 
-The address has a key, which is exchanged for a cookie at its first use. The page is below a folder with a random name,
-and the cookie is for this folder alone: browsers send cookies of a host to all of its ports, and another port may be
-another user's. The command line of a browser is public on its machine, so the browser is given a file to open, which
-only its user can read.
+The address has a key, which is exchanged for a cookie at its first use. The page is in a folder with a random name, and
+the cookie is valid only for this folder: browsers send cookies of a host to all its ports, and another port may belong
+to another user. Every user of a machine can read the command line of a browser, so the browser opens a file that only
+its user can read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LEADING = """<!doctype html>
 <body><p><a href="{address}">Continue to ortho measure</a></p></body>
 </html>
 """
-#: Who comes without the cookie reads this.
+#: Text for requests without the cookie.
 REFUSED = (
     b"This address does not open the page: it was used before, or it has no key.\n"
     b"Use the browser that opened it first, or start 'ortho measure' again for a new address.\n"
@@ -45,7 +45,7 @@ def _secret() -> str:
 
 @dataclass
 class PageEntry:
-    """The way to the page of one server.
+    """Address, key and cookie of one server.
 
     Parameters
     ----------
@@ -59,16 +59,16 @@ class PageEntry:
 
     @property
     def path(self) -> str:
-        """The path that works once, with its query; after that the path of the page."""
+        """The path that works once, with its query; later the path of the page."""
         return f"/{self.folder}/" + (f"?key={self._key}" if self._key else "")
 
     def knows(self, cookies: list[bytes]) -> bool:
-        """Tell whether the ``Cookie`` headers of a request have the cookie."""
+        """Return whether the ``Cookie`` headers of a request have the cookie."""
         mine = _COOKIE + self._cookie.encode()
-        return any(secrets.compare_digest(one.strip(), mine) for header in cookies for one in header.split(b";"))
+        return any(secrets.compare_digest(cookie.strip(), mine) for header in cookies for cookie in header.split(b";"))
 
     def exchange(self, query: bytes) -> bytes | None:
-        """Return the ``Set-Cookie`` header for the query of the address; None where it is wrong or was used."""
+        """Return the ``Set-Cookie`` header for the query of the address; None if it is wrong or was used before."""
         if self._key is None or not secrets.compare_digest(query, b"key=" + self._key.encode()):
             return None
         self._key = None
@@ -78,17 +78,17 @@ class PageEntry:
 def leading_to(address: str) -> str:
     """Return a page that leads to an address.
 
-    A strict cookie is not sent where a file or a foreign page leads. So the first answer is such a page too: from
-    there on the way is within the site.
+    Browsers do not send a strict cookie after a link from a file or a foreign page. So the first answer is such a page
+    too: from there on, links are within the site.
     """
     return _LEADING.format(address=html.escape(address))
 
 
 @contextlib.contextmanager
 def private_file(address: str, points: Path) -> Iterator[Path | None]:
-    """Give a file that leads to an address, as long as the context lasts; None where others could read it.
+    """Provide a file that leads to an address while the context lasts; None if others could read it.
 
-    It is beside the points, because packaged browsers see the user's folders, and neither ``/tmp`` nor hidden ones.
+    It is beside the points, because packaged browsers cannot read ``/tmp`` or hidden folders.
     """
     path = points.with_name(points.name + _ENDING)
     try:

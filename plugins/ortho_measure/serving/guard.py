@@ -1,7 +1,7 @@
-"""The guard before the page: this machine alone, the right host, the cookie, and bodies of a size.
+"""The guard of the page: only this machine, the right host, the cookie, and limited request bodies.
 
-Every request needs the cookie, which the address of `PageEntry` sets once. Pages of other origins cannot use it. A name
-that an attacker points at this machine fails at the Host header.
+Every request needs the cookie, which the address of `PageEntry` sets once. Pages of other origins cannot use it. A host
+name that an attacker points to this machine fails at the Host header.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ HEADERS = (
 
 
 class Guard:
-    """An ASGI application that lets through what may be asked, without the folder of the entry in the path.
+    """An ASGI application that passes on allowed requests, without the folder of the entry in the path.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ class Guard:
         self._app, self._hosts, self._entry, self._admit = app, {host.encode() for host in hosts}, entry, admit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it."""
+        """Pass on a request, or refuse it."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
         if scope["type"] != "http":
-            raise RuntimeError("only HTTP is spoken here")
+            raise RuntimeError("only HTTP is supported")
         headers = _headers(scope)
         status = self._foreign(scope, headers)
         if status:
@@ -88,7 +88,7 @@ class Guard:
         await self._app(inner, _replayed(body, receive), _with_headers(send))
 
     def _foreign(self, scope: Scope, headers: Headers) -> int:
-        """Return a status to refuse what is of another host, origin or folder with, or 0."""
+        """Return the status for refusing another host, origin or folder; 0 for an allowed request."""
         hosts = headers.get(b"host", [])
         if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
             return 421
@@ -111,7 +111,7 @@ def _headers(scope: Scope) -> Headers:
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """Return the body of a request, None where it is too long."""
+    """Return the body of a request; None if it is too long."""
     parts, size, more = [], 0, True
     while more:
         message = await receive()
@@ -126,14 +126,14 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 def _replayed(body: bytes, receive: Receive) -> Receive:
-    """Return what gives a body that was read already once more."""
-    given = False
+    """Return a function that delivers a body that was already read."""
+    delivered = False
 
     async def again() -> MutableMapping[str, Any]:
-        nonlocal given
-        if given:
+        nonlocal delivered
+        if delivered:
             return await receive()
-        given = True
+        delivered = True
         return {"type": "http.request", "body": body, "more_body": False}
 
     return again
@@ -144,7 +144,7 @@ def _with_headers(send: Send) -> Send:
         if message["type"] == "http.response.start":
             own = list(message.get("headers", []))
             named = {name for name, _ in own}
-            message = {**message, "headers": [*own, *(one for one in HEADERS if one[0] not in named)]}
+            message = {**message, "headers": [*own, *(header for header in HEADERS if header[0] not in named)]}
         await send(message)
 
     return sending

@@ -1,7 +1,7 @@
-"""The listening socket of the page: it bounds the number of connections, and the time of those without the cookie.
+"""The listening socket of the page: it limits the number of connections, and the time of those without the cookie.
 
-Every user of this machine can connect. Whoever does not have the cookie must not keep its owner out: neither by
-connections that stay open, nor by so many of them that this process has no descriptor left.
+Every user of this machine can connect. Users without the cookie must not block its owner, neither by connections that
+stay open, nor by so many that this process has no file descriptor left.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class _Connection:
 
 
 class Listener(socket.socket):
-    """A listening socket of this machine alone, for an event loop of asyncio that accepts its connections.
+    """A listening socket for this machine only; an asyncio event loop accepts its connections.
 
-    A connection beyond `most` closes the oldest one that has not shown the cookie. One that has is never closed.
+    A connection beyond `most` closes the oldest one without the cookie. A connection with the cookie is never closed.
 
     Parameters
     ----------
@@ -89,12 +89,12 @@ class Listener(socket.socket):
         return connection, address
 
     def admit(self, address: Any) -> None:
-        """Take note that a request of the connection from an address has the cookie."""
+        """Record that the connection from an address has the cookie."""
         if address in self._connections:
             self._connections[address].known = True
 
     def _watch(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Close connections without the cookie in time, as long as there are any."""
+        """Close connections without the cookie after some time, as long as there are connections."""
         self._forget_closed()
         for address, connection in list(self._connections.items()):
             if not connection.known and loop.time() - connection.since > self._patience:

@@ -1,4 +1,4 @@
-"""The log of the server, whose size does not grow with what others send."""
+"""The log of the server; its size does not grow with the requests of others."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Repeated(logging.Filter):
-    """Let the 1st, 10th, 100th … message of a kind through, with its number."""
+    """Pass the 1st, 10th, 100th … message of a kind, with its number."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Repeated(logging.Filter):
 
 @contextmanager
 def repetitions_counted(*names: str) -> Iterator[None]:
-    """Count repeated messages of loggers as long as the context lasts, instead of writing each."""
+    """Count repeated messages of loggers while the context lasts, instead of writing each."""
     filters = {logging.getLogger(name): Repeated() for name in names}
     for logger, repeated in filters.items():
         logger.addFilter(repeated)

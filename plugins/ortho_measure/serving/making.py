@@ -1,4 +1,4 @@
-"""The ortho of the points as they are, made while one goes on measuring: one at a time."""
+"""Make the ortho of the present points in the background, one at a time."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class Making:
         self._thread: threading.Thread | None = None
 
     def begin(self, number: int = 0) -> dict[str, Any]:
-        """Begin with an image, unless an ortho is being made already, and say how far it is.
+        """Start the ortho of an image, unless one is running, and return its progress.
 
         Raises
         ------
         InputError
-            If there is no such image.
+            If the image is unknown.
         """
         if number >= len(self._session.views):
             raise InputError("unknown image", field="number")
@@ -45,9 +45,9 @@ class Making:
             return self._told
 
     def told(self) -> dict[str, Any]:
-        """Say how far it is: `state` is none, running, done or failed, `share` the finished part of its `stage`.
+        """Return the progress: `state` is none, running, done or failed, `share` the finished part of its `stage`.
 
-        `number` is the image that it is of.
+        `number` is that of the image.
         """
         with self._lock:
             return self._told
@@ -57,14 +57,14 @@ class Making:
         return self._file("html").read_bytes()
 
     def picture(self, which: str) -> bytes:
-        """Return the last ortho as PNG, or the reference on its grid; both have the same size."""
+        """Return the last ortho as PNG, or the reference on the same grid."""
         grid = reduced_grid(grid_of(self._file("ortho")), _SIDE)
         if which == "ortho":
             return preview_png(self._file("ortho"), side=_SIDE)
         pixels = np.zeros((1, grid.height, grid.width), dtype=np.float32)
         valid = np.zeros(pixels.shape, dtype=bool)
         for reference in [sheet.reference for sheet in self._session.sheets]:
-            # GDAL takes a lower resolution from overviews and averages the rest.
+            # GDAL uses overviews for the lower resolution and averages the rest.
             part, good = Regridded(reference.path, grid, resampling="average").read(0, 0, grid.width, grid.height)
             fresh = good.all(axis=0) & ~valid[0]
             pixels[0, fresh] = part.mean(axis=0)[fresh]
@@ -75,32 +75,32 @@ class Making:
 
     def _make(self, number: int) -> None:
         try:
-            made = self._session.ortho(self._advance, number)
+            result = self._session.ortho(self._advance, number)
         except OrthoError as error:
             self._tell({"state": "failed", "share": 0.0, "error": f"{error.message} ({error.remedy})"})
-        except Exception as error:  # the page would wait for ever
+        except Exception as error:  # otherwise the page would wait forever
             self._tell({"state": "failed", "share": 0.0, "error": f"{type(error).__name__}: {error}"})
             raise
         else:
-            headline = made.document["report"]["headline"]
+            headline = result.document["report"]["headline"]
             with self._lock:
-                self._files = dict(made.files)
+                self._files = dict(result.files)
             self._tell(
                 {
                     "state": "done",
                     "share": 1.0,
                     "figure": headline["figure"],
                     "what": headline["what"],
-                    "files": [str(path) for path in made.files.values()],
+                    "files": [str(path) for path in result.files.values()],
                 }
             )
 
     def _advance(self, stage: str, share: float) -> None:
         self._tell({"state": "running", "stage": stage, "share": float(share)})
 
-    def _tell(self, told: dict[str, Any]) -> None:
+    def _tell(self, progress: dict[str, Any]) -> None:
         with self._lock:
-            self._told = {"number": self._told["number"], **told}
+            self._told = {"number": self._told["number"], **progress}
 
     def _file(self, name: str) -> Path:
         with self._lock:

@@ -1,6 +1,6 @@
-"""The server of the page: starlette behind the guard, on this machine alone.
+"""The server of the page: starlette behind the guard, for this machine only.
 
-What the page may load is a fixed table, read when the server begins: no path of a request is ever opened.
+The page can load only a fixed table of files, read at the start of the server: it never opens a path of a request.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
 
-#: What the page is made of: name -> media type.
+#: The files of the page: name -> media type.
 PAGE = {
     "index.html": "text/html; charset=utf-8",
     "style.css": "text/css; charset=utf-8",
@@ -49,28 +49,28 @@ _REMEDY = "reload the page"
 
 
 class Windows:
-    """Which window of the browser writes: the first one, until another takes over."""
+    """Which browser window can write: the first one, until another takes over."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._writer: str | None = None
 
     def claim(self, window: str, *, take: bool = False) -> bool:
-        """Return whether a window writes now; `take` makes it so."""
+        """Return whether a window can write; with `take`, it takes over."""
         with self._lock:
             if self._writer is None or take:
                 self._writer = window
             return self._writer == window
 
     def leave(self, window: str) -> None:
-        """Let the next window write, if it was this one."""
+        """Release the right to write, if this window has it."""
         with self._lock:
             if self._writer == window:
                 self._writer = None
 
 
 class _Answers:
-    """What is answered to each request; methods of the same names as paths."""
+    """The answers to requests; methods have the names of the paths."""
 
     def __init__(self, session: Project, tiles: TileServer) -> None:
         self._session, self._tiles, self._windows = session, tiles, Windows()
@@ -83,14 +83,14 @@ class _Answers:
         Raises
         ------
         InputError
-            If there are several.
+            If there are several scenes.
         """
         if not isinstance(self._session, Session):
             raise InputError("this request is for a single scene", field="request", remedy=_REMEDY)
         return self._session
 
     def begin(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Say what does not change: sizes, names, bands."""
+        """Return what does not change: sizes, names, bands."""
         session = self._session
         writes = not session.journal.read_only and self._windows.claim(_window(given), take=bool(given.get("take")))
         return {
@@ -109,12 +109,12 @@ class _Answers:
         }
 
     def leave(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Take note that a window is closed."""
+        """Record that a window was closed."""
         self._windows.leave(_window(given))
         return {}
 
     def act(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Do an action; a window that does not write is refused."""
+        """Apply an action; only for the window that can write."""
         self._require_writer(given)
         action = given.get("action")
         if not isinstance(action, dict):
@@ -122,18 +122,18 @@ class _Answers:
         return self._session.act(action)
 
     def state(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Return all that changes."""
+        """Return everything that changes."""
         return self._session.state()
 
     def predict(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Say where a place lies in all views."""
+        """Return the positions of a place in all views."""
         version = _whole(given.get("version", 0))
         if given.get("ground") is not None:
             return self._session.predict(version, ground=_numbers(given["ground"], 3))
         return self._session.predict(version, str(given.get("at")), _numbers(given.get("place"), 2))
 
     def link(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Say how one view lies in another."""
+        """Return the relation of one view to another."""
         version, place = _whole(given.get("version", 0)), _numbers(given.get("place"), 2)
         return self._session.link(version, str(given.get("at")), place, str(given.get("to")))
 
@@ -147,7 +147,7 @@ class _Answers:
         )
 
     def tie(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Match a click in one of several images, or a ground, in all of them."""
+        """Match a click in one of several images, or ground, in all images."""
         session, known = self._session, given.get("known") or {}
         if not isinstance(session, BlockSession) or not isinstance(known, dict):
             raise InputError("this request is for several images", field="request", remedy=_REMEDY)
@@ -160,7 +160,7 @@ class _Answers:
         return session.proposal(number, _numbers(given.get("image"), 2), places)
 
     def typed(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Understand typed coordinates."""
+        """Return entered coordinates as ground."""
         values = given.get("values")
         if not isinstance(values, list) or len(values) != 3:
             raise InputError("enter x and y; the height is optional", field="values")
@@ -171,7 +171,7 @@ class _Answers:
         }
 
     def stretch(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Return what is black and white, for each band."""
+        """Return the values of black and white for each band."""
         pane, box = str(given.get("pane")), given.get("box")
         if pane not in self._tiles.bands:
             raise InputError("unknown view", field="pane")
@@ -180,7 +180,7 @@ class _Answers:
         return {"limits": [self._tiles.limits(pane, version, where, self._band(pane, band)) for band in bands]}
 
     def compare(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Compare the models that the points could be fitted with."""
+        """Compare models on the points."""
         return self._session.compared()
 
     def save(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -189,12 +189,12 @@ class _Answers:
         return {}
 
     def make(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Begin to make the ortho of an image."""
+        """Start the ortho of an image."""
         self._require_writer(given)
         return self.making.begin(_whole(given.get("number", 0)))
 
     def made(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Say how far the ortho is."""
+        """Return the progress of the ortho."""
         return self.making.told()
 
     def _require_writer(self, given: dict[str, Any]) -> None:
@@ -232,7 +232,7 @@ def application(
 
 
 class _Given:
-    """What a request is given: parts of the page, tiles, answers, and what was made; work is done by threads."""
+    """The responses: files of the page, tiles, answers, and results; threads do the work."""
 
     def __init__(self, session: Project, tiles: TileServer) -> None:
         self._session, self._tiles, self._answers = session, tiles, _Answers(session, tiles)
@@ -244,7 +244,7 @@ class _Given:
         return await asyncio.get_running_loop().run_in_executor(self._workers, work, *given)
 
     async def page(self, request: Request) -> Response:
-        """Give a part of the page."""
+        """Return a file of the page."""
         from starlette.responses import Response
 
         name = request.path_params.get("name", "index.html")
@@ -253,7 +253,7 @@ class _Given:
         return Response(self._files[name], media_type=PAGE[name], headers={"cache-control": "no-cache"})
 
     async def tile(self, request: Request) -> Response:
-        """Give a tile."""
+        """Return a tile."""
         from starlette.responses import JSONResponse, Response
 
         try:
@@ -261,11 +261,11 @@ class _Given:
             made = await self._run(lambda: self._tiles.png(*given))
         except OrthoError as error:
             return JSONResponse(_told(error), 400)
-        # The address names all that the pixels depend on.
+        # The address contains everything that the pixels depend on.
         return Response(made, media_type="image/png", headers={"cache-control": "private, max-age=86400, immutable"})
 
     async def outcome(self, request: Request) -> Response:
-        """Give the report of the ortho that was made, or a picture of it."""
+        """Return the report of the ortho, or a picture of it."""
         from starlette.responses import JSONResponse, Response
 
         which, own = request.path_params["which"], {"cache-control": "no-store"}
@@ -281,7 +281,7 @@ class _Given:
             return JSONResponse(_told(error), 400)
 
     async def answer(self, request: Request) -> Response:
-        """Answer what the page asks."""
+        """Answer a request of the page."""
         from starlette.responses import JSONResponse, Response
 
         what = request.path_params["what"]
@@ -298,7 +298,7 @@ class _Given:
         return JSONResponse(done, headers={"cache-control": "no-store"})
 
 
-#: What the page may ask: methods of `_Answers`.
+#: Allowed requests: methods of `_Answers`.
 ASKED = (
     "begin",
     "leave",
@@ -318,14 +318,14 @@ ASKED = (
 
 
 def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], port: int = 0) -> None:
-    """Serve the page of a session until the process is asked to end.
+    """Serve the page of a session until the process is stopped.
 
     Parameters
     ----------
     ready : callable
-        Gets the address once it is answered there. The address works once.
+        Called with the address when the server is ready. The address works once.
     port : int
-        0 is any that is free.
+        0 means any free port.
     """
     import uvicorn
 
@@ -334,7 +334,7 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     hosts = {f"{LOOPBACK}:{number}", f"localhost:{number}"}
     limit_cache(OutputOptions.memory, os.cpu_count() or 1)
     app = application(session, entry, hosts, opened, listener.admit)
-    # h11 limits the size of headers. The listener is told the true address of a client, whatever headers claim.
+    # h11 limits the size of headers. The listener gets the true address of a client, whatever headers state.
     config = uvicorn.Config(
         app,
         loop="asyncio",
@@ -351,7 +351,7 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
     )
     try:
         ready(f"http://{LOOPBACK}:{number}{entry.path}")
-        # Ctrl-C is how this command ends.
+        # Ctrl-C ends this command normally.
         with contextlib.suppress(KeyboardInterrupt), repetitions_counted("uvicorn.error", "asyncio"):
             uvicorn.Server(config).run([listener])
     finally:
@@ -359,19 +359,19 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
         session.close()
 
 
-# -- what requests say -----------------------------------------------------------------------------------------------
+# -- contents of requests --------------------------------------------------------------------------------------------
 
 
 def _asked(body: bytes) -> dict[str, Any]:
-    given = parse_json(body or b"{}", "request", _REMEDY)
-    if not isinstance(given, dict):
+    document = parse_json(body or b"{}", "request", _REMEDY)
+    if not isinstance(document, dict):
         raise InputError("a request must be a JSON object", remedy=_REMEDY)
     try:
-        json.dumps(given, ensure_ascii=False).encode()
+        json.dumps(document, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
-        # JSON can name halves of a character. They are in no file and in no answer.
+        # JSON can contain unpaired surrogates, which files and answers cannot.
         raise InputError("this request has text that is not Unicode", field="request", remedy=_REMEDY) from error
-    return given
+    return document
 
 
 def _tile(request: Request) -> tuple[Any, ...]:
@@ -396,10 +396,10 @@ def _tile(request: Request) -> tuple[Any, ...]:
 
 
 def _bands(values: Any) -> list[int]:
-    found = [_whole(value) for value in values] if isinstance(values, list) else []
-    if len(found) not in (1, 3):
+    bands = [_whole(value) for value in values] if isinstance(values, list) else []
+    if len(bands) not in (1, 3):
         raise InputError("choose one band (grey) or three (colour)", field="bands")
-    return found
+    return bands
 
 
 def _whole(value: Any) -> int:
@@ -409,7 +409,7 @@ def _whole(value: Any) -> int:
 
 
 def _numbers(values: Any, count: int) -> list[float]:
-    """Return so many finite numbers of a request."""
+    """Return a list of this many finite numbers from a request."""
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
         raise InputError(f"this must be a list of {count} numbers", field="request", remedy=_REMEDY)
     for value in values:
@@ -435,5 +435,5 @@ def _window(given: dict[str, Any]) -> str:
 
 
 def _told(error: OrthoError) -> dict[str, Any]:
-    """Return what the page shows of an error: no path of this machine is in it."""
+    """Return an error for the page, without paths of this machine."""
     return {"error": {"message": error.message, "field": error.field, "remedy": error.remedy}}

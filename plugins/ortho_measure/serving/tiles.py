@@ -1,4 +1,4 @@
-"""Tiles: scenes, what is rendered into their pixels, and maps: PNG of any reduction, made when asked for."""
+"""Tiles of scenes, rendered references and maps: PNG at any reduction, made on request."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ortho_pipeline.raster.source import RasterSource
 
 #: Side of a tile (px).
 SIDE = 256
-#: Pixels of the scene in one of a tile: whole powers of two up to this.
+#: Largest number of scene pixels per tile pixel; factors are powers of two.
 MOST = 1 << 16
 
 Pixels = NDArray[np.float32]
@@ -33,7 +33,7 @@ class TileServer:
     Parameters
     ----------
     memory : int
-        Bytes of pixels that are kept.
+        Size of the cache of pixels (bytes).
     """
 
     def __init__(self, project: Project, opened: SceneOptions = SceneOptions(), memory: int = 256_000_000) -> None:
@@ -62,18 +62,18 @@ class TileServer:
         bands: Sequence[int],
         limits: Sequence[tuple[float, float]],
     ) -> bytes:
-        """Return a tile as PNG, transparent where nothing is shown.
+        """Return a tile as PNG, transparent where there are no data.
 
         Parameters
         ----------
         factor : int
-            Pixels of the scene in one of the tile.
+            Pixels of the scene per pixel of the tile.
         column, row : int
-            Of the tile among those of this factor.
+            Position of the tile among those of this factor.
         bands : sequence of int
-            One shown in grey, or three in colours; 0 is the mean of all.
+            One band (grey) or three (colour); 0 is the mean of all.
         limits : sequence of (float, float)
-            What is black and what is white, for each band.
+            Values of black and white for each band.
         """
         planes = [
             self.pixels(name, version, factor, column * SIDE * factor, row * SIDE * factor, band) for band in bands
@@ -83,7 +83,7 @@ class TileServer:
         return png_bytes(np.stack([*shown, np.where(valid, 255, 0).astype(np.uint8)]))
 
     def limits(self, name: str, version: int, box: Sequence[float] | None, band: int) -> tuple[float, float]:
-        """Return what is black and what is white: percentiles 1 and 99 of the raster, or of a box of the view.
+        """Return the values of black and white: percentiles 1 and 99 of the raster, or of a box of the view.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class TileServer:
         return stretch(plane[:rows, :columns]) or self._pyramids(name, band)[0].stretch()
 
     def pixels(self, name: str, version: int, factor: int, left: int, top: int, band: int) -> Pixels:
-        """Return the intensities ``(SIDE, SIDE)`` of a square of the scene's pixels; NaN where nothing is shown."""
+        """Return the intensities ``(SIDE, SIDE)`` of a square of the scene's pixels; NaN without data."""
         if (
             name not in self.bands
             or not 0 <= band <= self.bands[name]
@@ -116,21 +116,21 @@ class TileServer:
                 return self._kept[key]
         pyramids = self._pyramids(name, band)
         if places is None:
-            made = pyramids[0].read(left, top, SIDE, SIDE, factor)
+            values = pyramids[0].read(left, top, SIDE, SIDE, factor)
         else:
             shown = [
                 replace(target, intensity=pyramid)  # type: ignore[type-var]  # all of them are dataclasses
                 for target, pyramid in zip(places.references, pyramids, strict=True)
             ]
-            made = Renderer(places.view, shown, np.array([[left, top]]), SIDE, factor).render(np.array([0]))[0]
+            values = Renderer(places.view, shown, np.array([[left, top]]), SIDE, factor).render(np.array([0]))[0]
         with self._lock:
-            self._kept[key] = made
+            self._kept[key] = values
             while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
-        return made
+        return values
 
     def _pyramids(self, name: str, band: int) -> list[Pyramid]:
-        """Return the rasters of a view, opened when they are first asked for."""
+        """Return the rasters of a view, opened on first use."""
         with self._lock:
             for one in self._shown[name]:
                 if (one, band) not in self._open:
@@ -140,6 +140,6 @@ class TileServer:
 
 
 def _shade(plane: Pixels, low: float, high: float) -> NDArray[np.uint8]:
-    with np.errstate(over="ignore"):  # black and white may be one value
+    with np.errstate(over="ignore"):  # black and white may have the same value
         scaled = np.clip((plane - low) * (255.0 / max(high - low, 1e-30)), 0.0, 255.0)
     return np.nan_to_num(scaled).astype(np.uint8)

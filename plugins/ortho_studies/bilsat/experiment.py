@@ -1,8 +1,8 @@
-"""Tables 3, 4 and 5 of Ok and Turker on simulated BILSAT-1 scenes: the paper's numbers beside ours.
+"""Tables 3, 4 and 5 of Ok and Turker on simulated BILSAT-1 scenes, compared with the paper.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 44 places, which
-the paper does not tell, the noise of the points, and the error of the ephemeris. `KNOBS` lists all settings, and the
-rows that they were fitted to: rows with all 44 points, in which there is nothing to select.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 44 positions
+(which the paper does not state), the noise of the points, and the error of the ephemeris. `KNOBS` lists all settings,
+and the rows to which they were fitted: rows with all 44 points, which need no selection.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ KNOBS = (
         SIGMA_IMAGE,
         "px per axis",
         "fitted",
-        "Noise of pointing: that of the paper's images and people, which nobody has published elsewhere. 0.5 px, which "
-        "is customary, would leave 0.71 px of the 0.99.",
+        "Pointing noise of the paper's images and operators, which is not published elsewhere. The usual 0.5 px "
+        "would explain only 0.71 of the 0.99 px.",
         ("3|rigorous even:44|*",),
     ),
     Knob(
@@ -68,7 +68,7 @@ KNOBS = (
         OFF_NADIR_DEG,
         "degrees",
         "fitted",
-        "Tilt across the track. The satellite can be turned by 30 degrees; the paper does not say how far it was.",
+        "Tilt across the track. The satellite can tilt by up to 30 degrees; the paper does not state the angle.",
         ("5|poly1 even:44|*",),
     ),
     Knob(
@@ -76,7 +76,7 @@ KNOBS = (
         ROUGHNESS,
         "",
         "fitted",
-        "How much the plains roll: what the models without heights leave over the relief.",
+        "Height variation of the plains, from the errors of the models without heights.",
         ("5|poly2 even:44|*", "5|poly3 even:44|*", "5|projective even:44|*"),
     ),
     Knob(
@@ -84,8 +84,8 @@ KNOBS = (
         RIDGE,
         "",
         "fitted",
-        "Weight of Tikhonov's regularisation, which the paper has for these two models and does not state; in steps "
-        "of a factor 3.",
+        "Weight of the Tikhonov regularisation of these two models, which the paper does not state; tried in "
+        "steps of a factor of 3.",
         ("5|rfm2 even:44|*", "5|rfm3 even:44|*"),
     ),
     Knob(
@@ -93,38 +93,38 @@ KNOBS = (
         "plains, one range of mountains in the east, 700 to 1900 m",
         "",
         "chosen",
-        "The heights and the mountains in the east are the paper's. Of four shapes that fit the rows with 44 points "
-        "this one was taken in sight of all rows: with the others 80 to 85 % of all rows were within 1.5, with this 85 "
-        "%, so that up to five points of a hundred are owed to the choice.",
+        "The heights and the mountains in the east are from the paper. Four shapes fit the rows with 44 points; "
+        "this one was chosen with knowledge of all rows. With the others, 80 to 85 % of all rows were within "
+        "1.5, with this one 85 %. So the choice may explain up to 5 %.",
     ),
     Knob(
         "PLACES",
         PLACES,
         "places in a cell",
         "chosen",
-        "Of so many places in each cell the lowest is measured, for road crossings lie in plains and valleys. With one "
-        "place three predictions in a hundred fewer are within 1.5; with six as many.",
+        "The lowest of this many places in each cell is measured, because road crossings are in plains and "
+        "valleys. With one place, 3 % fewer predictions are within 1.5; with six, the same number.",
     ),
     Knob(
         "SIGMA_GROUND",
         SIGMA_GROUND,
         "m per axis",
         "paper",
-        "Better than 1 m in planimetry and elevation; a fortieth of a pixel, so that it decides nothing.",
+        "Better than 1 m in planimetry and elevation. This is a fortieth of a pixel, so it has no influence.",
     ),
     Knob(
         "SIGMA_POSITION",
         SIGMA_POSITION,
         "m per axis",
         "chosen",
-        "Error of the ephemeris, from which the rigorous model starts; it decides nothing, for position and attitude "
-        "are adjusted without weights, as in the paper.",
+        "Error of the ephemeris, from which the rigorous model starts. It has no influence, because position "
+        "and attitude are adjusted without weights, as in the paper.",
     ),
 )
 NAIVE = (
-    "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for the check "
-    "points, for p unknowns and k points. It knows the noise of each model from the paper, which the simulation has to "
-    "predict, and nothing of geometry."
+    "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for "
+    "the check points, for p unknowns and k points. It uses the noise of each model from the paper, which the "
+    "simulation must predict, and no geometry."
 )
 
 
@@ -213,7 +213,7 @@ def reproduce(
     dict
         As `tables.make_document` makes it.
     """
-    found = np.full((len(rows), realisations, len(QUANTITIES)), np.nan)
+    values = np.full((len(rows), realisations, len(QUANTITIES)), np.nan)
     vectors = np.full((realisations, 2), np.nan)
     for seed in range(realisations):
         scene = BilsatScene.make(off_nadir_deg, seed=seed)
@@ -221,16 +221,16 @@ def reproduce(
         position = geodetic(np.array([scene.survey(seed).position]))[0]
         for index, row in enumerate(rows):
             result = _fit(row, points, position)
-            found[index, seed] = _numbers(result)
+            values[index, seed] = _numbers(result)
             if (row.model, row.selection) == (RIGOROUS, f"even:{len(points)}") and result is not None:
                 vectors[seed] = _vector_statistics(points.image, result.residuals)
         if progress:
             progress((seed + 1) / realisations)
-    asked = [(row, k) for row in rows for k, number in enumerate(row.paper) if number is not None]
+    numbers = [(row, k) for row in rows for k, number in enumerate(row.paper) if number is not None]
     medians = {
         (row.label, QUANTITIES[k]): float(np.median(kept))
-        for row, k in asked
-        for kept in [found[rows.index(row), :, k][np.isfinite(found[rows.index(row), :, k])]]
+        for row, k in numbers
+        for kept in [values[rows.index(row), :, k][np.isfinite(values[rows.index(row), :, k])]]
         if len(kept)
     }
     seen = np.isfinite(vectors).any()
@@ -244,8 +244,8 @@ def reproduce(
         ),
         knobs=KNOBS,
         naive_text=NAIVE,
-        numbers=[Number(row.table, row.label, QUANTITIES[k], "px", row.paper[k], naive(row, k)) for row, k in asked],
-        found=np.stack([found[rows.index(row), :, k] for row, k in asked], axis=1),
+        numbers=[Number(row.table, row.label, QUANTITIES[k], "px", row.paper[k], naive(row, k)) for row, k in numbers],
+        found=np.stack([values[rows.index(row), :, k] for row, k in numbers], axis=1),
         titles=TITLES,
         statements=statements(medians, Vectors(*np.nanmedian(vectors, axis=0).tolist()) if seen else None),
     )

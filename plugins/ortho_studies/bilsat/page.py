@@ -14,46 +14,46 @@ from ortho_studies.simulation.page import Figure, Reason
 REASONS = (
     Reason(
         "rigorous cluster",
-        "The paper does not say where its three groups lay. Ours are the points nearest to three corners; the error "
-        "elsewhere depends on how small and how oblong the group is. A residual of 0.04 px from four points (eight "
-        "measurements, six unknowns) with noise of 0.7 px is chance.",
+        "The paper does not state the positions of its three groups. Ours are the points nearest to three "
+        "corners; the error elsewhere depends on the size and shape of the group. A residual of 0.04 px from "
+        "four points (eight measurements, six unknowns) with noise of 0.7 px is chance.",
     ),
     Reason(
         "projective even:9",
-        "The paper's nine points would bear 74 % of the squared residuals that all 44 have in its last row (9 x 2.37² "
-        "of 44 x 1.25²), and have twice the residuals of its 20 points. A least-squares fit to nine points of that "
-        "quality does not come out so; something in this row seems to have gone wrong.",
+        "The paper's nine points would have 74 % of the squared residuals of all 44 points in its last row (9 x "
+        "2.37² of 44 x 1.25²), and twice the residuals of its 20 points. A least-squares fit to nine points of "
+        "that quality cannot give this; the row seems to be wrong.",
     ),
     Reason(
         "rigorous even",
-        "With four points there are eight measurements for six unknowns, with eight points sixteen: one draw of the "
-        "noise, as the paper has it, says little about so few that are left over.",
+        "Four points give eight measurements for six unknowns, eight points give sixteen. With so little "
+        "redundancy, a single draw of the noise, as in the paper, has little meaning.",
     ),
     Reason(
         "poly1 even:4",
-        "Three unknowns per axis from four points: the residual per axis has one degree of freedom, and the error of "
-        "the check points is a systematic one of several pixels, so it depends on where the four points lay.",
+        "Three unknowns per axis from four points: the residual per axis has one degree of freedom. The check "
+        "points have a systematic error of several pixels, which depends on the positions of the four points.",
     ),
     Reason(
         "poly3 even:11",
-        "Ten unknowns per axis from eleven points: one degree of freedom is left over, and where the eleven points lay "
-        "decides how far cubic terms run away at the rim.",
+        "Ten unknowns per axis from eleven points: one degree of freedom. The positions of the eleven points "
+        "decide how large the cubic terms become at the edge.",
     ),
     Reason(
         "poly2 even:20",
-        "The paper's own 44 points (0.66 px) let one expect 0.55 px from twenty of them, as ours have, not 0.38 px; "
-        "which twenty were taken decides.",
+        "From the paper's own 44 points (0.66 px) we expect 0.55 px for twenty of them, as ours have, not 0.38 "
+        "px. It depends on which twenty were used.",
     ),
     Reason("poly2 even:7", "Six unknowns per axis from seven points: one degree of freedom per axis."),
     Reason(
         "rfm1 even:8",
-        "Fourteen unknowns from sixteen measurements, those of height from eight heights: one draw says little, and "
-        "the check points depend on which heights were among the eight.",
+        "Fourteen unknowns from sixteen measurements, and those of height from eight heights. A single draw has "
+        "little meaning, and the check points depend on the eight heights.",
     ),
     Reason(
         "rfm",
-        "The paper states neither weight nor form of its regularisation. Ours draws higher terms to zero more strongly "
-        "than lower ones; where there are about as many unknowns as measurements, that decides. (The paper's 0.95 of "
+        "The paper states neither weight nor form of its regularisation. Ours penalises higher terms more than "
+        "lower ones. With about as many unknowns as measurements, this decides the result. (The paper's 0.95 of "
         "rfm2 with 32 points does not agree with its 0.49 and 0.44, which give 0.66.)",
     ),
 )

@@ -35,12 +35,12 @@ class Vectors:
 
 def statements(medians: Medians, vectors: Vectors | None = None) -> list[Statement]:
     """Return the statements whose rows were computed."""
-    found = []
+    checked = []
     for text, labels, test, excuse in _STATEMENTS:
         if all((label, quantity) in medians for label, quantity in labels):
             holds, detail = test({key: medians[key] for key in labels})
-            found.append(Statement(text, holds, detail, **excuse))
-    return found + ([] if vectors is None else _of_vectors(vectors))
+            checked.append(Statement(text, holds, detail, **excuse))
+    return checked + ([] if vectors is None else _of_vectors(vectors))
 
 
 def _of_vectors(vectors: Vectors) -> list[Statement]:
@@ -49,15 +49,15 @@ def _of_vectors(vectors: Vectors) -> list[Statement]:
             "The error vectors of the rigorous model with 44 points are completely random.",
             abs(vectors.neighbours) < 0.1,
             f"correlation of nearest neighbours {vectors.neighbours:+.2f}",
-            "The noise that we draw is random, and our lens has no distortion that could show.",
+            "Our noise is random, and our lens has no visible distortion.",
             by_settings=True,
         ),
         Statement(
             "Points that lie apart have larger errors than those that are close to each other.",
             vectors.isolation > 0.1,
             f"rank correlation of error and distance of the nearest neighbour {vectors.isolation:+.2f}",
-            "Our points are spread over cells of one size and are all measured alike; the paper's lonely points may "
-            "have been the ones that are hard to see.",
+            "Our points are spread over cells of equal size, and all have the same noise. In the paper, "
+            "isolated points may have been harder to see.",
         ),
     ]
 
@@ -130,16 +130,16 @@ _STATEMENTS: Sequence[tuple[str, tuple[tuple[str, str], ...], _Test, dict[str, A
         (*_checks("rigorous even:4", "rigorous even:12", *_GROUPS), *_controls(*_GROUPS)),
         _clusters,
         {
-            "why": "How far the error grows depends on how small and how oblong a group is. Five of ours are clearly "
-            "worse than evenly distributed points, one with twelve is 1.3 times as bad; the paper's six are 1.5 to "
-            "5.6 times."
+            "why": "The error depends on the size and shape of a group. Five of our groups are clearly worse "
+            "than evenly distributed points; one with twelve points is 1.3 times as bad. In the paper all six "
+            "are 1.5 to 5.6 times as bad."
         },
     ),
     (
         "With 12 of them the check points have around 3 px at most.",
         _checks(*_GROUPS[3:]),
         lambda values: (max(_each(values)) <= 3.0, _listed(values)),
-        {"why": "Ours are the twelve points nearest to a corner; how small the paper's groups were it does not say."},
+        {"why": "Ours are the twelve points nearest to a corner; the paper does not state the size of its groups."},
     ),
     (
         "The first-order polynomial is the worst of the simple models.",
@@ -174,7 +174,7 @@ _STATEMENTS: Sequence[tuple[str, tuple[tuple[str, str], ...], _Test, dict[str, A
         "With 32 points the rational function of the second order is so, too.",
         _checks("rfm2 even:32", "dlt even:20"),
         lambda values: (max(_each(values)) / min(_each(values)) < SIMILAR, _listed(values)),
-        {"why": "It rests on twelve check points and on a regularisation that the paper does not state."},
+        {"why": "It depends on twelve check points, and on a regularisation that the paper does not state."},
     ),
     (
         "The rational function of the third order fits its control points best.",
@@ -192,8 +192,8 @@ _STATEMENTS: Sequence[tuple[str, tuple[tuple[str, str], ...], _Test, dict[str, A
             f"with 20 points {min(_each(values)[3:]):.2f} to {max(_each(values)[3:]):.2f} px",
         ),
         {
-            "why": "Nor is it so in the paper's own tables: 1.67 to 2.78 px, where five of its six simple models have "
-            "1.11 to 1.43 px with 20 points."
+            "why": "The paper's own tables do not show this either: 1.67 to 2.78 px, while five of its six "
+            "simple models have 1.11 to 1.43 px with 20 points."
         },
     ),
 )

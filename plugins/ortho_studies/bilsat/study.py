@@ -48,8 +48,10 @@ STUDY = Study(
     simulate,
     reproduce,
     (
-        StudyOption("off_nadir", "Tilt  [default: that of 'reproduce bilsat']", low=0, high=30, unit="DEG"),
-        StudyOption("size", "Columns and rows; fewer are larger  [default: 2048]", int, unit="PX"),
-        StudyOption("all_cameras", "An image of each of the four XS cameras, not of the red one.", bool, flag="--xs"),
+        StudyOption("off_nadir", "Off-nadir angle  [default: that of 'reproduce bilsat']", low=0, high=30, unit="DEG"),
+        StudyOption("size", "Columns and rows; fewer means larger pixels  [default: 2048]", int, unit="PX"),
+        StudyOption(
+            "all_cameras", "Write an image of each of the four XS cameras, not only of the red one.", bool, flag="--xs"
+        ),
     ),
 )

@@ -253,7 +253,7 @@ class BilsatScene:
         People measure road crossings, which lie in plains and valleys: of some places in each cell, the lowest.
         """
         if points < 4:
-            raise InputError("a scene has at least 4 points", field="points")
+            raise InputError("a scene needs at least 4 points", field="points")
         camera, hills = Snapshot.over_ankara(off_nadir_deg, size=size), BilsatTerrain()
         random = np.random.default_rng(seed)
         image = np.stack([_spread(points, size, random) for _ in range(PLACES)])

@@ -1,9 +1,9 @@
-"""Tables 2 to 6 of Willneff et al. on simulated CARTOSAT-1 stereo pairs: the paper's numbers beside ours.
+"""Tables 2 to 6 of Willneff et al. on simulated CARTOSAT-1 stereo pairs, compared with the paper.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the places of the
-69 points and the noise of their measurement; orbit, cameras, terrain and the vendor's RPCs stay. As in the paper, image
-points have 0.5 px and control 0.3 m a priori, check points are ties, and one stochastic model serves all. `KNOBS` lists
-all settings, and the rows that they were fitted to.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the positions of
+the 69 points and their measurement noise; orbit, cameras, terrain and the vendor's RPCs are fixed. As in the paper,
+image points have 0.5 px and control points 0.3 m a priori, check points are ties, and one stochastic model serves all.
+`KNOBS` lists all settings, and the rows to which they were fitted.
 """
 
 from __future__ import annotations
@@ -187,8 +187,8 @@ KNOBS = (
         simulated.SIGMA_COLUMN,
         "px",
         "fitted",
-        "Noise in the columns of each image, from s0 with few control points, where nearly all redundancy is the "
-        "parallax across the track.",
+        "Noise in the columns of each image, from s0 with few control points: there, nearly all redundancy is "
+        "the parallax across the track.",
         ("5|s0 of *|s0",),
     ),
     Knob(
@@ -196,7 +196,7 @@ KNOBS = (
         simulated.SIGMA_ROW,
         "px",
         "fitted",
-        "Noise in the rows: what the affine correction leaves in the rows, and the height.",
+        "Noise in the rows, from the residuals of the affine correction in rows and height.",
         ("4|RPC affine|fore y", "4|RPC affine|aft y", "4|RPC affine|Z"),
     ),
     Knob(
@@ -204,8 +204,9 @@ KNOBS = (
         list(simulated.SIGMA_GROUND),
         "m (east, north, up)",
         "fitted",
-        "Noise on the ground, the same for both images (a roundabout's centre is not where it seems), from what the "
-        "affine correction leaves in X and Y. The height has the paper's 0.3 m of its control.",
+        "Noise on the ground, the same for both images (the visible centre of a roundabout is not the surveyed "
+        "one), from the residuals of the affine correction in X and Y. The height has 0.3 m, as the control "
+        "points of the paper.",
         ("4|RPC affine|X", "4|RPC affine|Y"),
     ),
     Knob(
@@ -213,8 +214,8 @@ KNOBS = (
         {view: [bias.col, bias.row] for view, bias in simulated.BIASES.items()},
         "px (column, row)",
         "fitted",
-        "What the original RPCs are off by. Their sizes are table 3's; the signs were chosen so that X, Y and Z have "
-        "the paper's signs; that these have the paper's sizes is the geometry of the orbit.",
+        "Errors of the original RPCs. Their sizes are from table 3; the signs were chosen so that X, Y and Z "
+        "have the signs of the paper. The sizes of X, Y and Z follow from the geometry of the orbit.",
         ("3|original RPC|fore ?", "3|original RPC|aft ?"),
     ),
     Knob(
@@ -222,7 +223,7 @@ KNOBS = (
         {view: [bias.row_per_col, bias.row_per_row] for view, bias in simulated.BIASES.items()},
         "px of rows per px of columns, of rows",
         "fitted",
-        "How the bias changes over the image: what shift, drift and affine leave in the rows.",
+        "Change of the bias over the image, from the residuals of shift, drift and affine in the rows.",
         ("4|RPC *|fore y", "4|RPC *|aft y"),
     ),
     Knob(
@@ -230,8 +231,8 @@ KNOBS = (
         simulated.CELLS,
         "places for each point",
         "fitted",
-        "How low the points lie: of so many places the lowest are measured, since roundabouts lie where people live. "
-        "It shows in the columns of the 3D affine model, whose parallel rays miss what height does to either side.",
+        "The lowest of this many places are measured, because roundabouts are in settlements. It affects the "
+        "columns of the 3D affine model, whose parallel rays ignore the effect of height towards the sides.",
         ("2|affine3d UTM|fore x", "2|affine3d UTM|aft x"),
     ),
     Knob(
@@ -239,7 +240,8 @@ KNOBS = (
         "nearest to the middle of the field",
         "",
         "fitted",
-        "The paper does not say where it lay. Its RMS with one point is that with nine; one at the rim gives 1.35 px.",
+        "The paper does not state its position. Its RMS with one point equals that with nine; a point at the "
+        "edge gives 1.35 px.",
         ("5|RPC shift, 1 GCP|fore y",),
     ),
     Knob(
@@ -247,8 +249,9 @@ KNOBS = (
         SIGMA_RADIUS,
         "m",
         "fitted",
-        "Sigma of the flying height, a soft constraint of the pushbroom, which the paper does not state: the metadata "
-        "said 638 km of a satellite at 618 km. The usual 5 km give the same RMS to 8 %, but an s0 of 0.74.",
+        "Sigma of the flying height, a soft constraint of the pushbroom, which the paper does not state: the "
+        "metadata have 638 km for a satellite at 618 km. The usual 5 km give the same RMS within 8 %, but an s0 "
+        "of 0.74.",
         ("6|s0 of pushbroom, 9 GCPs|s0",),
     ),
     Knob(
@@ -256,9 +259,8 @@ KNOBS = (
         [list(simulated.FIELD_MIDDLE), list(simulated.FIELD_HALF)],
         "of the image",
         "paper",
-        "The points covered the top left quarter of the scene, all over Hobart; of it the part that both images see "
-        "(swaths of 29.42 and 26.24 km), evenly. Formerly a smaller field, crowded towards its middle line, was fitted "
-        "to the 3D affine model in geographic coordinates, which therefore is worse than it was.",
+        "The points cover the top left quarter of the scene, all of Hobart. Ours are evenly spread over the "
+        "part that both images see (swaths of 29.42 and 26.24 km).",
     ),
     Knob("SIGMA_IMAGE, SIGMA_CONTROL", [SIGMA_IMAGE, SIGMA_CONTROL], "px, m", "paper", "A priori, for the weights."),
     Knob(
@@ -269,8 +271,8 @@ KNOBS = (
         "a flat city under one mountain, 0 to 1260 m",
         "",
         "paper",
-        "From sea level to over 1260 m at Mount Wellington, whose place is that on maps; how the lower hills roll is "
-        "a choice in sight of no row.",
+        "From sea level to over 1260 m at Mount Wellington, at its real position. The shape of the lower hills "
+        "was chosen without knowledge of any row.",
     ),
 )
 #: Models of the curves over the number of control points.
@@ -303,13 +305,13 @@ def reproduce(
         As `tables.make_document` makes it. The labels of s0 and of the extreme residuals begin with these words.
     """
     numbers = _numbers(rows)
-    found = np.full((realisations, len(rows), len(RMS) + len(OTHERS) + 1), np.nan)
+    values = np.full((realisations, len(rows), len(RMS) + len(OTHERS) + 1), np.nan)
     curves = np.full((realisations, len(CURVES), len(counts)), np.nan)
     rpcs = delivered_rpcs()
     for seed in range(realisations):
         block = Block.make(seed, rpcs)
         for k, row in enumerate(rows):
-            found[seed, k] = _found(block.fit(row.model, row.selection), row.geocentric)
+            values[seed, k] = _found(block.fit(row.model, row.selection), row.geocentric)
         # Curves are smooth; a fifth of the realisations shows them.
         if seed % 5 == 0:
             for k, model in enumerate(CURVES.values()):
@@ -324,11 +326,11 @@ def reproduce(
         naive_text=NAIVE,
         numbers=numbers,
         found=np.concatenate(
-            [found[:, :, : len(RMS)].reshape(realisations, -1), found[:, :, len(RMS) : -1].reshape(realisations, -1)],
+            [values[:, :, : len(RMS)].reshape(realisations, -1), values[:, :, len(RMS) : -1].reshape(realisations, -1)],
             axis=1,
         ),
         titles=TITLES,
-        statements=statements(dict(zip((row.label for row in rows), np.nanmedian(found, axis=0), strict=True))),
+        statements=statements(dict(zip((row.label for row in rows), np.nanmedian(values, axis=0), strict=True))),
         curves=_curves(curves, counts),
     )
 

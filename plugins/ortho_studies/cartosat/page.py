@@ -12,8 +12,8 @@ from ortho_studies.simulation.page import Figure, Reason
 
 #: The models whose errors are drawn, and what there is to see.
 DRAWN = {
-    "rpc affine": "RPC with an affine bias correction: what is left is the noise of the measurement, larger along the "
-    "track (down the image) than across.",
+    "rpc affine": "RPC with an affine bias correction: the rest is measurement noise, larger along the track "
+    "(down the image) than across.",
     "affine3d geographic": "3D affine model in geographic coordinates: the meridians converge and the parallels "
     "curve, which an affine transformation cannot follow.",
 }
@@ -21,30 +21,31 @@ DRAWN = {
 REASONS = (
     Reason(
         "RPC shift, 1 GCP",
-        "The error of the one control point goes into all others at full size, so this row is a single draw: the "
+        "The error of the single control point affects all others fully, so this row is a single draw: the "
         "paper's point was about 0.4 px off across the track.",
     ),
     Reason(
         "RPC shift + drift, 3 GCPs",
-        "Three points leave two measurements over in each direction, and the paper does not tell where they lay.",
+        "Three points leave two redundant measurements in each direction, and the paper does not state their "
+        "positions.",
     ),
     Reason(
         "affine3d geographic",
-        "An affine transformation cannot follow converging meridians, so this error grows with the square of the "
-        "field. Ours is all of the upper left quarter, as the paper says; its numbers ask for a smaller field, with "
-        "more points near its middle row.",
+        "An affine transformation cannot represent converging meridians, so this error grows with the square of "
+        "the field. Our field is the whole upper left quarter, as the paper states; its numbers suggest a "
+        "smaller field with more points near its middle row.",
     ),
     Reason(
         "s0",
-        "The paper's nine control points fit its models better than its check points do (s0 0.38 is 0.19 px, the "
-        "check points have 0.25 to 0.52 px); ours are measured alike. Where the model itself is wrong (geographic "
-        "coordinates, slopes of the RPCs that are not corrected), our control lies at the rim of the field, where "
-        "that shows most.",
+        "The paper's nine control points fit its models better than its check points do (s0 0.38 is 0.19 px, "
+        "the check points have 0.25 to 0.52 px); ours all have the same noise. If the model itself is wrong "
+        "(geographic coordinates, uncorrected slopes of the RPCs), our control points at the edge of the field "
+        "show the largest errors.",
     ),
     Reason(
         "extremes",
-        "The largest of 60 residuals is a single draw. The paper's are up to four times the RMS and mostly to one "
-        "side, so that one or two of its points were worse than the others; our noise is normal for all.",
+        "The largest of 60 residuals is a single draw. The paper's are up to four times the RMS and mostly to "
+        "one side, so one or two of its points were worse than the others. Our noise is normal for all points.",
     ),
 )
 INTRODUCTION = (

@@ -62,7 +62,7 @@ def write_product(
         raise InputError(
             f"size {size} and seed {seed} are not possible",
             field="size, seed",
-            remedy=f"a size from {SMALLEST} to {LARGEST} and a seed from 0",
+            remedy=f"use a size from {SMALLEST} to {LARGEST}, and a seed of 0 or more",
         )
     out = Path(folder)
     pair = simulated.StereoPair.make(size=size, seed=seed, jitter=jitter)

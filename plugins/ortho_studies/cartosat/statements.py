@@ -114,8 +114,7 @@ _RANKINGS: tuple[tuple[str, tuple[str, ...], Callable[..., tuple[bool, str]], st
             two[6] < one[6] and one[6] / two[6] > _plan(one) / _plan(two),
             _both("height with shift", one[6], "with drift", two[6]),
         ),
-        "The slopes of the bias were fitted to the rows of the images in these columns, and the height "
-        "follows from the rows.",
+        "The slopes of the bias were fitted to the image rows in these columns, and the height follows from the rows.",
     ),
     (
         "The affine correction improves height and planimetry further, and the RMS in the images.",

@@ -22,7 +22,7 @@ def simulate(folder: str | PathLike[str], *, seed: int = 0, size: int = 1200, ji
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:
-    """Tables 2 to 6 of Willneff et al., on simulated CARTOSAT-1 stereo pairs; and curves over the control points."""
+    """Tables 2 to 6 of Willneff et al., on simulated CARTOSAT-1 stereo pairs, and errors by control point number."""
     document = experiment.reproduce(realisations, progress=progress)
     return Reproduced(
         document, text(document), lambda: page.page(document, {m: experiment.error_vectors(m) for m in page.DRAWN})
@@ -42,9 +42,13 @@ STUDY = Study(
     reproduce,
     (
         StudyOption(
-            "size", "Columns and rows; 12000 are the real ones (25 min), fewer are larger.", int, 1200, unit="PX"
+            "size",
+            "Columns and rows; 12000 is the real size (25 min), fewer means larger pixels.",
+            int,
+            1200,
+            unit="PX",
         ),
-        StudyOption("jitter", "Pitch jitter, pixels of the full size.", float, 0.0, 0, 10, unit="PX"),
+        StudyOption("jitter", "Pitch jitter, in pixels of the real size.", float, 0.0, 0, 10, unit="PX"),
     ),
     realisations=50,
 )

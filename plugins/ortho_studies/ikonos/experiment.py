@@ -1,8 +1,8 @@
-"""Table 2 and figure 4 of Amini and Hashemi on simulated IKONOS Geo scenes: the paper's numbers beside ours.
+"""Table 2 and figure 4 of Amini and Hashemi on simulated IKONOS Geo scenes, compared with the paper.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws what the paper does
-not tell: the hills, the places of the points, the azimuth of the satellite, the direction of its scan and the vendor's
-error; and the noise. `KNOBS` lists all settings, and the two rows that two of them were fitted to.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the noise and
+what the paper does not state: hills, positions of the points, azimuth of the satellite, direction of its scan, and the
+vendor's error. `KNOBS` lists all settings, and the two rows to which two of them were fitted.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ KNOBS = (
         POINTING,
         "px per axis",
         "fitted",
-        "Noise of pointing, from the model that has nothing else left. It came out at the half pixel that is customary "
-        "a priori (Willneff et al. have it), but it was found in sight of this row, so the row is not counted.",
+        "Pointing noise, from the model without other errors. The result is the usual half pixel (as in "
+        "Willneff et al.). But it was chosen with knowledge of this row, so the row is not counted.",
         ("2|DLT|*",),
     ),
     Knob(
@@ -92,41 +92,40 @@ KNOBS = (
         [STEEPNESS, BEND],
         "",
         "published",
-        "The slope of the city, through heights that are published: the railway station 1117 m, the centre (35.696 "
-        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. Formerly 4.0 and 0.9 fitted 2D affine; with "
-        "the heights of the city itself 2D affine and projective come out by a third too small. A tilt of 27 degrees "
-        "would make up for that, but nothing tells it.",
+        "The slope of the city, through published heights: the railway station 1117 m, the centre (35.696 "
+        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. With these heights, 2D affine and "
+        "projective are a third too small. A tilt of 27 degrees would explain this, but there is no evidence for it.",
     ),
     Knob(
         "REVERSED",
         REVERSED,
         "of the realisations",
         "published",
-        "A scan against the flight, in which lines of sight are not parallel along it: two of the three real products "
-        "that were looked at have it, so it is drawn. Formerly all scans were reversed, which 3D affine asked for.",
+        "A scan against the flight, with lines of sight that are not parallel along it. Two of three real "
+        "products have it, so it is drawn at random.",
     ),
     Knob(
         "OFF_NADIR_DEG",
         OFF_NADIR_DEG,
         "degrees",
         "chosen",
-        "Tilt. Geo products are ordered with at least 60 degrees of elevation; this is between. All models without "
-        "heights have errors in proportion to its tangent.",
+        "Tilt. Geo products are ordered with an elevation of at least 60 degrees; this is in the middle. The "
+        "errors of all models without heights are proportional to its tangent.",
     ),
     Knob(
         "relief",
         "waves of 0.4 to 25 km, 1050 to 1800 m",
         "",
         "chosen",
-        "How the hills fall off with their wavelength. Of longest waves of 12, 25 and 40 km the second was taken in "
-        "sight of all rows, so that the cubic polynomial is no pure prediction.",
+        "Decrease of the hills with their wavelength. Of 12, 25 and 40 km for the longest wave, the second was "
+        "chosen with knowledge of all rows, so the cubic polynomial is not a pure prediction.",
     ),
     Knob(
         "BIAS",
         list(BIAS),
         "m",
         "published",
-        "Error of the vendor's line of sight: 10 to 25 m are usual for Geo products. All models of table 2 take it up.",
+        "Error of the vendor's line of sight: 10 to 25 m are usual for Geo products. All models of table 2 absorb it.",
     ),
 )
 #: What a vendor's model is good for: heights (m) of the RPC and of the model from metadata.
@@ -251,7 +250,7 @@ def error_vectors(seed: int = 0) -> dict[str, tuple[Array, Array]]:
     drawn = Realisation.draw(seed)
     check = drawn.points.check
     fits = {name: fit_family(name, drawn.points, robust=False) for name in TABLE_2}
-    return {name: (drawn.points.image[check], found.residuals[check]) for name, found in fits.items()}
+    return {name: (drawn.points.image[check], fitted.residuals[check]) for name, fitted in fits.items()}
 
 
 def relief_check(drawn: Realisation) -> tuple[float, float]:
@@ -295,11 +294,11 @@ def _own_name(own: str, correction: str, count: int) -> tuple[str, str]:
 def _evaluate(drawn: Realisation) -> _Values:
     values: _Values = {}
     for name in TABLE_2:
-        found = fit_family(name, drawn.points, robust=False)
-        values[2, NAMES[name], "RMS check"] = _rms(found, "check")
-        values["A", NAMES[name], "leave-one-out"] = _rms(found, "loo")
-        kept = len(prune(found).fit.param_names)
-        values["A", NAMES[name], "share justified"] = kept / len(found.param_names)
+        fitted = fit_family(name, drawn.points, robust=False)
+        values[2, NAMES[name], "RMS check"] = _rms(fitted, "check")
+        values["A", NAMES[name], "leave-one-out"] = _rms(fitted, "loo")
+        kept = len(prune(fitted).fit.param_names)
+        values["A", NAMES[name], "share justified"] = kept / len(fitted.param_names)
     for row in OWN:
         values["B", *_own_name(*row)] = _check_error(_own_fit, drawn, *row)
     return values
@@ -345,8 +344,8 @@ def _check_error(make: Callable[..., Fit], *given: Any, **options: Any) -> float
         return float("nan")
 
 
-def _rms(found: Fit, which: str) -> float:
-    numbers = found.rmse(which)
+def _rms(fitted: Fit, which: str) -> float:
+    numbers = fitted.rmse(which)
     return float("nan") if numbers is None else numbers.total
 
 
@@ -364,12 +363,12 @@ def statements(table: Array) -> list[Statement]:
     groups = [table[:, [names.index(name) for name in group]] for group in (order[:2], order[2:4], order[4:])]
     apart = [(one.max(axis=1) < other.min(axis=1)).mean() for one, other in pairwise(groups)]
     best = (table.argmin(axis=1) == names.index("dlt")).mean()
-    said = {name: f"{NAMES[name]} {medians[names.index(name)]:.2f}" for name in names}
+    labels = {name: f"{NAMES[name]} {medians[names.index(name)]:.2f}" for name in names}
     return [
         Statement(
             "The models rank: " + ", ".join(NAMES[name] for name in order) + ".",
             ours == order,
-            ", ".join(said[name] for name in ours) + f" m; {100 * ordered:.0f} % of the realisations have all six so",
+            ", ".join(labels[name] for name in ours) + f" m; {100 * ordered:.0f} % of the realisations have all six so",
         ),
         Statement(
             "The DLT model was the best model for the test area.",
@@ -379,7 +378,7 @@ def statements(table: Array) -> list[Statement]:
         Statement(
             "An accuracy of 1.1 m is achieved with DLT.",
             medians[names.index("dlt")] < 1.25,
-            f"{said['dlt']} m; the paper’s table has 1.19 m",
+            f"{labels['dlt']} m; the paper’s table has 1.19 m",
             "The noise of pointing was fitted to this row.",
             by_settings=True,
         ),
@@ -392,12 +391,12 @@ def statements(table: Array) -> list[Statement]:
 
 
 def _relief_note(relief: Array) -> str:
-    expected, found = np.median(relief, axis=0)
+    expected, estimated = np.median(relief, axis=0)
     spread = np.percentile(relief[:, 1] / relief[:, 0], (5, 95))
     return (
         "A check that needs no adjustment: the error of 2D affine should be what a plane does not explain of the "
         f"heights, over the tangent of the satellite’s elevation. That is {expected:.2f} m; the adjustment has "
-        f"{found:.2f} m (ratio {spread[0]:.2f} to {spread[1]:.2f} in 90 % of the realisations)."
+        f"{estimated:.2f} m (ratio {spread[0]:.2f} to {spread[1]:.2f} in 90 % of the realisations)."
     )
 
 

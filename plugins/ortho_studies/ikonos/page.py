@@ -20,13 +20,14 @@ INTRODUCTION = (
 REASONS = (
     Reason(
         "cubic polynomial",
-        "Ten unknowns per axis from twenty points: where they lay decides how far cubic terms swing between them.",
+        "Ten unknowns per axis from twenty points: their positions decide how large the cubic terms become "
+        "between them.",
     ),
     Reason(
         "2D",
-        "Models without heights are off by what a plane does not explain of the relief, over the tangent of the "
-        "elevation. With the published heights of the city and 20 degrees of tilt that is less than in the paper: its "
-        "image was tilted by more, or its part of the city is more bent.",
+        "The error of models without heights is the relief without a plane, divided by the tangent of the "
+        "elevation. With the published heights of the city and a tilt of 20 degrees this is less than in the "
+        "paper. Its image had a larger tilt, or its part of the city has more relief.",
     ),
 )
 _LETTERS = "abcdef"

@@ -108,19 +108,19 @@ def _check(size: int, pixel: float, seed: int, components: int, multispectral: b
         raise InputError(
             f"size {size}, seed {seed} and {counted(components, 'component')} are not possible",
             field="size, seed, components",
-            remedy=f"a size from {SMALLEST} to {LARGEST}, a seed from 0, and 1 to {MOST_COMPONENTS} components",
+            remedy=f"use a size from {SMALLEST} to {LARGEST}, a seed from 0, and 1 to {MOST_COMPONENTS} components",
         )
     if not pixel >= FINEST or size * pixel > simulated.EXTENT * (1 + 1e-9):
         raise InputError(
             f"{size} pixels of {pixel:g} m are not possible",
             field="size, pixel",
-            remedy=f"pixels of at least {FINEST} m, and a scene of at most {simulated.EXTENT:g} m",
+            remedy=f"use pixels of at least {FINEST} m, and a scene of at most {simulated.EXTENT:g} m",
         )
     if size % (components * (RATIO if multispectral else 1)):
         raise InputError(
-            f"{size} columns cannot be cut so",
+            f"{size} columns cannot be cut into equal parts",
             field="size",
-            remedy=f"a multiple of {components * (RATIO if multispectral else 1)}",
+            remedy=f"use a multiple of {components * (RATIO if multispectral else 1)}",
         )
 
 
@@ -153,13 +153,13 @@ def _write_points(measured: Points, cuts: list[SimulatedComponent], path: Path) 
 
 
 def _write_image(
-    out: Path, cut: SimulatedComponent, whole: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
+    out: Path, cut: SimulatedComponent, scene: GeoScene, band: str, pixels: NDArray[np.uint16], rpc: bool
 ) -> Iterator[tuple[str, Path]]:
     grid = _of_band(cut.scene, band)
     name = "_".join(
         ["", *([] if cut.identifier == "0000000" else [cut.identifier]), *([] if band == "pan" else [band])]
     )
-    first = round((grid.west - whole.west) / grid.pixel)
+    first = round((grid.west - scene.west) / grid.pixel)
     path = out / f"po_{ORDER}_{band}_{cut.identifier}.tif"
     _write_tiff(path, pixels[:, first : first + grid.columns], grid)
     yield f"image{name}".rstrip("_"), path

@@ -27,7 +27,7 @@ def simulate(
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:
-    """Table 2 and figure 4 of Amini and Hashemi, on simulated IKONOS scenes; and what the paper did not have."""
+    """Table 2 and figure 4 of Amini and Hashemi, on simulated IKONOS scenes, with further models."""
     document = experiment.reproduce(realisations, progress=progress)
     return Reproduced(document, text(document), lambda: page.page(document, experiment.error_vectors()))
 
@@ -44,11 +44,11 @@ STUDY = Study(
     simulate,
     reproduce,
     (
-        StudyOption("off_nadir", "Tilt  [default: that of 'reproduce ikonos']", low=0, high=45, unit="DEG"),
+        StudyOption("off_nadir", "Off-nadir angle  [default: that of 'reproduce ikonos']", low=0, high=45, unit="DEG"),
         StudyOption("size", "Columns and rows.", int, 1000, unit="PX"),
-        StudyOption("pixel", "Size of a pixel  [default: so that the image covers 11 km]", unit="M"),
-        StudyOption("rpc", "Deliver _rpc.txt or not.", bool, True, flag="--rpc/--no-rpc"),
-        StudyOption("multispectral", "Four bands in files of their own beside pan.", bool, flag="--ms"),
-        StudyOption("components", "Files that each image is cut into.", int, 1),
+        StudyOption("pixel", "Pixel size  [default: the image covers 11 km]", unit="M"),
+        StudyOption("rpc", "Write _rpc.txt or not.", bool, True, flag="--rpc/--no-rpc"),
+        StudyOption("multispectral", "Also write four colour bands in separate files.", bool, flag="--ms"),
+        StudyOption("components", "Number of files into which each image is cut.", int, 1),
     ),
 )

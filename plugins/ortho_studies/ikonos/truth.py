@@ -138,7 +138,9 @@ class IkonosPass:
         """
         if not 0 <= off_nadir_deg <= 45:
             raise InputError(
-                f"{off_nadir_deg:g} degrees off nadir are not possible", field="off_nadir_deg", remedy="0 to 45 degrees"
+                f"an off-nadir angle of {off_nadir_deg:g} degrees is not possible",
+                field="off_nadir_deg",
+                remedy="use 0 to 45 degrees",
             )
         aim = geocentric(np.array([[LON, LAT, REFERENCE_HEIGHT]]))[0]
         up = aim / np.linalg.norm(aim)
@@ -446,4 +448,6 @@ def _meet(
         lon, lat = np.radians(ground[:, :2].T)
         up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
         distance = distance - above / (up * rays).sum(axis=1)
-    raise InputError("the slopes are too steep for this tilt", field="off_nadir_deg", remedy="tilt less")
+    raise InputError(
+        "the slopes are too steep for this off-nadir angle", field="off_nadir_deg", remedy="use a smaller angle"
+    )

@@ -1,8 +1,8 @@
 """Table 1, figures 4 to 7 and section 3.1 of Bueyueksalih, Akcin and Jacobsen, on simulated OrbView-3 scenes.
 
-Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 34 places, their
-noise, and the attitude error of both scenes. `KNOBS` lists all settings, and the rows that they were fitted to: most of
-table 1, for the paper tells little of how the satellite turned.
+Every number is the median over realisations, with the 5th and 95th percentile. A realisation draws the 34 positions,
+their noise, and the attitude error of both scenes. `KNOBS` lists all settings, and the rows to which they were fitted:
+most of table 1, because the paper states little about the rotation of the satellite.
 """
 
 from __future__ import annotations
@@ -140,9 +140,9 @@ def _numbers() -> list[Number]:
     ]
 
 
-def _medians(numbers: list[Number], found: Array) -> dict[tuple[str, str, str], float]:
+def _medians(numbers: list[Number], values: Array) -> dict[tuple[str, str, str], float]:
     keys = [(str(number.table), number.label, number.quantity) for number in numbers]
-    return dict(zip(keys, np.nanmedian(found, axis=0).tolist(), strict=True))
+    return dict(zip(keys, np.nanmedian(values, axis=0).tolist(), strict=True))
 
 
 # -- OrbView-3 -------------------------------------------------------------------------------------------------------
@@ -278,14 +278,14 @@ def _figure_7(findings: Findings) -> Curve:
 
 
 def _edge_curve() -> Curve:
-    found = [edges(strength) for strength in ENHANCEMENTS]
+    widths = [edges(strength) for strength in ENHANCEMENTS]
     names = {"fwhm": "width", "blur": "blur"}
     return Curve(
         "Edges of the staggered lines without TDI against the strength of an edge enhancement",
         "strength of the enhancement",
         "width at half height, and blur [pixels]",
         {
-            f"{label} along the {axis}": (list(ENHANCEMENTS), [one[key][k] for one in found])
+            f"{label} along the {axis}": (list(ENHANCEMENTS), [one[key][k] for one in widths])
             for key, label in names.items()
             for k, axis in enumerate(("line", "scan"))
         },
@@ -299,12 +299,12 @@ def error_vectors(seed: int = 0) -> dict[str, tuple[Array, Array]]:
     """Return map coordinates and residuals (m) ``(34, 2)``, of figures 4, 5 and 6 in one realisation."""
     coast = simulated.Coast()
     ground = simulated.places(simulated.POINTS, coast, seed)
-    found = {}
+    vectors = {}
     for index, name in enumerate(simulated.SCENES):
         camera = simulated.scanner(name)
         true = simulated.with_attitude_error(camera, seed)
         points = simulated.measure(true, ground, seed, image_number=index).to_crs(simulated.MAP_CRS)
         where = points.ground[:, :2]
-        found[f"{name} affine3d"] = where, _shifts(fit_family("affine3d", points, robust=False))
-        found[f"{name} rpc"] = where, _shifts(corrected(simulated.vendor_rpc(camera), points, "affine"))
-    return found
+        vectors[f"{name} affine3d"] = where, _shifts(fit_family("affine3d", points, robust=False))
+        vectors[f"{name} rpc"] = where, _shifts(corrected(simulated.vendor_rpc(camera), points, "affine"))
+    return vectors

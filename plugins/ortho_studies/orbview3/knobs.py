@@ -12,8 +12,8 @@ KNOBS = (
         {name: seconds for name, (seconds, _) in simulated.SCENES.items()},
         "s from abeam",
         "fitted",
-        "When the satellite took either scene. The difference is the paper's height to base of 1.4; the ratio is that "
-        "of the errors of 3D affine in Y, which go with the distance along the track.",
+        "Time of each scene. The difference gives the paper's height-to-base ratio of 1.4; the ratio is that of "
+        "the errors of 3D affine in Y, which are proportional to the distance along the track.",
         ("1|affine3d|* Y",),
     ),
     Knob(
@@ -21,22 +21,22 @@ KNOBS = (
         simulated.SIDE,
         "m",
         "chosen",
-        "How far the area lies beside the track: not directly below the orbit, but not too far away.",
+        "Distance of the area from the track: not directly below the orbit, but not too far away.",
     ),
     Knob(
         "LINES",
         simulated.LINES,
         "",
         "paper",
-        "Length of a scene, from the 11 m that the middle of a scene is off the linear width.",
+        "Length of a scene, from the 11 m between the middle of a scene and its linear width.",
     ),
     Knob(
         "TURNING, YAW_RATE",
         [simulated.TURNING, simulated.YAW_RATE],
         "(0 to 1), rad/s",
         "fitted",
-        "How far the scan keeps its angular speed while the range changes, and how fast the line of pixels turns. The "
-        "paper says that both happen, not how much.",
+        "How much the scan keeps its angular speed while the range changes, and the turning rate of the line of "
+        "pixels. The paper mentions both, but not their size.",
         ("1|affine3d|* X", "1|affine12|* X", "1|affine14|* X"),
     ),
     Knob(
@@ -52,17 +52,17 @@ KNOBS = (
         [*simulated.TOWN, simulated.TOWN_RADIUS],
         "m (east, north, radius)",
         "chosen",
-        "Where every second point lies, so that some have neighbours within 600 m.",
+        "Position of every second point, so that some have neighbours within 600 m.",
     ),
     Knob(
         "SIGMA_IMAGE",
         simulated.SIGMA_IMAGE,
         "px per axis",
         "fitted",
-        "Noise of pointing: the root mean square of the four relative accuracies.",
+        "Pointing noise: the root mean square of the four relative accuracies.",
         ("1|RPC affine, relative|*",),
     ),
-    Knob("SIGMA_GROUND", simulated.SIGMA_GROUND, "m per axis", "chosen", "A GPS survey; it decides nothing."),
+    Knob("SIGMA_GROUND", simulated.SIGMA_GROUND, "m per axis", "chosen", "A GPS survey; it has no influence."),
     Knob(
         "SIGMA_BIAS",
         simulated.SIGMA_BIAS,
@@ -75,8 +75,8 @@ KNOBS = (
         [simulated.SIGMA_DRIFT, simulated.SIGMA_WOBBLE, simulated.SIGMA_YAW],
         "m",
         "fitted",
-        "Attitude: drift to an end of the scene, each higher degree, and yaw at the ends of the line; from the root "
-        "mean squares of what shift and affine correction leave.",
+        "Attitude: drift towards an end of the scene, each higher degree, and yaw at the ends of the line; from "
+        "the residuals (root mean square) of shift and affine correction.",
         ("1|RPC shift|*", "1|RPC affine|*"),
     ),
     Knob(
@@ -91,14 +91,14 @@ KNOBS = (
         rendering.ENHANCEMENT,
         "of the difference to the mean of 3 x 3 pixels",
         "chosen",
-        "Strength of the vendor's edge enhancement, which only the two statements on edges rest upon.",
+        "Strength of the vendor's edge enhancement; only the two statements on edges depend on it.",
     ),
     Knob(
         "QUICKBIRD",
         simulated.QUICKBIRD["side"],
         "m",
         "chosen",
-        "How far the area lies beside QuickBird's track; its altitude of 450 km is published.",
+        "Distance of the area from QuickBird's track; its altitude of 450 km is published.",
     ),
     Knob(
         "QUICKBIRD_NOISE",
@@ -113,7 +113,8 @@ KNOBS = (
         simulated.QUICKBIRD_ATTITUDE,
         "of OrbView-3",
         "fitted",
-        "Drift and wobble of its attitude, from what a shift of the RPC leaves beside the improved 3D affine model.",
+        "Drift and wobble of its attitude, from the residuals of a shift of the RPC compared with the improved "
+        "3D affine model.",
         ("3.1|RPC shift|*",),
     ),
     Knob(
@@ -121,7 +122,7 @@ KNOBS = (
         "against the flight",
         "",
         "fitted",
-        "From the simple 3D affine model being worse in Y than in X.",
+        "From the simple 3D affine model, which is worse in Y than in X.",
         ("3.1|affine3d|*",),
     ),
 )

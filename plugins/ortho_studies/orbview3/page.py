@@ -14,30 +14,30 @@ from ortho_studies.simulation.page import Figure, Reason
 REASONS = (
     Reason(
         "RPC absolute",
-        "One draw of the attitude error of a scene, beyond the percentiles of ours; the standard deviation (14 m) is "
-        "all that the headers tell.",
+        "A single draw of the attitude error of a scene, outside our percentiles; the headers only state the "
+        "standard deviation (14 m).",
     ),
     Reason(
         "RPC affine, relative",
-        "The relative accuracy of neighbours rests on few pairs closer than 600 m. In the paper it is 0.53 m for Y of "
-        "scene 471890 and 1.17 to 1.47 m for the other three, in images of one kind that the same people measured: one "
-        "noise for all, which ours has, cannot give both.",
+        "The relative accuracy of neighbours depends on few pairs closer than 600 m. In the paper it is 0.53 m "
+        "for Y of scene 471890 and 1.17 to 1.47 m for the other three, in the same kind of images measured by "
+        "the same people. Ours has the same noise for all, which cannot give both.",
     ),
     Reason(
         "dlt",
-        "The denominator that DLT has in common for X and Y takes up the changing range only as far as the speed of "
-        "the scan goes with it. How the satellite turned, the paper does not say; ours keeps its angular speed to the "
-        "part that the other models ask for.",
+        "DLT has one denominator for X and Y. It absorbs the changing range only if the scan speed changes with "
+        "it. The paper does not state how the satellite turned; ours keeps its angular speed as far as the "
+        "other models require.",
     ),
     Reason(
         "affine14",
-        "What is left after 14 parameters are the terms of the third order of an attitude law that the paper does not "
-        "give, and the wobble of the attitude. For this number the paper has two values itself: 2.88 m in table 1, "
-        "1.90 m in section 3.1.",
+        "After 14 parameters, the third-order terms of an attitude law that the paper does not give remain, and "
+        "the wobble of the attitude. The paper itself has two values for this number: 2.88 m in table 1, 1.90 m "
+        "in section 3.1.",
     ),
     Reason(
         "affine3d",
-        "The size of these errors goes with the extent of the 34 points, which the paper shows only as a sketch.",
+        "The size of these errors depends on the extent of the 34 points, which the paper shows only as a sketch.",
     ),
 )
 INTRODUCTION = (
@@ -68,9 +68,9 @@ def page(document: Mapping[str, Any], vectors: Mapping[str, tuple[Array, Array]]
     )
 
 
-def _vectors(number: int, model: str, scene: str, found: tuple[Array, Array], bar: float) -> Figure:
+def _vectors(number: int, model: str, scene: str, vectors: tuple[Array, Array], bar: float) -> Figure:
     """Draw residuals on the ground, enlarged, as on a map: east to the right, north up; `bar` (m) is the scale bar."""
-    where, shifts = found
+    where, shifts = vectors
     low, high = where.min(axis=0) - _MARGIN, where.max(axis=0) + _MARGIN
     scale = _WIDE / float(high[0] - low[0])
     tall, unit = float(high[1] - low[1]) * scale, _WIDE / 14 / bar

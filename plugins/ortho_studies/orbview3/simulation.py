@@ -61,7 +61,7 @@ def write_product(
         raise InputError(
             f"pixels of {pixel} m and seed {seed} are not possible",
             field="pixel, seed",
-            remedy=f"whole metres from {SMALLEST} to {LARGEST} and a seed from 0",
+            remedy=f"use whole metres from {SMALLEST} to {LARGEST}, and a seed of 0 or more",
         )
     out, coast = Path(folder), simulated.Coast()
     ground = simulated.places(simulated.POINTS, coast, seed)

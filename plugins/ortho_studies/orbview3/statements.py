@@ -97,7 +97,7 @@ def _on_geometry(ours: Medians, findings: Findings, geometry: Mapping[str, float
             f"Scene {scene}: RPC affine ≤ RPC shift < 14 < 12 < 8 parameters of the 3D affine transformation.",
             sizes[0] <= sizes[1] and all(a < b for a, b in itertools.pairwise(sizes[1:])),
             ", ".join(f"{size:.2f} m" for size in sizes),
-            "More parameters always fit better, and the sizes were fitted.",
+            "More parameters always fit better, and these sizes were fitted.",
             by_settings=True,
         )
     correlations = [findings.median(f"{scene} dlt correlation") for scene in simulated.SCENES]
@@ -116,8 +116,8 @@ def _on_rpc(ours: Medians, findings: Findings) -> Iterator[Statement]:
         "Without control all mean discrepancies are below the standard deviation from the header, 14 m.",
         below > 0.5,
         f"all four are so in {100 * below:.0f} % of the realisations",
-        "Each of four draws is beyond its standard deviation once in three times. The paper’s scenes were either lucky "
-        "or better than their header says; which of both, two scenes cannot tell.",
+        "Each of four draws exceeds its standard deviation in one of three cases. The paper’s scenes were "
+        "either lucky or better than their headers state; two scenes cannot show which.",
     )
     keys = [f"{scene} {axis}" for scene in simulated.SCENES for axis in "XY"]
     pairs = [(ours["1", RELATIVE, key], ours["1", AFFINE, key]) for key in keys]
@@ -136,9 +136,9 @@ def _on_rpc(ours: Medians, findings: Findings) -> Iterator[Statement]:
         "Neighbouring points are correlated with 0.2 to 0.3: errors remain that the affine correction leaves.",
         bool((correlations >= 0.15).all()),
         "mean correlations " + ", ".join(f"{value:.2f}" for value in correlations),
-        "They are positive, but a third to a half of the paper’s: noise that is large enough for the relative accuracy "
-        "of three of the four columns leaves too small a part to the wobble. In the paper one column (0.53 m) has much "
-        "less noise than the others, which one noise for all cannot give.",
+        "They are positive, but only a third to a half of the paper’s. The noise that explains the relative "
+        "accuracy of three of the four columns leaves too little for the wobble. In the paper one column (0.53 "
+        "m) has much less noise than the others, which equal noise for all cannot give.",
     )
     relative = relative_deviation(findings)
     yield Statement(
@@ -178,16 +178,17 @@ def _on_parameters(findings: Findings) -> Iterator[Statement]:
         + " and ".join(f"{100 * share:.0f} %" for share in alike)
         + " of the realisations; "
         + "; ".join(f"{scene}: {shares[scene]}" for scene in simulated.SCENES),
-        "Which parameters are needed depends on the drift of the attitude, which is drawn for each scene: nothing that "
-        "a simulation could predict. That column per column is needed least often agrees with scene 471890 only.",
+        "The needed parameters depend on the drift of the attitude, which is drawn at random for each scene, so "
+        "a simulation cannot predict them. Column per column is needed least often; this agrees only with scene "
+        "471890.",
     )
     ratios = [findings.median(f"{scene} pruned ratio") for scene in simulated.SCENES]
     yield Statement(
         "Without them the root mean square discrepancies do not change.",
         max(ratios) <= 1.005,
         "ratios " + ", ".join(f"{ratio:.3f}" for ratio in ratios) + " at the usual significance of 5 %",
-        "Two decimals that do not change are less than 0.5 %. A parameter that is just not significant changes more "
-        "than that with 34 points; the paper’s were further from being significant.",
+        "Two unchanged decimals mean less than 0.5 %. With 34 points, a parameter that is just not significant "
+        "changes more than that; the paper’s were less significant.",
     )
 
 
@@ -197,7 +198,7 @@ def _on_edges() -> Iterator[Statement]:
         "Pixels are two pixels of the image wide.",
         min(raw) > 1.7,
         f"width of an edge along line and scan {raw[0]:.2f} and {raw[1]:.2f} px",
-        "The simulated camera is built so.",
+        "The simulated camera has this property by construction.",
         by_settings=True,
     )
     yield Statement(
@@ -205,22 +206,23 @@ def _on_edges() -> Iterator[Statement]:
         max(enhanced) <= 1.1,
         f"width of an edge along line and scan {raw[0]:.2f} and {raw[1]:.2f} px, enhanced {enhanced[0]:.2f} and "
         f"{enhanced[1]:.2f} px",
-        "An enhancement with 3 by 3 pixels takes back what the missing TDI blurs along the scan, but not the width of "
-        "the staggered pixels along the line. How the vendor enhances, and how the paper measured, it does not say.",
+        "An enhancement with 3 by 3 pixels compensates the blur of the missing TDI along the scan, but not the "
+        "width of the staggered pixels along the line. The paper states neither the vendor's enhancement nor "
+        "its method of measurement.",
     )
 
 
 def relative_deviation(findings: Findings) -> dict[str, list[float]]:
     """Return the relative standard deviation (m) per class of distance: scenes and axes, over all realisations."""
-    found = {}
+    deviations = {}
     for scene, analyses in findings.analyses.items():
         for k, axis in enumerate("XY"):
             squares: list[list[float]] = [[] for _ in CLASSES[1:]]
             for analysis in analyses:
                 for one in analysis.classes:
                     squares[CLASSES.index(one.from_m)].append(one.relative[k] ** 2)
-            found[f"{scene} {axis}"] = [float(np.sqrt(np.mean(part))) for part in squares]
-    return found
+            deviations[f"{scene} {axis}"] = [float(np.sqrt(np.mean(part))) for part in squares]
+    return deviations
 
 
 def edges(enhancement: float) -> dict[str, tuple[float, float]]:

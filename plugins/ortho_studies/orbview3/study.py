@@ -22,7 +22,7 @@ def simulate(folder: str | PathLike[str], *, seed: int = 0, pixel: int = 8) -> S
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:
-    """Table 1 and figures 4 to 7 of Bueyueksalih et al., on simulated OrbView-3 scenes; and QuickBird beside them."""
+    """Table 1 and figures 4 to 7 of Bueyueksalih et al., on simulated OrbView-3 scenes, and their QuickBird table."""
     document = experiment.reproduce(realisations, progress=progress)
     return Reproduced(document, text(document), lambda: page.page(document, experiment.error_vectors()))
 
@@ -38,5 +38,5 @@ STUDY = Study(
     "Two OrbView-3 scenes over Zonguldak (Bueyueksalih et al.)",
     simulate,
     reproduce,
-    (StudyOption("pixel", "Metres; 1 is the real one, larger are fewer.", int, 8, unit="M"),),
+    (StudyOption("pixel", "Pixel size in metres; 1 is the real size, larger means fewer pixels.", int, 8, unit="M"),),
 )

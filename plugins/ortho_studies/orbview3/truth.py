@@ -409,21 +409,21 @@ def places(count: int, coast: Coast, seed: int, area: tuple[float, float] = FIEL
     Of some candidates for each other point the one that is farthest from all points is taken.
     """
     if count < 4:
-        raise InputError("a scene has at least 4 points", field="points")
+        raise InputError("a scene needs at least 4 points", field="points")
     random = np.random.default_rng([seed, 2])
-    found = np.zeros((0, 2))
-    while len(found) < count:
-        if len(found) % TOWN_SHARE == 0:
+    positions = np.zeros((0, 2))
+    while len(positions) < count:
+        if len(positions) % TOWN_SHARE == 0:
             angle, radius = random.uniform(0, 2 * np.pi, 1), TOWN_RADIUS * np.sqrt(random.uniform(size=1))
             drawn = TOWN + np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
         else:
             drawn = random.uniform(-0.5, 0.5, (CANDIDATES, 2)) * area
         drawn = drawn[coast.inland(*drawn.T) > 100.0]
         if len(drawn):
-            gaps = np.linalg.norm(drawn[:, None] - found[None], axis=2).min(axis=1, initial=np.inf)
-            found = np.concatenate([found, drawn[[gaps.argmax()]]])
+            gaps = np.linalg.norm(drawn[:, None] - positions[None], axis=2).min(axis=1, initial=np.inf)
+            positions = np.concatenate([positions, drawn[[gaps.argmax()]]])
     metre = 180 / np.pi / EARTH_A
-    lon, lat = LON + found[:, 0] * metre / np.cos(np.radians(LAT)), LAT + found[:, 1] * metre
+    lon, lat = LON + positions[:, 0] * metre / np.cos(np.radians(LAT)), LAT + positions[:, 1] * metre
     return np.stack([lon, lat, coast(lon, lat)], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Scenes of known truth, and what the reproductions of papers have in common: scanner, waves, terrain, tables, page.
+"""Simulated scenes with known truth, and the common code of the reproductions: scanner, waves, terrain, tables, page.
 
-Imports `display`, `points` and `models.base`, so that truth shares no code with what it tests.
+It imports only `display`, `points` and `models.base`, so the truth shares no code with what it tests.
 """

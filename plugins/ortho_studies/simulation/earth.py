@@ -1,4 +1,4 @@
-"""The Earth of simulated scenes: size, turning, geocentric coordinates; it shares no code with that of the models."""
+"""The Earth of simulated scenes: size, rotation, geocentric coordinates; it shares no code with the models."""
 
 from __future__ import annotations
 

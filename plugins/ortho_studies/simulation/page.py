@@ -1,4 +1,4 @@
-"""How a reproduction is shown: tables as text for a terminal, and a page with figures, curves and reasons."""
+"""Output of a reproduction: tables as text for the terminal, and a page with figures, curves and reasons."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SOURCES = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing and what stands below it."""
+    """A drawing and its caption."""
 
     drawing: Drawing
     caption: str
@@ -34,17 +34,17 @@ class Figure:
 
 @dataclass(frozen=True)
 class Reason:
-    """Why rows differ from the paper: those (not yet explained) whose ``label quantity`` starts with `start`."""
+    """Why rows differ from the paper: all rows without a reason whose ``label quantity`` starts with `start`."""
 
     start: str
     why: str
 
 
-UNEXPLAINED = Reason("", "Beyond the factor without a cause that we know of.")
+UNEXPLAINED = Reason("", "Outside the factor; the cause is unknown.")
 
 
 def text(document: Mapping[str, Any]) -> str:
-    """Return the tables for a terminal; `!` marks what does not agree, `f` what a setting was fitted to."""
+    """Return the tables for a terminal; `!` marks rows that do not agree, `f` rows that settings were fitted to."""
     rows = [row for table in document["tables"] for row in table["rows"]]
     wide, narrow = (max([least, *(len(row[key]) for row in rows)]) for least, key in ((24, "label"), (8, "quantity")))
     lines = [document["paper"], document["settings_text"], ""]
@@ -57,51 +57,53 @@ def text(document: Mapping[str, Any]) -> str:
             ours = "".join(f" {_number(row[key]):>7}" for key in ("paper", "median", "p5", "p95", "naive"))
             lines.append(f"{marks} {row['label']:<{wide}} {row['quantity']:<{narrow}} {row['units']:<2}{ours}")
         lines.append("")
-    for one in document["statements"]:
-        why = f" {one['why']}" if one["why"] else ""
+    for statement in document["statements"]:
+        why = f" {statement['why']}" if statement["why"] else ""
         lines.append(
-            f"{'!' if one['verdict'] == VERDICTS[2] else ' '} {one['text']} {_capital(one['verdict'])}: "
-            f"{one['detail']}.{why}"
+            f"{'!' if statement['verdict'] == VERDICTS[2] else ' '} {statement['text']} "
+            f"{_capital(statement['verdict'])}: "
+            f"{statement['detail']}.{why}"
         )
     return "\n".join([*lines, *([""] if document["statements"] else []), *verdict(document)])
 
 
 def verdict(document: Mapping[str, Any]) -> list[str]:
-    """Return what the document proves: predictions, beside the naive guesses, then the rest; one sentence each."""
-    found = document["summary"]
-    wide, tight = (f"{factor:g}" for factor in found["factors"])
-    predicted, fitted, draws = (found[role] for role in ("predicted", "fitted", "draw"))
-    said = []
+    """Return the result in sentences: predictions compared with naive guesses, then the rest."""
+    summary = document["summary"]
+    wide, tight = (f"{factor:g}" for factor in summary["factors"])
+    predicted, fitted, draws = (summary[role] for role in ("predicted", "fitted", "draw"))
+    single = summary.get("single_realisation")
+    sentences = []
     if predicted["rows"]:
-        said += [
-            f"Of {counted(predicted['rows'], 'number')} that no setting was fitted to, "
-            f"{_share(predicted, 'within', wide)} are "
-            f"within a factor {wide} of the paper and {_share(predicted, 'within', tight)} within {tight}.",
-            f"A naive guess without any simulation has {_share(predicted, 'naive', wide)} and "
-            f"{_share(predicted, 'naive', tight)}: {document['naive_text']}",
-            f"{_of(predicted['covered'], predicted['rows'])} lie between our 5th and 95th percentile. Were the paper "
-            f"one of our realisations, {100 * found['single_realisation']['median']:.0f} % "
-            f"({100 * found['single_realisation']['p5']:.0f} to {100 * found['single_realisation']['p95']:.0f} %) "
-            f"would be within {wide} of our medians.",
+        sentences += [
+            f"{counted(predicted['rows'], 'number')} of the paper are predicted (no setting was fitted to them): "
+            f"{_share(predicted, 'within', wide)} agree within a factor of {wide}, "
+            f"{_share(predicted, 'within', tight)} within {tight}.",
+            f"A naive guess without simulation agrees for {_share(predicted, 'naive', wide)} and "
+            f"{_share(predicted, 'naive', tight)}. The guess: {document['naive_text']}",
+            f"{_of(predicted['covered'], predicted['rows'])} are between our 5th and 95th percentile. If the "
+            f"paper were "
+            f"one of our realisations, {100 * single['median']:.0f} % ({100 * single['p5']:.0f} to "
+            f"{100 * single['p95']:.0f} %) would be within {wide} of our medians.",
         ]
     if fitted["rows"]:
-        said.append(
+        sentences.append(
             f"Not counted: {counted(fitted['rows'], 'number')} that settings were fitted to "
             f"({_share(fitted, 'within', wide)} "
             f"within {wide}, {_share(fitted, 'within', tight)} within {tight})."
         )
     if draws["rows"]:
-        said.append(
-            f"Nor are {draws['rows']} numbers that are single draws of an error whose spread alone is known "
-            f"({draws['covered']} lie between our 5th and 95th percentile)."
+        sentences.append(
+            f"Also not counted: {counted(draws['rows'], 'number')} that are single draws of an error with a known "
+            f"spread ({draws['covered']} are between our 5th and 95th percentile)."
         )
     if document["statements"]:
-        numbers = [sum(one["verdict"] == which for one in document["statements"]) for which in VERDICTS]
-        said.append(
-            f"Of {sum(numbers)} statements of the paper {numbers[0]} are reproduced, {numbers[1]} hold by the settings "
-            f"and {numbers[2]} are not reproduced."
+        numbers = [sum(statement["verdict"] == which for statement in document["statements"]) for which in VERDICTS]
+        sentences.append(
+            f"Of {sum(numbers)} statements of the paper, {numbers[0]} are reproduced, {numbers[1]} are true because of "
+            f"the settings, and {numbers[2]} are not reproduced."
         )
-    return said
+    return sentences
 
 
 def _share(counted: Mapping[str, Any], what: str, factor: str) -> str:
@@ -117,7 +119,7 @@ def _capital(words: str) -> str:
 
 
 def knob_text(knob: Mapping[str, Any]) -> str:
-    """Return value and units of a knob for people."""
+    """Return value and units of a setting for people."""
     return f"{_shown(knob['value'])} {knob['units']}".strip()
 
 
@@ -224,19 +226,19 @@ def draw_vectors(
 def draw_curve(curve: Mapping[str, Any]) -> Drawing:
     """Draw the series of a `Curve` (as JSON) as lines, each with its name at its end."""
     drawing = Drawing(640, 380, curve["title"], "curve")
-    xs = [value for one in curve["series"] for value in one["x"]]
-    ys = [value for one in curve["series"] for value in one["y"] if value is not None]
+    xs = [value for series in curve["series"] for value in series["x"]]
+    ys = [value for series in curve["series"] for value in series["y"] if value is not None]
     low, high = min(ys, default=0.0), max(ys, default=1.0)
     reach = (high - low) or 1.0
     floor = 0.0 if low >= 0 else low - 0.05 * reach
     axes = Axes(drawing, (58.0, 14.0, 430.0, 306.0), (min(xs), max(xs)), (floor, high + 0.05 * reach))
     axes.draw(curve["x_label"], curve["y_label"])
     ends: list[tuple[float, int, str]] = []
-    for k, one in enumerate(curve["series"]):
-        known = [(x, y) for x, y in zip(one["x"], one["y"], strict=True) if y is not None]
+    for k, series in enumerate(curve["series"]):
+        known = [(x, y) for x, y in zip(series["x"], series["y"], strict=True) if y is not None]
         if known:
             drawing.path(f"series-{k % 9}", [axes.at(x, y) for x, y in known])
-            ends.append((axes.at(*known[-1])[1], k, one["name"]))
+            ends.append((axes.at(*known[-1])[1], k, series["name"]))
     level = -np.inf
     for y, k, name in sorted(ends):
         level = max(y, level + 15)

@@ -1,11 +1,11 @@
-"""Scenes of known truth, for tests, the sample data and experiments.
+"""Simulated scenes with known truth, for tests, the sample data and experiments.
 
-A `LineScanner` flies a circular orbit and looks at a `Terrain` whose brightness is given by a `Landscape`. All three
-are closed functions of their fields: nothing is read from a file, and a seed gives the same scene on every machine.
+A `LineScanner` flies on a circular orbit and looks at a `Terrain` with the brightness of a `Landscape`. All three are
+closed functions of their fields: they read no files, and a seed gives the same scene on every machine.
 `render` makes the image, `simulate_points` the ground control.
 
-The camera is written from first principles and shares no code with the models that are fitted to it, so that a mistake
-in one cannot hide in the other.
+The camera is written from first principles and shares no code with the models that are fitted to it. So a mistake in
+one cannot hide in the other.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class LineScanner(SensorModel):
 
     In the orbital frame x points forward, y to the right, z down. A row is exposed at ``t = (row - height/2) *
     line_period`` seconds; columns run from right to left of the flight, so that a southward pass gives north-up images.
-    Light time, aberration and refraction are left out.
+    Light time, aberration and refraction are ignored.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class LineScanner(SensorModel):
     pixel_tan : float
         Tangent of the angle of one pixel.
     heights : tuple of 2 floats
-        Lowest and highest ellipsoidal height for which the camera is meant, metres.
+        Range of ellipsoidal heights of the camera, metres.
     """
 
     kind: ClassVar[str] = "line-scanner"
@@ -80,7 +80,7 @@ class LineScanner(SensorModel):
         earth_rate: float = EARTH_RATE,
         heights: tuple[float, float] | None = None,
     ) -> Self:
-        """Aim a camera so that the middle of its image lies on a ground point.
+        """Aim a camera so that the middle of its image shows a ground point.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class LineScanner(SensorModel):
 
     @cached_property
     def domain(self) -> tuple[Array, Array]:
-        """Centre and half-size of the box (degrees, degrees, metres) that the image sees between `heights`."""
+        """Centre and half-size of the box (degrees, degrees, metres) of the image between `heights`."""
         corners = np.array([[c, r] for c in (0.0, self.width) for r in (0.0, self.height)])
         seen = np.concatenate([self.image_to_ground(corners, h) for h in self.heights])
         low, high = seen.min(axis=0), seen.max(axis=0)
@@ -190,7 +190,7 @@ class LineScanner(SensorModel):
         return partials
 
     def image_to_ground(self, image: ArrayLike, height: ArrayLike) -> Array:
-        """Follow the ray of a pixel down to an ellipsoidal height; NaN where it misses the Earth."""
+        """Intersect the ray of a pixel with an ellipsoidal height; NaN if it misses the Earth."""
         origin, direction = self.rays(image)
         wanted = np.broadcast_to(np.asarray(height, dtype=np.float64), (len(origin),))
         distance = _meet_sphere(origin, direction, EARTH_A + wanted)
@@ -253,14 +253,14 @@ def _triple(vector: Array) -> tuple[float, float, float]:
 
 
 def _meet_sphere(origin: Array, direction: Array, radius: Array) -> Array:
-    """Return the distance along the rays to their first meeting with spheres about the Earth's centre; NaN if none."""
+    """Return the distance along rays to the first intersection with spheres about the Earth's centre; NaN if none."""
     half = (origin * direction).sum(axis=1)
     with np.errstate(invalid="ignore"):
         return -half - np.sqrt(half**2 - (origin**2).sum(axis=1) + radius**2)
 
 
 def _climb(ground: Array, direction: Array) -> Array:
-    """Return how fast the ellipsoidal height changes along rays at lon, lat, h."""
+    """Return the rate of the ellipsoidal height along rays at lon, lat, h."""
     lon, lat = np.radians(ground[:, 0]), np.radians(ground[:, 1])
     return np.cos(lat) * (np.cos(lon) * direction[:, 0] + np.sin(lon) * direction[:, 1]) + np.sin(lat) * direction[:, 2]
 
@@ -271,12 +271,12 @@ def _climb(ground: Array, direction: Array) -> Array:
 def meet_terrain(camera: LineScanner, terrain: Terrain, image: ArrayLike) -> Array:
     """Intersect the rays of image points with the terrain, by the secant method along the ray.
 
-    Slopes are taken to be gentler than the rays, so that nothing is hidden.
+    Slopes are assumed to be less steep than the rays, so nothing is hidden.
 
     Returns
     -------
     ndarray (N, 3)
-        Ground points in EPSG:4979, on the terrain to 1e-6 m; NaN where the search does not end.
+        Ground points in EPSG:4979, on the terrain within 1e-6 m; NaN if the iteration does not converge.
     """
     origin, direction = camera.rays(image)
     ground = camera.image_to_ground(image, sum(camera.heights) / 2)
@@ -308,14 +308,14 @@ def render(
     noise_dn: float = 4.0,
     seed: int = 0,
 ) -> NDArray[np.uint16]:
-    """Make the image that the camera takes: every pixel's own ray is followed to the terrain.
+    """Make the image of the camera: the ray of every pixel is intersected with the terrain.
 
     Parameters
     ----------
     pattern : callable
         Brightness ``(N,)`` in 0…1 of map coordinates ``(N, 2)``, such as a `Landscape`.
     window : tuple, optional
-        First column, first row, width, height; the whole image without it.
+        First column, first row, width, height; default: the whole image.
     noise_dn : float
         Standard deviation of the sensor's noise.
 
@@ -339,7 +339,7 @@ def render(
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPoints:
-    """Points as a surveyor would deliver them, beside their truth: image ``(N, 2)`` and EPSG:4979 ground ``(N, 3)``."""
+    """Points as a surveyor would deliver them, and their truth: image ``(N, 2)`` and EPSG:4979 ground ``(N, 3)``."""
 
     measured: Points
     true_image: Array
@@ -358,8 +358,8 @@ def simulate_points(
 ) -> SimulatedPoints:
     """Measure points on the terrain, spread over the image, with seeded noise in the image and on the ground.
 
-    The image is divided into one cell per point and each point lies somewhere in the middle of its cell; the check
-    points are spread among them.
+    The image is divided into one cell per point; each point is at a random position in the middle of its cell. Check
+    points are spread among control points.
 
     Raises
     ------

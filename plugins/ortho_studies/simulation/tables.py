@@ -1,11 +1,11 @@
-"""Tables that the reproductions of all papers share: the paper's numbers, ours beside them, and what that proves.
+"""Tables of the reproductions: the paper's numbers compared with ours, and the conclusions.
 
-An experiment is a sequence of `Number`, one for each number of the paper's tables (and, with `paper` None, for what the
-paper did not have), a sequence of `Knob`, one for each setting that somebody chose, and an array of what came out in
-each realisation. `make_document` puts them together; `page` shows the document.
+An experiment has a sequence of `Number`, one for each number of the paper's tables (`paper` is None for numbers that
+the paper does not have), a sequence of `Knob`, one for each chosen setting, and an array with the results of all
+realisations. `make_document` combines them; `page` shows the document.
 
-A number to which a knob was fitted proves nothing, so it is counted by itself. The others are predictions; beside each
-stands what somebody would have guessed from the paper's other numbers without simulating anything.
+A number to which a setting was fitted proves nothing, so it is counted separately. The others are predictions. Each is
+also compared with a naive guess from other numbers of the paper, without simulation.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class Number:
     units : str
         ``px``, ``m``, or empty where the number has none.
     paper : float, optional
-        What the paper found; nothing, if the paper had no such number.
+        The number of the paper, if it has one.
     naive : float, optional
-        What the paper's other numbers would let one guess.
+        A guess from other numbers of the paper.
     draw : bool
-        The paper's number is one draw from a distribution of which only the spread is known.
+        The paper's number is a single draw from a distribution with a known spread.
     """
 
     table: int | str
@@ -60,24 +60,24 @@ class Number:
 
     @property
     def key(self) -> str:
-        """Text that the patterns of `Knob.rows` are compared with."""
+        """Text for comparison with the patterns of `Knob.rows`."""
         return f"{self.table}|{self.label}|{self.quantity}"
 
 
 @dataclass(frozen=True)
 class Knob:
-    """A setting of an experiment that somebody chose.
+    """A setting of an experiment.
 
     Attributes
     ----------
     value : number, string, sequence or mapping
-        As it is used, with its units in `units`.
+        The value, with its units in `units`.
     source : str
         One of `SOURCES`.
     why : str
-        Why it has that value.
+        The reason for the value.
     rows : tuple of str
-        Which numbers it was fitted to: patterns ``table|label|quantity`` with ``*``; none unless fitted.
+        Numbers to which it was fitted: patterns ``table|label|quantity`` with ``*``; empty unless fitted.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Knob:
     rows: tuple[str, ...] = ()
 
     def fits(self, number: Number) -> bool:
-        """Tell whether the knob was fitted to a number."""
+        """Return whether the setting was fitted to a number."""
         return any(fnmatchcase(number.key, pattern) for pattern in self.rows)
 
     def to_json(self) -> dict[str, Any]:
@@ -105,12 +105,12 @@ class Knob:
 
 @dataclass(frozen=True)
 class Statement:
-    """A sentence of the paper, whether our results say the same, the numbers that say so, and why not (or too easily).
+    """A statement of the paper, whether our results confirm it, with which numbers, and the reason if not.
 
     Attributes
     ----------
     by_settings : bool
-        The settings leave it hardly any choice, so that it proves nothing if it holds.
+        The settings make it true, so it proves nothing.
     """
 
     text: str
@@ -125,7 +125,7 @@ class Statement:
         return VERDICTS[2] if not self.holds else VERDICTS[int(self.by_settings)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the statement as JSON values; the reason only where there is something to excuse."""
+        """Return the statement as JSON values, with the reason if it is needed."""
         why = self.why if self.verdict != VERDICTS[0] else ""
         return {"text": self.text, "verdict": self.verdict, "detail": self.detail, "why": why}
 
@@ -164,9 +164,9 @@ def make_document(
     Parameters
     ----------
     naive_text : str
-        How the naive guesses of `numbers` are made.
+        Method of the naive guesses of `numbers`.
     found : (R, N)
-        What came out in each realisation for each of `numbers`; NaN where nothing could be fitted.
+        Results of each realisation for each of `numbers`; NaN if nothing could be fitted.
     titles : mapping
         Title of each table, in the order of the page.
     """
@@ -219,26 +219,26 @@ def _line(number: Number, values: Array, knobs: Sequence[Knob]) -> dict[str, Any
 
 
 def is_within(row: Mapping[str, Any], factor: float = FACTORS[0], which: str = "median") -> bool:
-    """Tell whether our median (or the naive guess) of a row is within a factor of the paper's number."""
+    """Return whether our median (or the naive guess) of a row is within a factor of the paper's number."""
     if row["paper"] is None or row[which] is None:
         return False
     return bool(1 / factor <= row[which] / row["paper"] <= factor)
 
 
 def is_covered(row: Mapping[str, Any]) -> bool:
-    """Tell whether the paper's number lies between the 5th and the 95th percentile of ours."""
+    """Return whether the paper's number is between the 5th and the 95th percentile of ours."""
     return row["median"] is not None and row["paper"] is not None and bool(row["p5"] <= row["paper"] <= row["p95"])
 
 
 def is_missed(row: Mapping[str, Any]) -> bool:
-    """Tell whether a row disagrees with the paper: beyond the factor, or for a draw, beyond the percentiles."""
+    """Return whether a row disagrees with the paper: outside the factor, or for a draw, outside the percentiles."""
     if row["role"] == "extra":
         return False
     return not (is_covered(row) if row["role"] == "draw" else is_within(row))
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return how many rows there are, and how many agree, in each of the ways that a document tells."""
+    """Return the number of rows, and of those that agree, by each measure of a document."""
     return {
         "rows": len(rows),
         "within": {f"{factor:g}": sum(is_within(row, factor) for row in rows) for factor in FACTORS},

@@ -1,8 +1,8 @@
-"""A made-up piece of the Earth: the hills, and what one sees on them from above.
+"""A simulated part of the Earth: hills, and the landscape on them.
 
-`Terrain` gives heights and `Landscape` brightness, both as closed functions of map coordinates and a seed: they can be
-evaluated at any point, at any density, and give the same values on every machine. Edges in the landscape are as soft as
-one pixel, so that an image of it is not aliased and an ortho can be compared with it.
+`Terrain` gives heights and `Landscape` brightness, both as closed functions of map coordinates and a seed. They can be
+evaluated at any point and density, and give the same values on every machine. Edges in the landscape are as soft as one
+pixel, so images are not aliased and orthos can be compared with it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sums of random waves: hills and textures as closed functions of the place, the same on every machine.
+"""Sums of random waves: hills and textures as closed functions of the position, the same on every machine.
 
 The terms are added in a fixed order, so that simulated scenes stay the same to the last bit.
 """
