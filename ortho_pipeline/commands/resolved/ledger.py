@@ -173,7 +173,7 @@ def provenance(
     ----------
     inputs : list
         From `Ledger.hashed`.
-    asked : mapping of str to dataclass
+    settings : mapping of str to dataclass
         The groups of options that the result depends on besides its points, by name (`Request.asked`).
     """
     return {
