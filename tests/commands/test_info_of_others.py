@@ -48,7 +48,13 @@ def test_a_dem_says_what_it_is():
 def test_an_ortho_says_what_it_is():
     done = info(SAMPLE / "reference.tif")
     assert done.exit_code == 0, done.output
-    for text in ("an ortho or another map raster", "no sensor model", "EPSG:32636", "5 x 5 metre", f"--reference {SAMPLE}"):
+    for text in (
+        "an ortho or another map raster",
+        "no sensor model",
+        "EPSG:32636",
+        "5 x 5 metre",
+        f"--reference {SAMPLE}",
+    ):
         assert text in done.output
     document = json.loads(info(SAMPLE / "reference.tif", "--json").stdout)
     assert document["kind"] == "map image"
