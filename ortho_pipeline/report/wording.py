@@ -19,9 +19,9 @@ from ortho_pipeline.display.numbers import (
     size_m,
     size_text,
 )
+from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.estimation.records import Adjustment, Bias, Parameter, Rmse, RmseOnGround, RmsesOnGround
-from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import NOT_TESTED, Dem, FlatGround, Headline, MapScaleRecord, SceneReport

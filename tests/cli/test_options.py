@@ -16,9 +16,9 @@ from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, error_document
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options import GROUPS, BlockOptions, SurfaceOptions, options_of
-from ortho_pipeline.options.texts import Setting, Text
 
 
 def command_of(name: str) -> click.Command:
