@@ -239,7 +239,7 @@ def _scenes(
                 continue
             elif not equals:
                 raise InputError(
-                    f"it is not clear to which of the {len(images)} images {text} belongs",
+                    f"{text} does not name its image",
                     field=f"scene.{field}",
                     remedy=Text("name the image: ", Setting(f"scene.{field}", f"{Path(images[0]).name}={text}")),
                 )
