@@ -196,7 +196,7 @@ def start_of(
     correction = options.correction or (OWN if model.param_names else "shift")
     if correction == OWN and not model.param_names:
         raise InputError(
-            f"the model {own!r} has no adjustable parameters",
+            f"the model {own!r} has no parameters of its own to adjust",
             file=image,
             field="points.correction",
             remedy="use shift, shift-drift or affine",
