@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from ortho_pipeline.errors import OrthoError as OrthoError
     from ortho_pipeline.errors import PluginError as PluginError
     from ortho_pipeline.errors import reads as reads
+    from ortho_pipeline.errors.texts import Setting as Setting
+    from ortho_pipeline.errors.texts import Text as Text
+    from ortho_pipeline.errors.texts import counted as counted
     from ortho_pipeline.estimation.family_fit import fit_family as fit_family
     from ortho_pipeline.estimation.fit import Fit as Fit
     from ortho_pipeline.estimation.fit import fit as fit
@@ -117,9 +120,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.options import is_usable as is_usable
     from ortho_pipeline.options import number_of as number_of
     from ortho_pipeline.options import numbers_of as numbers_of
-    from ortho_pipeline.options.texts import Setting as Setting
-    from ortho_pipeline.options.texts import Text as Text
-    from ortho_pipeline.options.texts import counted as counted
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
     from ortho_pipeline.points import write_points as write_points
@@ -272,7 +272,7 @@ _NAMES = {
         "number_of",
         "numbers_of",
     ),
-    "options.texts": (
+    "errors.texts": (
         "Setting",
         "Text",
         "counted",

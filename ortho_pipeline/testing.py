@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import described
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.hookspecs import Scene, Sensor
 from ortho_pipeline.host.contract import model_faults, scene_faults, sensor_faults
 from ortho_pipeline.models import KINDS, SensorModel, model_from_dict
 from ortho_pipeline.models.base import as_ground
-from ortho_pipeline.options.texts import counted
 
 #: Image to ground and back must close within this (pixels).
 CLOSURE = 1e-5

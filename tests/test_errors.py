@@ -12,12 +12,12 @@ from ortho_studies.simulation.scanner import LineScanner, simulate_points
 from ortho_studies.simulation.terrain import Terrain
 
 from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.choice.comparison import compare
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.imaging.registration import Transform
 from ortho_pipeline.models import ImageCorrection
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points, read_points
 from ortho_pipeline.points.selection import select_control
 

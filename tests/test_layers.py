@@ -25,7 +25,8 @@ PACKAGE = ROOT / "ortho_pipeline"
 
 #: Rooms, and modules that stand between them, bottom to top: each imports only itself and what is on lines above.
 ROOMS = """
-errors options
+errors
+options
 files
 runtime
 stores

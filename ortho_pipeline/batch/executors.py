@@ -19,8 +19,8 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, TypeVar
 
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import EXECUTORS
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.runtime.process_limits import print_no_error_twice, require_memory, startable_threads
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.

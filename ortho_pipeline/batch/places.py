@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import Location, VsiPath, located
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.stores.objects import Objects
 
 _WALKS, _PATTERN_BYTES = 2, 1000

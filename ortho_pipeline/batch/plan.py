@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import os
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import pyproj
-
-from ortho_pipeline import host
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
 from ortho_pipeline.batch.places import PipelinePaths, Place
 from ortho_pipeline.commands.heights.automatic import AUTO
+from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
 from ortho_pipeline.errors import InputError, reads
@@ -31,7 +27,6 @@ from ortho_pipeline.options import (
     SceneOptions,
     SurfaceOptions,
 )
-from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.dem_mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
@@ -164,18 +159,6 @@ def plan(
     """
     file = place(located(path, allow_network=allow_network))
     return _Planner(file, read_config(file), PipelinePaths(path, root, allow_network)).plan()
-
-
-@functools.cache
-def versions() -> dict[str, Any]:
-    """Return the software that results depend on."""
-    packages = ("ortho-pipeline", "numpy", "scipy", "numba")
-    return {
-        **{name: metadata.version(name) for name in packages},
-        "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
-        "proj": pyproj.proj_version_str,
-        "plugins": sorted(f"{origin.plugin} ({origin})" for origin in host.Host.discover().plugins()),
-    }
 
 
 class _Planner:

@@ -22,9 +22,9 @@ import pydantic
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.json.records import Record
-from ortho_pipeline.options.texts import Text
 from ortho_pipeline.report.wording import refuted
 
 SCHEMA_VERSION = 1

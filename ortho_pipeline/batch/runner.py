@@ -29,12 +29,13 @@ from ortho_pipeline.batch.freshness import (
     reads_the_same,
     untouched,
 )
-from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan, versions
+from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
 from ortho_pipeline.batch.summary import paths_of
 from ortho_pipeline.commands.mosaic.assembly import assemble
+from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
 from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json

@@ -36,11 +36,11 @@ from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import marks_warning
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.base import Surface

@@ -24,8 +24,8 @@ from ortho_pipeline.block.equations.elimination import step_of
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
-from ortho_pipeline.options.texts import counted
 
 #: Without any control, each parameter is held at its start value by its effect in the image, with this sigma (px): the
 #: size of what vendors' orientations are off by.

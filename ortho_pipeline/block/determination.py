@@ -12,9 +12,9 @@ from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
-from ortho_pipeline.options.texts import counted
 
 
 def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:

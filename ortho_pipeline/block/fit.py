@@ -22,6 +22,7 @@ from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.variances.components import Variances, VariancesRecord
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.records import CommonError as CommonErrorRecord
 from ortho_pipeline.estimation.records import NoticeDocument, Parameter, Residual, Rmse, Role
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
@@ -29,7 +30,6 @@ from ortho_pipeline.files.json.records import Count, Record, Words
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import ROLES
 
 Triple = tuple[float, float, float]

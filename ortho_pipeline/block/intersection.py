@@ -18,9 +18,9 @@ from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.projection.rays import linearised
 from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 
 #: Rays whose point is so many times less certain along its worst direction than along its best are parallel.
 PARALLEL = 3e3

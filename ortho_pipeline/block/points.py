@@ -18,11 +18,11 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import is_usable
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import (
     checked_common,

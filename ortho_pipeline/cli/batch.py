@@ -17,8 +17,8 @@ from ortho_pipeline.cli.machine.terminal import printable, say
 from ortho_pipeline.cli.options import dry_run_option, json_option, mosaic_options, network_option
 from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_files, print_json, print_result, progress
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
-from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan

@@ -9,8 +9,8 @@ from dataclasses import replace
 import click
 
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import GROUPS, BlockOptions, MosaicOptions, options_of
-from ortho_pipeline.options.texts import Setting, Text
 
 #: Options of a scene and of a mosaic.
 _GROUPS = {**GROUPS, "mosaic": MosaicOptions}

@@ -15,6 +15,7 @@ import click
 from ortho_pipeline.cli.flags import FLAGS, with_flags
 from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import (
     BlockOptions,
     MatchOptions,
@@ -26,7 +27,6 @@ from ortho_pipeline.options import (
     SurfaceOptions,
     options_of,
 )
-from ortho_pipeline.options.texts import Setting, Text
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -239,7 +239,7 @@ def _scenes(
                 continue
             elif not equals:
                 raise InputError(
-                    f"it is not clear to which of the {len(images)} images {text} belongs",
+                    f"{text} does not name its image",
                     field=f"scene.{field}",
                     remedy=Text("name the image: ", Setting(f"scene.{field}", f"{Path(images[0]).name}={text}")),
                 )

@@ -16,7 +16,7 @@ import click
 from ortho_pipeline.cli.flags import as_typed, name_as_typed
 from ortho_pipeline.cli.machine.browser import page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable_json, say
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.results import CompareResult, FitResult, Result

@@ -12,6 +12,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import allowed, states, together, whole_or_nothing, write_json
 from ortho_pipeline.files.locations import Location, located, place
@@ -19,7 +20,6 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_stack import stack_bands
 from ortho_pipeline.imaging.registration import Registration
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.options.texts import counted
 
 SCHEMA_VERSION = 1
 

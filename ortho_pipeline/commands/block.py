@@ -37,6 +37,7 @@ from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
@@ -46,7 +47,6 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport

@@ -14,12 +14,12 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, fit_family
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, families, family_of, start_model
 from ortho_pipeline.options import BlockOptions, SceneOptions
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points
 
 
@@ -196,7 +196,7 @@ def start_of(
     correction = options.correction or (OWN if model.param_names else "shift")
     if correction == OWN and not model.param_names:
         raise InputError(
-            f"the model {own!r} has no adjustable parameters",
+            f"the model {own!r} has no parameters of its own to adjust",
             file=image,
             field="points.correction",
             remedy="use shift, shift-drift or affine",

@@ -25,12 +25,12 @@ from ortho_pipeline.commands.scene_fit import (
 )
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.choice import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import ridge_of
 from ortho_pipeline.models import families
 from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.report import document as report
 from ortho_pipeline.runtime.process_limits import one_blas_thread

@@ -11,13 +11,13 @@ from typing import Any
 from ortho_pipeline import host
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import allowed
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import PathLike, SceneOptions
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster import source as raster
 
 #: Sidecar files that GDAL attaches to an image of this stem, whatever the image itself contains.

@@ -29,6 +29,7 @@ from ortho_pipeline.commands.scene_fit import adjust, adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, ReportError, completed
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.export import FORMATS, Export, check_formats
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
@@ -38,7 +39,6 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.host import Host
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache

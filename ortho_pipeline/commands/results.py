@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import OrthoError, ReportError, error_document
+from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.family_fit import Removed
 from ortho_pipeline.estimation.fit import Fit
@@ -23,7 +24,6 @@ from ortho_pipeline.files import part_of_outputs, staged, together, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
-from ortho_pipeline.options.texts import Text
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.map_scale import map_scale

@@ -18,6 +18,7 @@ from ortho_pipeline.commands.stac.given import heights_given, with_items
 from ortho_pipeline.commands.survey.map_raster import described, is_upright, kind_of
 from ortho_pipeline.display.notices import to_document
 from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.json.values import json_value
@@ -30,7 +31,6 @@ from ortho_pipeline.host.unread import unread
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
 from ortho_pipeline.stores import kept

@@ -17,6 +17,7 @@ from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import CoverageError, InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.choice import comparison as comparing
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.family_fit import OWN, Removed, fit_family, fit_own, prune, restricted, ridge_of
@@ -26,7 +27,6 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, Pieces, SensorModel, families
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, PointOptions
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, marks_warning
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.report.matching import MatchingRecord

@@ -14,7 +14,7 @@ from html import escape
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text
 
 #: Variables of the page and what they are outside of it.
 _COLOURS = {"control": "#2563a8", "check": "#b4500b", "paper": "#ffffff", "ink": "#1b1f24", "stop": "#b3261e"}

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NoReturn
 
+from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.options.texts import Text
 
 _CODE = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 #: Code of a warning of a sensor that came as text alone.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 
 
 def render(template: str, package: str = "ortho_pipeline", **values: Any) -> str:

@@ -21,12 +21,12 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import chance_of, left_out, rms, squared_distances
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import outside_of_hull
 

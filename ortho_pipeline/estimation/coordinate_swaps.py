@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 
 #: Larger median residuals (px) are absurd: no vendor's model is so inaccurate.

@@ -8,11 +8,11 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DegeneratePoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.estimation.statistics import correlation_of
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
 #: Error if the uncertainty at a corner of the image (or of the domain) is this many times that of a measured point ...

@@ -9,12 +9,12 @@ from typing import TypeVar
 import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
+from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.estimation.fit import Fit, Prior, fit, gross_errors
 from ortho_pipeline.estimation.regularisation import METHODS
 from ortho_pipeline.models import family_of, start_model
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import number_of
-from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points import Points
 
 SensorModelT = TypeVar("SensorModelT", bound=SensorModel)

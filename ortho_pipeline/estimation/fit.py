@@ -14,6 +14,7 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.blunders import OutlyingPoint, checks_apart, find_blunders, outlying, refuse_many
 from ortho_pipeline.estimation.determinacy import (
     EXTRAPOLATION_WARNING,
@@ -43,7 +44,6 @@ from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors, shared
 from ortho_pipeline.estimation.statistics import correlation_of, student_of, total_correlation_of
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 

@@ -28,12 +28,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
 from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.statistics import effective_parameters, left_out, unit_weight
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
 #: Above this condition number the points do not determine the model.

@@ -21,12 +21,12 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.rpc_files import size_of_image
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text
 
 #: An image below this part of the size of its RPC's range is suspiciously small.
 _SMALL = 0.5

@@ -11,10 +11,10 @@ import numpy as np
 from osgeo import gdal, osr
 
 from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.rpc import name_sources_relatively
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.surface.base import Surface

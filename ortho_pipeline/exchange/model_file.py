@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ortho_pipeline.errors import InputError, PluginError, reads
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import read_json, write_json
 from ortho_pipeline.files.json.values import software_version
 from ortho_pipeline.models import model_from_dict, require_view
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.options.texts import Setting, Text
 
 SCHEMA_VERSION = 1
 DOCUMENT = "ortho-pipeline model"

@@ -17,6 +17,7 @@ from osgeo import gdal
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError, ModelError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.rpc_files import (
     TEXT_SUFFIXES,
     read_rpc_text,
@@ -31,7 +32,6 @@ from ortho_pipeline.files.locations import VsiPath, place
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.raster.source import open_dataset
 

@@ -25,9 +25,9 @@ from typing import Any
 
 from ortho_pipeline import files
 from ortho_pipeline.errors import InputError, completed, reads
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.options.texts import Setting, Text
 
 #: Limits in bytes of XML, and of the other formats, which usually have 20 kB.
 MAX_SIZE, MAX_PLAIN = 5_000_000, 1_000_000

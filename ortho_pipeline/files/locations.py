@@ -20,8 +20,8 @@ from typing import Any, Self
 from urllib.parse import unquote
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.traffic import COUNTING
-from ortho_pipeline.options.texts import Setting, Text
 
 #: Schemes of web servers, which give files and neither list nor take any, and GDAL's file systems that read them.
 WEB = {"https": "/vsicurl/https://", "http": "/vsicurl/http://"}

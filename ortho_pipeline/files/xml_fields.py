@@ -9,8 +9,8 @@ from datetime import datetime
 from xml.etree.ElementTree import Element
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.reading import read_bounded
-from ortho_pipeline.options.texts import counted
 
 MAX_SIZE = 5_000_000
 #: Numbers in one field, and elements of one name, that a scene may have.

@@ -25,10 +25,10 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import Transformer
 
 from ortho_pipeline.errors import CrsError, DatumError, OrthoError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.geodesy.geoid_grid import header_fault, refuse_absurd, refuse_unread
 from ortho_pipeline.geodesy.missing_grids import grid_of_message, grid_remedy, unavailable_grids, warn_of_better
-from ortho_pipeline.options.texts import Setting, Text
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import DatumError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import VERTICAL_FORMS, Vertical
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical
-from ortho_pipeline.options.texts import Setting, Text
 
 _SURVEY_FOOT = 1200 / 3937
 #: Length in metres of the units of heights, by name without blanks and punctuation.

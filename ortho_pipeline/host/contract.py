@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import OrthoError, described
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps
 from ortho_pipeline.hookspecs import Piece, Scene, Sensor
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 
 #: Smaller pixels (m) or a narrower scene mean that its ground is not in the units of its CRS.
 SMALLEST_PIXEL, NARROWEST = 1e-3, 1.0

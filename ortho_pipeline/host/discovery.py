@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed, described
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.hookspecs import Format, Scene, Sensor
@@ -19,7 +20,6 @@ from ortho_pipeline.host.contract import scene_faults
 from ortho_pipeline.host.registry import Broken, Origin, Registry
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.models import KINDS
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import open_dataset
 
 _COPY_IT = "correct this field, or copy the file again from the delivery"

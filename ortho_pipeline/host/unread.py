@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
-from ortho_pipeline.options.texts import Setting, Text
 
 _RECONSTRUCTIONS = ("reconstruction.json", "opensfm/reconstruction.json")
 #: Names of orthority's files of cameras and of orientations.

@@ -10,8 +10,8 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.imaging.registration import Registration, register
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.raster.source import open_pixels
 

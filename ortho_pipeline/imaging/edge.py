@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options.texts import Setting, Text, counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 
 Array = NDArray[np.float64]
 Segment = tuple[tuple[float, float], tuple[float, float]]

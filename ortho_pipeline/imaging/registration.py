@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.models.base import Array, as_image
-from ortho_pipeline.options.texts import counted
 
 #: Number of parameters by the name of the transformation.
 TRANSFORMS = {"similarity": 4, "affine": 6, "projective": 8, "poly2": 12}

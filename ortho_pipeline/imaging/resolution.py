@@ -18,9 +18,9 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.imaging.edge import HALF_WIDTH, Array, Edge, Segment, analyse_edge, said
 from ortho_pipeline.options import numbers_of
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.source import RasterSource
 
 SCHEMA_VERSION = 1

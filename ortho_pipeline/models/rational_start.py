@@ -6,13 +6,13 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.errors import TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.crs import parse_crs, utm_crs
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.families import Family, exponents, family_of
 from ortho_pipeline.models.rational import GEOCENTRIC, Rational
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
 #: The domain extends beyond the points by this part of its size.

@@ -1,8 +1,8 @@
 """Options of a user, grouped as the pipeline takes them.
 
-Each option is stated here, once: its field and default, and in an `Option` what the command line and the pipeline file
-make their own options from. Messages name an option by a `texts.Setting`: as ``group.field``, which it is called in
-Python and in the pipeline file, and of which the command line shows the flag.
+Each option is stated here, once: its field and default, and an `Option` from which the command line and the pipeline
+file make their own options. Messages name an option by an `errors.texts.Setting`, as ``group.field``. That is its name
+in Python and in the pipeline file; the command line shows the flag instead.
 
 Imports nothing but `errors`. A new option is a field in `groups`, of a block in `block`, of a mosaic in `mosaic`.
 """

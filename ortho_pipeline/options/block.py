@@ -4,9 +4,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options.groups import CHECK, MODEL_CRS, PIXEL_ORIGIN, VERTICAL_FORMS
 from ortho_pipeline.options.option import CORRECTIONS, Option, PathLike, documented
-from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented

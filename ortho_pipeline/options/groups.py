@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Protocol
 
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options.option import CORRECTIONS, PIXEL_ORIGINS, Option, PathLike, documented
 from ortho_pipeline.options.output import OutputOptions
-from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented

@@ -4,8 +4,8 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options.option import Option, documented
-from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options.option import PIXEL_TYPES, RESAMPLING, Option, PathLike, documented
-from ortho_pipeline.options.texts import Setting, Text
 
 
 @documented

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.points.image_errors import read_image_errors
 from ortho_pipeline.points.rows import (
     CSV_ERRORS,

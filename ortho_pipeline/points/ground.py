@@ -11,9 +11,9 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, DatumError, InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import VERTICAL_FORMS, Vertical, ground_transform, horizontal, parse_crs, same_crs
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points.rows import Table
 
 Array = NDArray[np.float64]

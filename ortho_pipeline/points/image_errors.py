@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.points.rows import CSV_ERRORS, PointRow, number, short, sigma_of
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import os
 import re
 
 from ortho_pipeline.errors import CrsError, InputError
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.points.rows import Line, PointRow, Table, cells_of, lines_of, number, short, sigma_of
 
 # -- QGIS ------------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.points.table import Array, Points
 
 _FORMS = "even:N, cluster:N[:K] (K 1-4: corners clockwise from the upper left, 5: middle), ids:a,b,c or random:N:seed"

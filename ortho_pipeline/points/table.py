@@ -20,10 +20,10 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError, completed, reads
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.ground import ground_of

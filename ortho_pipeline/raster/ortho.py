@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.pixel_types import holds, pixel_type
 from ortho_pipeline.raster.source import Grid, RasterSource

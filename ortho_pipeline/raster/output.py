@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.files.locations import VsiPath
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.source import first_line, open_dataset
 
 #: Blocks of a file that are read again before it gets its name.

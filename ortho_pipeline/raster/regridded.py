@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.naming import crs_text
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import MEMORY, Grid, RasterSource, first_line, open_dataset
 

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
 from ortho_pipeline.files.shell import converted, typed
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.opening.drivers import DRIVERS
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen

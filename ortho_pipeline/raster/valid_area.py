@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pyproj
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import open_pixels
 
@@ -74,7 +74,7 @@ def _polygons(geometry: BaseGeometry) -> list[Any]:
     return [part for one in parts for part in shapely.get_parts(one) if part.geom_type == "Polygon" and part.area > 0]
 
 
-def _unwrapped(ring: Array) -> Array:
+def _unwrapped(ring: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a closed ring of lon, lat with longitudes that do not jump; one around a pole goes by way of it."""
     lon = np.degrees(np.unwrap(np.radians(ring[:, 0])))
     ring = np.column_stack([lon, ring[:, 1]])

@@ -16,10 +16,10 @@ from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
 from ortho_pipeline.display.numbers import flat, metres, px
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.estimation.records import Rmse, is_known
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.block_records import BlockHeadline, BlockImage, BlockProvenance, BlockReport
 from ortho_pipeline.report.matching import RELATIVE

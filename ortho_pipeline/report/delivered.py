@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import px
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.records import Adjustment
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.records import UNKNOWN, Headline
 from ortho_pipeline.report.wording import headline
 

@@ -23,11 +23,11 @@ import numpy as np
 import pydantic
 
 from ortho_pipeline.display.numbers import class_size
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 
 Evidence = Literal["check", "delivered", "loo"]
 Limit = Literal["pixel", "accuracy"]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.numbers import metres, px, share
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
 from ortho_pipeline.estimation.records import Adjustment, Count, Pair
 from ortho_pipeline.files.json.records import Record
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Code of the notice of an adjustment to matches: its figures are no absolute ones.
 RELATIVE = "relative-to-reference"

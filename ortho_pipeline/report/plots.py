@@ -12,10 +12,10 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, number, round_down
 from ortho_pipeline.display.notices import doubted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.choice.comparison import ComparedModel
 from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.estimation.spatial.correlation import Covariance
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.gallery.plots import plot_match_histograms, plot_matches
 from ortho_pipeline.report.layers.accuracy import plot_accuracy
 from ortho_pipeline.report.records import SceneReport

@@ -17,9 +17,9 @@ import numpy as np
 import shapely
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import sha256, staged, whole_or_nothing, write_json
 from ortho_pipeline.geodesy.distortion import metres_of_steps
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import RasterSource

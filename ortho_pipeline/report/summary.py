@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.numbers import area_km2, metres, plain_size, px, share, short, signed, size_text
+from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Bias, Parameter, Point, is_known
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.map_scale import ce90_of
 from ortho_pipeline.report.matching import is_relative

@@ -13,9 +13,9 @@ from ortho_pipeline.display.numbers import (
     px,
     size_m,
 )
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.estimation.records import Adjustment, Rmse, RmseOnGround, RmsesOnGround
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import UNKNOWN, Headline, MapScaleRecord, SceneReport

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text
 
 #: Bytes of address space that any command needs beside its windows: libraries, compiled kernels, grids of PROJ.
 LEAST = 256 << 20

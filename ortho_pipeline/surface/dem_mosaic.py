@@ -24,10 +24,10 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, DatumError, InputError, completed
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.files.shell import typed_pattern
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.surface.base import Array
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import share
 from ortho_pipeline.errors import CoverageError, InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.geodesy.crs import ground_transform, utm_crs
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface

@@ -31,11 +31,11 @@ import numpy as np
 from osgeo import gdal, gdal_array
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_fit import REFUSE_ERROR, RpcExport
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.output import gdal_errors, written

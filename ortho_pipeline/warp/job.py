@@ -11,11 +11,11 @@ import pydantic
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.rpc_fit import RpcExport
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.files.shell import converted
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Resources, require_memory, startable_threads

@@ -15,10 +15,10 @@ import numpy as np
 import pydantic
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.json.records import DocumentError, Record
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.options import CORRECTIONS
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import DEFAULT_SIGMA_IMAGE, Points
 from ortho_pipeline.points.geojson import feature_of
 from ortho_pipeline.points.image_errors import says_more, sigma_of_covariance

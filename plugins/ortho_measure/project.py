@@ -20,11 +20,11 @@ from ortho_measure.places import Geometry, SceneGeometry, Sheet, ground_typed, l
 from ortho_measure.planning import Next
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import write_json
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import SceneView
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
 

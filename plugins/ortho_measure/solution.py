@@ -13,6 +13,7 @@ from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, rmse_metres
 from ortho_pipeline.estimation.observations.image_errors import ImageErrors
@@ -20,7 +21,6 @@ from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.options import MatchOptions
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 from ortho_pipeline.surface.base import Surface

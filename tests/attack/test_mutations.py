@@ -188,7 +188,7 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         ("/".join(["**"] * 8) + "/*.tif", "too complex a pattern"),
         ("../../**/*.tif", "outside the root folder"),
         ("/**/*.tif", "outside the root folder"),
-        ("a" * 300 + "/*.tif", "not a path"),
+        ("a" * 300 + "/*.tif", "not the path"),
         ("b" * 5000, "too complex a pattern"),
     ],
 )

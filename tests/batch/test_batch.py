@@ -27,6 +27,7 @@ from ortho_pipeline.batch import runner as batch
 from ortho_pipeline.batch.executors import Processes, WorkerDied, completed
 from ortho_pipeline.batch.records import RunRecord, locked
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.files import Outputs
@@ -478,7 +479,7 @@ def test_the_dem_concerns_all_scenes_and_other_software_too(block, monkeypatch):
     block.run()
     block.tiny.write_dem(block.folder / "dem.tif", share=0.99)
     assert block.run() == dict.fromkeys(("s0", "s1", "s2"), "done")
-    newer = {**batch_plan.versions(), "gdal": "99.0"}
+    newer = {**versions(), "gdal": "99.0"}
     monkeypatch.setattr(batch_plan, "versions", lambda: newer)
     monkeypatch.setattr(batch, "versions", lambda: newer)
     assert block.run() == dict.fromkeys(("s0", "s1", "s2"), "done")

@@ -470,7 +470,7 @@ def test_labels_are_unique(tmp_path: Path) -> None:
     labels = labels_of(paths)
     assert labels[:2] == ["a_x", "b_x"]
     assert len({label.lower() for label in labels}) == 4
-    with pytest.raises(InputError, match="given twice"):
+    with pytest.raises(InputError, match="listed twice"):
         labels_of([paths[0], paths[1], paths[0]])
 
 
@@ -484,7 +484,7 @@ def test_names_in_point_files_find_their_images(stereo: Stereo) -> None:
     assert one.rays == 30
     text = stereo.write().read_text().replace("aft/BAND.tif", "BAND").replace("fore/BAND.tif", "other")
     (stereo.folder / "rays.csv").write_text(text)
-    with pytest.raises(InputError, match="could mean"):
+    with pytest.raises(InputError, match="ambiguous"):
         points_of_images(read_block_points(stereo.folder / "rays.csv"), stereo.images, ["a", "f"])
 
 

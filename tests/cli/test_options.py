@@ -16,9 +16,9 @@ from ortho_pipeline.cli.flags import FLAGS, flags_of, with_flags
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, error_document
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.options import GROUPS, BlockOptions, SurfaceOptions, options_of
-from ortho_pipeline.options.texts import Setting, Text
 
 
 def command_of(name: str) -> click.Command:
@@ -103,7 +103,7 @@ def test_an_error_names_options_as_the_caller_knows_them(tiny, tmp_path) -> None
     done = CliRunner().invoke(cli, words)
     error = json.loads(done.stdout)["error"]
     assert (error["field"], error["message"]) == ("--height", "--dem and --height cannot be used together")
-    assert "--height: --dem and --height exclude" in done.stderr
+    assert "--height: --dem and --height cannot be used together" in done.stderr
     # The pipeline file has keys, the command that reads it some options of its own.
     (tmp_path / "block").mkdir()
     (tmp_path / "block" / "p.yaml").write_text(

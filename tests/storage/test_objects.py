@@ -295,7 +295,7 @@ def test_orthos_of_a_bucket_are_a_mosaic_in_a_bucket(
     there = [f"s3://bucket/orthos/{name}/{name}_ortho.tif" for name in "ab"]
     assert "--allow-network" in ortho("mosaic", *there, "-o", str(tmp_path / "no.tif"), code=2)
     assert "--allow-network" in ortho("mosaic", str(tmp_path / "a/a_ortho.tif"), "-o", "s3://bucket/m.tif", code=2)
-    assert "its own folder" in ortho("mosaic", *there, "-o", str(tmp_path / "m.vrt"), "--allow-network", code=2)
+    assert "in its folder" in ortho("mosaic", *there, "-o", str(tmp_path / "m.vrt"), "--allow-network", code=2)
     made = json.loads(ortho("mosaic", *there, "-o", "s3://bucket/all/m.tif", "--allow-network", "--json"))
     here = json.loads(ortho("mosaic", *(str(tmp_path / f"{one}/{one}_ortho.tif") for one in "ab"),
                             "-o", str(tmp_path / "m.tif"), "--json"))  # fmt: skip

@@ -320,9 +320,9 @@ def test_bands_that_do_not_match_leave_nothing(cameras, tmp_path):
     with pytest.raises(InputError):
         bands.register([cameras["image"], noise], tmp_path / "out")
     assert not list((tmp_path / "out").glob("*"))
-    with pytest.raises(InputError, match="not among the images"):
+    with pytest.raises(InputError, match="not one of the images"):
         bands.register([cameras["image"], noise], tmp_path / "out", reference=cameras["image_nir"])
-    with pytest.raises(InputError, match="one name"):
+    with pytest.raises(InputError, match="the same name"):
         bands.register([cameras["image"], cameras["image"]], tmp_path / "out")
 
 

@@ -120,7 +120,7 @@ def test_what_does_not_fit_is_refused(tmp_path, landscape, options, message):
     with pytest.raises(InputError, match=message) as caught:
         lay_out([a, b])
     assert caught.value.file == str(b.path)
-    with pytest.raises(InputError, match="needs an ortho"):
+    with pytest.raises(InputError, match="needs at least one ortho"):
         lay_out([])
 
 

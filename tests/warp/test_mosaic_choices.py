@@ -312,7 +312,7 @@ def test_what_cannot_be_is_refused(tmp_path):
             mosaic(paths, tmp_path / "m.vrt", MosaicOptions(format="VRT", **{field: True}))
         assert caught.value.field == f"mosaic.{field}"
         assert not (tmp_path / "m.vrt").exists()
-    with pytest.raises(InputError, match="given twice"):
+    with pytest.raises(InputError, match="listed twice"):
         mosaic([*paths, one.path], tmp_path / "m.tif")
     with pytest.raises(InputError, match="both input and output"):
         mosaic(paths, one.path)

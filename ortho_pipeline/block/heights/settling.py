@@ -18,11 +18,11 @@ from ortho_pipeline.block.heights.common_heights import CommonHeights, correlate
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights, planes_at
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma.
 _ROUNDS, _STABLE, _FEW = 10, 0.02, 0.02

@@ -18,10 +18,10 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Points of a pair at which it is computed.
 _PLACES = 30

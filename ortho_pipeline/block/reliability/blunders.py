@@ -24,11 +24,11 @@ from ortho_pipeline.block.reliability.standardised_residuals import Standardised
 from ortho_pipeline.block.reliability.suspects import GrossError, Trusted, judge
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.grid import estimate, reweighed
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.blunders import BLUNDER_RISK, SCALE_FLOOR, refuse_many
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.estimation.statistics import chance_of
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text
 
 _ROBUST_ROUNDS, _TEST_ROUNDS = 6, 8
 #: Robust weights that change less than this on average decide no more about who is a suspect.

@@ -12,9 +12,9 @@ from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 
 class ImageVariance(Record):

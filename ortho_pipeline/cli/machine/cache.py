@@ -10,7 +10,7 @@ from ortho_pipeline.cli.machine.terminal import say
 from ortho_pipeline.cli.options import json_option
 from ortho_pipeline.cli.parsing import Group
 from ortho_pipeline.cli.printing import print_json
-from ortho_pipeline.options.texts import counted
+from ortho_pipeline.errors.texts import counted
 
 _FAILED = 1
 

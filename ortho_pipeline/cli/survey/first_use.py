@@ -15,8 +15,8 @@ from ortho_pipeline.cli.options import json_option, scene_options
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_json, print_result, print_warnings, view_text
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.options.texts import counted
 
 if TYPE_CHECKING:
     from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind

@@ -18,10 +18,10 @@ from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.scene_fit import adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource

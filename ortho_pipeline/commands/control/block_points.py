@@ -23,10 +23,10 @@ from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, parse_crs
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface

@@ -16,13 +16,13 @@ import numpy as np
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource

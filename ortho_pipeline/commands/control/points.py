@@ -14,11 +14,11 @@ from ortho_pipeline.commands.control.matching import Matched, match_scene
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, of_option
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.hookspecs import Piece, Scene
 from ortho_pipeline.options import MatchOptions, PointOptions
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, assign_roles, gcps_of_dataset, points_of
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.rows import OWN_IMAGE

@@ -26,11 +26,11 @@ from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.intensity import Intensity

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from ortho_pipeline.errors import DatumError, InputError, OrthoError, of_option
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform
 from ortho_pipeline.geodesy.proj_grids import fetch_grid, missing_grid
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.cells.assembled import open_cells
 from ortho_pipeline.surface.cells.copernicus import Extent, extent_of
 from ortho_pipeline.surface.cells.sources import source_of

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from ortho_pipeline.commands.heights.automatic import AUTO, extents_under, open_automatic
 from ortho_pipeline.commands.stac.given import heights_given
 from ortho_pipeline.errors import InputError, completed, of_option
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions, number_of
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent

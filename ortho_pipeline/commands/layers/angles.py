@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import write_text
 from ortho_pipeline.options import OutputOptions
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report.layers.angles import AnglesLayer, angles_style
 from ortho_pipeline.runtime.process_limits import Resources
 

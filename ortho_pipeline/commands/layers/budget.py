@@ -14,12 +14,12 @@ from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.report.document import accuracy_style
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.runtime.process_limits import Resources

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.errors import InputError, completed
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import RasterSource

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pyproj
 
+from ortho_pipeline import host
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import files_of
@@ -159,6 +162,18 @@ def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:
         return []
 
 
+@functools.cache
+def versions() -> dict[str, Any]:
+    """Return the software that results depend on."""
+    packages = ("ortho-pipeline", "numpy", "scipy", "numba")
+    return {
+        **{name: metadata.version(name) for name in packages},
+        "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
+        "proj": pyproj.proj_version_str,
+        "plugins": sorted(f"{origin.plugin} ({origin})" for origin in host.Host.discover().plugins()),
+    }
+
+
 def provenance(
     request: Request,
     scene: Scene,
@@ -173,7 +188,7 @@ def provenance(
     ----------
     inputs : list
         From `Ledger.hashed`.
-    asked : mapping of str to dataclass
+    settings : mapping of str to dataclass
         The groups of options that the result depends on besides its points, by name (`Request.asked`).
     """
     return {

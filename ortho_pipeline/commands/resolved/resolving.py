@@ -13,9 +13,9 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, ModelError, completed
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import states
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface

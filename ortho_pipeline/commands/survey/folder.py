@@ -13,10 +13,10 @@ from ortho_pipeline import host
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import read_points
 from ortho_pipeline.raster.source import open_dataset
 

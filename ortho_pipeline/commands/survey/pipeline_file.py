@@ -10,9 +10,9 @@ from pathlib import Path
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.commands.survey.folder import FolderSurvey, Kind, survey
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import allowed, write_text
 from ortho_pipeline.options import SceneOptions
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 NAME = "pipeline.yaml"
 #: Kinds of files of a scene, with their group and key in the pipeline file.

@@ -18,6 +18,7 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.recommendation import recommend
 from ortho_pipeline.estimation.family_fit import OWN, fit_family, fit_own
@@ -26,7 +27,6 @@ from ortho_pipeline.estimation.records import LeftOut, NoticeDocument
 from ortho_pipeline.files.json.records import Count, Record, Words
 from ortho_pipeline.models import ImageCorrection, SensorModel, families, family_of
 from ortho_pipeline.models.correction import FREE
-from ortho_pipeline.options.texts import Text
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.control_hull import uncovered
 from ortho_pipeline.runtime.process_limits import one_blas_thread

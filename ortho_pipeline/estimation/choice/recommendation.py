@@ -19,12 +19,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 
 #: Chance that the scene's own model is rejected although the other one is only equally good (one-sided).
 _SIGNIFICANTLY_WORSE = 0.05

@@ -29,6 +29,7 @@ import pydantic
 from numpy.typing import ArrayLike, NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres, metre_partials, with_reference_height
 from ortho_pipeline.estimation.statistics import basis_of, student_of
@@ -36,7 +37,6 @@ from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_geodetic
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 
 #: Chance that random residuals are called systematic.
 SIGNIFICANCE = 0.05

@@ -18,7 +18,7 @@ def _as_it_is(text: object) -> str:
     return text
 
 
-#: A text for people: one that knows which options it names (`options.texts.Text`) stays so.
+#: A text for people: one that knows which options it names (`errors.texts.Text`) stays so.
 Words = Annotated[str, pydantic.PlainValidator(_as_it_is), pydantic.WithJsonSchema({"type": "string"})]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.band_shifts import BandShift, spread
@@ -43,7 +44,6 @@ from ortho_pipeline.imaging.matching.weights import Components, components, unex
 from ortho_pipeline.imaging.turns import orientations
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.image_errors import sigma_of_covariance
 from ortho_pipeline.raster.caching.block_cache import limit_cache

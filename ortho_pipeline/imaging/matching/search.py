@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.imaging.matching.agreement import affine_step, agreed, followed_by, shifted
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
@@ -33,7 +34,6 @@ from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_pe
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Left, top, right and bottom, px.
 Region = tuple[int, int, int, int]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Text
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
@@ -26,7 +27,6 @@ from ortho_pipeline.imaging.matching.search import Level
 from ortho_pipeline.imaging.matching.targets import SceneView, Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Text
 from ortho_pipeline.surface.rays import meet_surface
 
 #: Largest displacement by heights (chip px, standard deviation) for a common search of chips.

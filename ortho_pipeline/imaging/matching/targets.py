@@ -13,10 +13,10 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import CrsError, InputError, completed
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.shell import typed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
 from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, SceneView, metres_per_pixel
 from ortho_pipeline.imaging.ties.pairs import Pair, PairMatches, PairSummary, TieSettings, shared, shows
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 
 #: Largest ratio of the number of cells of a scene to the number of points wanted in its smallest overlap.

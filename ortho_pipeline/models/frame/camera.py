@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.models.base import (
     Array,
     SensorModel,
@@ -52,7 +53,6 @@ from ortho_pipeline.models.frame.working_frame import (
 )
 from ortho_pipeline.models.lens import INTERIOR, Interior
 from ortho_pipeline.models.light.refraction import FLATTEST
-from ortho_pipeline.options.texts import counted
 
 PARAMETERS = (*EXTERIOR, *INTERIOR)
 #: Warning for a camera whose `FrameCamera.sees_ground` is false.

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, rotation_between
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.frame.collinearity import rays
 from ortho_pipeline.models.frame.working_frame import GEOGRAPHIC, MAP, TOPOCENTRIC
 from ortho_pipeline.models.lens import Interior
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
 #: Numbers of triples to solve, and of solutions to refine.

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,11 +22,11 @@ from typing import Any
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, place, within
 from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.geodesy.crs_gate import refuse_files
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.raster.opening.drivers import (
     DRIVERS,
     PLAIN,

@@ -10,8 +10,8 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, round_down
 from ortho_pipeline.display.numbers import signed
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.records import Pair, is_known
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.gallery.matches import MatchPoint, in_words, shown
 from ortho_pipeline.report.records import SceneReport
 

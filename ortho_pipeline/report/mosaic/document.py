@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.numbers import share, short
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.naming import crs_definition, crs_text
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.warp.mosaic import Balance, Mosaic, Owners
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from ortho_pipeline.block.fit import Ray
 from ortho_pipeline.display.numbers import px
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.records import is_known
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.rows import ROLES
 from ortho_pipeline.report.block_records import BlockReport
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Drawing, round_down
 from ortho_pipeline.display.notices import doubted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.block_records import BlockReport
 
 #: Longer side of the drawing and its margin, CSS px; points, pairs and names beyond which none are drawn.

@@ -12,9 +12,9 @@ from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.network import NetworkRecord, network_of
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.geodesy.crs import ground_transform
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points.control_hull import COVERED, empty_parts
 from ortho_pipeline.report.map_scale import MapScaleRecord, judge
 

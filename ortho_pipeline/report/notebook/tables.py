@@ -15,11 +15,11 @@ from typing import Any
 
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.records import Rmse, Rmses
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 
 #: In a notebook, pages of reports are this high (CSS pixels).

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from ortho_pipeline.options.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text
 
 Level = Literal["stop", "look", "know"]
 

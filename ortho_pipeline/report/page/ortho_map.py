@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.display.drawing import Drawing, round_down
 from ortho_pipeline.display.notices import doubted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.records import Pair, Point, is_known
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.records import OrthoRecord, SceneReport
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from urllib.parse import quote
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files import write_text
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report.page.advice import WORDS, Signal, signals
 from ortho_pipeline.report.page.behaviour import policy, script

@@ -9,10 +9,10 @@ from typing import Any
 from urllib.parse import urljoin
 
 from ortho_pipeline.errors import InputError, StorageError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import AnyPath, Location, require_network, within
 from ortho_pipeline.files.reading import parse_json, read_json
 from ortho_pipeline.files.traffic import count
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.stores.objects import Objects
 
 #: Types of documents that hold items, or lead to them.

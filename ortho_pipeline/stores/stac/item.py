@@ -12,8 +12,8 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import AnyPath, Location
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.stores.stac.documents import COLLECTIONS, REMEDY, read_document, target
 from ortho_pipeline.stores.stac.places import Box, boxes_of
 

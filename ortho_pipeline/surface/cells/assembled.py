@@ -10,9 +10,9 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.errors import CoverageError, DatumError, InputError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
-from ortho_pipeline.options.texts import Setting, Text
 from ortho_pipeline.surface.base import Array, parse_fill
 from ortho_pipeline.surface.cells.copernicus import LIST, Cell, Extent, crs_of_cells
 from ortho_pipeline.surface.cells.sources import Source, misplaced

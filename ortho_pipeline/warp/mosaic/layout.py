@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options.texts import Setting, Text, counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 

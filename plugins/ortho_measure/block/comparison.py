@@ -17,9 +17,9 @@ from ortho_measure.block.solution import BlockSolution, solve
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 
 #: A smaller improvement of the error (a factor) does not justify more parameters.
 _WORTH = 1.05

@@ -16,9 +16,9 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.models.base import SensorModel
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS
 
 

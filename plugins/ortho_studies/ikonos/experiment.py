@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.family_fit import fit_family, fit_own, prune
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
@@ -22,7 +23,6 @@ from ortho_pipeline.models import family_of
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.map_plane import MapPlane
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
 from ortho_studies.ikonos.truth import (

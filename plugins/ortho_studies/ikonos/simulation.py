@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from osgeo import gdal, osr
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import write_text
-from ortho_pipeline.options.texts import counted
 from ortho_pipeline.points import Points, write_points
 from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.surface.writing import write_terrain

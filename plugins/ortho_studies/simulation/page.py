@@ -10,8 +10,8 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, round_down, style_sheet
 from ortho_pipeline.display.pages import render
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import counted
 from ortho_studies.simulation.tables import VERDICTS, is_covered, is_missed
 
 _SIDE, _MARGIN = 520.0, 18.0

@@ -1,4 +1,4 @@
-"""Errors that a caller can act on.
+"""Errors that a caller can act on, and the texts of messages, which name options.
 
 ::
 
