@@ -225,7 +225,7 @@ def test_ground_sigmas_are_estimated_or_stated_by_hand(stereo: Stereo, tmp_path:
     points = stereo.write()
     points.write_text(points.read_text().replace(",0.2,0.1,0.1", ",0.2,,"))
     text = run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
-    assert "Ground of 8 control points states no sigma; estimated: " in text
+    assert "8 control points state no ground accuracy; estimated: " in text
     assert "--ground-sigma" in text
     assert "Accuracy of the ground" in (tmp_path / "out" / "block_report.html").read_text()
     args = ("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
