@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ortho_pipeline import commands
-from ortho_pipeline.display.notices import FROM_SENSOR, Notice, to_document
+from ortho_pipeline.display.notices import FROM_SENSOR, Notice
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
