@@ -309,7 +309,7 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     assert "Good enough for maps at 1:" in verdict_of(tmp_path / "near")
     assert verdict_of(tmp_path / "near").endswith("This does not cover heights.")
     assert (tmp_path / "near" / "block_report.html").read_text().count('class="doubted"') == 1
-    assert "Warning: check point p9: its height is" in said
+    assert "Warning: Check point p9: its height is" in said
 
 
 def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:
