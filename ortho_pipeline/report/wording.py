@@ -1,4 +1,4 @@
-"""The report in words: the headline, the summary for the terminal, and numbers as people read them."""
+"""The report in words: the headline, the verdict on map scales, and what makes a figure untrue."""
 
 from __future__ import annotations
 
