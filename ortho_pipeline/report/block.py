@@ -258,20 +258,20 @@ def join_lines(network: NetworkRecord) -> list[str]:
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:
-    """Say what was found of ground that states no sigma."""
+    """Return the estimated accuracy of control whose ground states no sigma."""
     ground = variances.unstated_ground
     number = max(ground.xy.points, ground.h.points)
     if not number:
         return []
-    who = counted(number, "control point")
+    who = counted(number, "control point states", "control points state")
     if not variances.separable:
-        return [f"Ground of {who} states no sigma; its errors count as errors of measurement"]
+        return [f"{who} no ground accuracy; their ground errors count as measuring errors"]
     found = [
         f"{part.sigma:.2g} m in {what} (redundancy {part.redundancy:.1f})"
         for what, part in (("plan", ground.xy), ("height", ground.h))
         if part.sigma is not None
     ]
-    return [f"Ground of {who} states no sigma; estimated: {', '.join(found)}"]
+    return [f"{who} no ground accuracy; estimated: {', '.join(found)}"]
 
 
 def _pair(rms: Rmse | None) -> str:

@@ -1,4 +1,4 @@
-"""The report in words: the headline, the summary for the terminal, and numbers as people read them."""
+"""The report in words: the headline, the verdict on map scales, and what makes a figure untrue."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def headline(
     if not adjustment.points:
         return before or Headline(figure=UNKNOWN, metres=None, what="there are no points", notes=())
     rmse, ground = adjustment.rmse, rmse_m or RmsesOnGround(control=None, check=None, loo=None)
-    notes = [*fit_notes(adjustment), *_outlying_notes(adjustment)]
+    notes = [*_left_out_notes(adjustment), *fit_notes(adjustment), *_outlying_notes(adjustment)]
     if matching is not None and matching.relative is not None:
         return _of_matches(matching, matching.relative, notes)
     evidence, to = evidence_of(adjustment), ", relative to the reference" if is_relative(adjustment) else ""
@@ -299,23 +299,23 @@ def _headline(rmse: Rmse, ground: RmseOnGround | None, what: str, notes: Iterabl
 
 
 def fit_notes(adjustment: Adjustment) -> list[str]:
-    """Say which points were left out, and how well the model fits its own control points."""
-    notes = []
-    if lost := len(adjustment.rejected):
-        notes.append(
-            f"{counted(lost, 'control point')} left out. If you trust several of them, the model does not suit the "
-            "scene."
-        )
+    """Say how well the model fits its own control points."""
     control, parameters = adjustment.rmse.control, len(adjustment.parameters)
-    if control and parameters:
-        points = counted(control.n, "control point")
-        notes.append(
-            f"The fit: {px(control.total)} RMSE at {points}, redundancy {adjustment.redundancy}."
-            if adjustment.redundancy
-            else f"No redundancy: {counted(parameters, 'parameter')} always fit {points} exactly. This proves nothing "
-            "about accuracy."
-        )
-    return notes
+    if not control or not parameters:
+        return []
+    points = counted(control.n, "control point")
+    if adjustment.redundancy:
+        return [f"The fit: {px(control.total)} RMSE at {points}, redundancy {adjustment.redundancy}."]
+    exactly = f"{counted(parameters, 'parameter')} always fit {points} exactly"
+    return [f"No redundancy: {exactly}. This proves nothing about accuracy."]
+
+
+def _left_out_notes(adjustment: Adjustment) -> list[str]:
+    """Say how many control points were left out, and what it means if that is wrong."""
+    if not adjustment.rejected:
+        return []
+    lost = counted(len(adjustment.rejected), "control point")
+    return [f"{lost} left out. If you trust several of them, the model does not suit the scene."]
 
 
 def _outlying_notes(adjustment: Adjustment) -> list[str]:

@@ -226,9 +226,9 @@ def test_ground_sigmas_are_estimated_or_stated_by_hand(stereo: Stereo, tmp_path:
     points = stereo.write()
     points.write_text(points.read_text().replace(",0.2,0.1,0.1", ",0.2,,"))
     text = run("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
-    assert "Ground of 8 control points states no sigma; estimated: " in text
+    assert "8 control points state no ground accuracy; estimated: " in text
     assert "--ground-sigma" in text
-    assert "Accuracy of the ground" in (tmp_path / "out" / "block_report.html").read_text()
+    assert "state no ground accuracy" in (tmp_path / "out" / "block_report.html").read_text()
     args = ("adjust", *stereo.images, "--points", points, "-o", tmp_path / "out")
     report = json.loads(run(*args, "--ground-sigma", "0.1,0.2", "--json"))["report"]
     assert report["adjustment"]["variances"]["unstated_ground"]["h"]["points"] == 0
@@ -254,7 +254,7 @@ def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -
     assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
     assert "https://" not in page
     # Notices say what to do, and one script, named by its digest, sorts the tables.
-    assert "Keep more points apart as check points" in page
+    assert "Reserve more check points" in page
     assert page.count("<script") == page.count("script-src &#39;sha256-") == 1
     report = json.loads((out / "block_report.json").read_text())
     assert report["document"] == "ortho-pipeline block report"
@@ -308,9 +308,9 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "near")
     assert verdict_of(tmp_path / "near").startswith("1 of 12 check points contradicts the block (p9): without it 0.")
     assert "Good enough for maps at 1:" in verdict_of(tmp_path / "near")
-    assert verdict_of(tmp_path / "near").endswith("No scale is stated for heights.")
+    assert verdict_of(tmp_path / "near").endswith("This does not cover heights.")
     assert (tmp_path / "near" / "block_report.html").read_text().count('class="doubted"') == 1
-    assert "Warning: check point p9: its height is" in said
+    assert "Warning: Check point p9: its height is" in said
 
 
 def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:
@@ -379,8 +379,9 @@ def test_nothing_is_claimed_of_a_fit_to_control_alone(stereo: Stereo, tmp_path: 
     report = json.loads(
         run("adjust", *images, "--points", stereo.write(8, 0), "-o", tmp_path, "--json")
     )["report"]  # fmt: skip
-    assert "control points in the images: the fit, not a test" in report["headline"]["what"]
-    assert report["headline"]["figure"].endswith(" px")
+    head = report["headline"]
+    assert (head["figure"], head["what"]) == ("Accuracy unknown", "there are no check points")
+    assert "control points in the images. This does not test the accuracy." in head["notes"][0]
     lines = stereo.write(3, 0).read_text().splitlines()
     few = tmp_path / "few.csv"
     few.write_text("\n".join(lines[:3] + [line for line in lines if line.startswith(("p0,", "p1,", "p2,"))]) + "\n")

@@ -166,7 +166,7 @@ def test_rectify_says_which_share_came_from_where(tiny, steep, tmp_path):
     assert valid.sum() == report.warp.valid_pixels
     roles = {one["role"]: one for one in result.document["report"]["provenance"]["inputs"]}
     assert roles["other ortho"]["path"] == str(other.files["ortho"])
-    assert f"taken from {other.files['ortho']}" in result.files["html"].read_text()
+    assert f"filled from {other.files['ortho']}" in result.files["html"].read_text()
     assert "from another ortho" in result.summary
     item = json.loads(result.files["stac"].read_text())["properties"]
     assert item["ortho:filled_from"] == other.files["ortho"].name

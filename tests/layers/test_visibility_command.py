@@ -86,7 +86,7 @@ def test_rectify_writes_the_mask_with_the_ortho_and_reports_what_is_visible(tiny
     )
     # The gentle waves of this DEM hide nothing from a camera that looks down.
     assert read_report(result.files["report"]).warp.hidden_share == 0.0
-    assert "100 % of what the image reaches" in result.files["html"].read_text()
+    assert "100 % of the area of the image" in result.files["html"].read_text()
     again = dataclasses.replace(output, visibility="nodata")
     true = commands.rectify(tiny.image, tmp_path / "out", surface=surface, output=again)
     assert "visibility" not in true.files

@@ -124,7 +124,7 @@ def test_the_page_of_matches_is_a_page(case: Case, tmp_path: Path) -> None:
 
 
 def test_the_page_of_an_ortho_shows_its_matches(rectified: Path) -> None:
-    assert "matches with the largest residuals" in (rectified / "scene_report.html").read_text()
+    assert "those with the largest residuals" in (rectified / "scene_report.html").read_text()
 
 
 def test_csv_says_the_same_as_geojson(case: Case, written_points: tuple[Path, dict], tmp_path: Path) -> None:

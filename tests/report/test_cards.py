@@ -16,8 +16,6 @@ def test_what_was_held_out_is_not_called_left_out():
     roles = {"g": "control", "c": "check", "m": "check", "w": "check", "t": "tie", "u": "tie"}
     rays = [ray("g"), ray("c"), ray("t"), ray("m", False), ray("w", False), ray("u", False)]
     said = rays_text(rays, roles, {("w", "A")})
-    assert said == (
-        "1 control, 1 check, 1 tie; 1 held out to check; 1 measurement left out as wrong; 1 that determines nothing"
-    )
+    assert said == ("1 control, 1 check, 1 tie; 1 reserved for checking; 1 measurement rejected; 1 without effect")
     assert rays_text(rays[:2], roles, ()) == "1 control, 1 check"
-    assert rays_text([ray("w", False)], roles, {("w", "A")}) == "none; 1 measurement left out as wrong"
+    assert rays_text([ray("w", False)], roles, {("w", "A")}) == "none; 1 measurement rejected"

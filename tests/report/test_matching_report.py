@@ -227,9 +227,9 @@ def test_what_the_adjustment_left_out_is_said(tmp_path: Path) -> None:
     out = [point.id for point in one.report.adjustment.points if point.kind == "out"]
     assert out == ["m0"]
     worst = gallery(one.report, one.matches).worst[0]
-    assert (worst.id, worst.kind) == ("m0", "left out by the adjustment")
+    assert (worst.id, worst.kind) == ("m0", "rejected by the adjustment")
     page = page_of(one, tmp_path)
-    assert "1 left out by the adjustment" in page
+    assert "1 rejected by the adjustment" in page
     # It has no part in the histograms, and does not shorten the vectors of the others.
     assert len(residuals_by_axis(one.report)[1]) == 39
 

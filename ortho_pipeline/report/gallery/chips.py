@@ -123,7 +123,7 @@ def _tile(matches: Matches, index: int, one: MatchPoint, place: int) -> ChipPair
     column, row = (float(value) for value in side / 2 + matches.found[index])
     reason = one.candidate.reason
     inside = 0 <= column <= side and 0 <= row <= side
-    kinds = {"control": "control", "check": "check", "out": "left out by the adjustment"}
+    kinds = {"control": "control", "check": "check", "out": "rejected by the adjustment"}
     return ChipPair(
         id=one.candidate.id if one.point is None else one.point.id,
         kind="rejected" if reason is not None else kinds[one.kind],

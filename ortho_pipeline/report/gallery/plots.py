@@ -120,7 +120,7 @@ def _vectors(drawing: Drawing, kind: str, line: str, found: Sequence[tuple[Pair,
 
 def _legend_rows(found: Sequence[MatchPoint], room: float) -> list[list[tuple[str, str, float]]]:
     """Return the legend as rows of kind, text and how far to the right, px."""
-    names = {"control": "control", "check": "check (held out)", "out": "left out by the adjustment"}
+    names = {"control": "control", "check": "check (held out)", "out": "rejected by the adjustment"}
     rows: list[list[tuple[str, str, float]]] = []
     x = math.inf
     for kind, some in _by_kind(found).items():

@@ -12,10 +12,10 @@ from ortho_pipeline.files.json.records import Record
 
 #: What makes up the error of an ortho, in words.
 _NAMES = {
-    "points": "the points that the model was adjusted to",
-    "model": "the model as it was delivered",
+    "points": "the control points",
+    "model": "the delivered model",
     "heights": "the heights",
-    "reference": "the reference that was matched with",
+    "reference": "the reference image",
     "interpolation": "the warp",
 }
 #: Side of the map in CSS pixels.
@@ -49,13 +49,13 @@ class AccuracyLayer(Record):
         low, _, high = self.range_m
         least = "" if not self.unknown else "at least "
         said = (
-            f"CE90 over the scene is {least}{metres(self.ce90_m)} ({metres(low)} to {metres(high)} over nine tenths of "
-            f"it). Of the variance, {parts}."
+            f"CE90 over the scene: {least}{metres(self.ce90_m)} ({metres(low)} to {metres(high)} in 90 % of the area). "
+            f"Sources of the variance: {parts}."
         )
         if self.unknown:
-            said += f" Nothing is known of {' and '.join(_NAMES[name] for name in self.unknown)}."
+            said += f" Unknown and not included: {' and '.join(_NAMES[name] for name in self.unknown)}."
         if self.known < 1.0:
-            said += f" For {share(1.0 - self.known)} of the pixels the heights have no stated accuracy."
+            said += f" In {share(1.0 - self.known)} of the pixels the height accuracy is not stated."
         return said
 
 

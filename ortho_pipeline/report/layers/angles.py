@@ -21,11 +21,11 @@ class AnglesLayer(Record):
     def statement(self) -> str:
         """Return the angles in words."""
         low, high = self.view_zenith_deg
-        said = f"seen {low:.2f}° to {high:.2f}° off the vertical"
+        said = f"line of sight {low:.2f}° to {high:.2f}° off the vertical"
         if self.sun_deg is None or self.shadow_share is None:
-            return f"{said}; where the sun stood is not known"
+            return f"{said}; the position of the sun is unknown"
         azimuth, elevation = self.sun_deg
-        return f"{said}; the sun at {azimuth:.1f}°, {elevation:.1f}° high, {share(self.shadow_share)} in shadow"
+        return f"{said}; sun azimuth {azimuth:.1f}°, elevation {elevation:.1f}°; {share(self.shadow_share)} in shadow"
 
 
 def angles_style(layer: AnglesLayer) -> str:

@@ -79,10 +79,10 @@ def rays_text(rays: Sequence[Ray], roles: Mapping[str, str], wrong: Collection[t
     # Matches that check take part in nothing, so that they test what the others make.
     held = sum(roles[ray.id] == "check" and (ray.id, ray.image) not in wrong for ray in unused)
     said = [", ".join(found or ["none"])]
-    said += [f"{held} held out to check"] if held else []
-    said += [f"{counted(left, 'measurement')} left out as wrong"] if left else []
+    said += [f"{held} reserved for checking"] if held else []
+    said += [f"{counted(left, 'measurement')} rejected"] if left else []
     if rest := len(unused) - left - held:
-        said.append(f"{rest} that {'determines' if rest == 1 else 'determine'} nothing")
+        said.append(f"{rest} without effect")
     return "; ".join(said)
 
 

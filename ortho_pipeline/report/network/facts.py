@@ -35,13 +35,13 @@ def found_network(fit: BlockFit, join_limit: float) -> tuple[NetworkRecord, tupl
 
 
 def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...]:
-    """Return a notice if the points of images speak for a part of them only."""
+    """Return a notice if points cover only a part of some images."""
     part = {label: float(place["covered"]) for label, place in places.items() if place["covered"] < COVERED}
     if not part:
         return ()
     said = ", ".join(f"{100 * share:.0f} % of {label}" for label, share in list(part.items())[:6])
     said += "" if len(part) <= 6 else f" and less of {counted(len(part) - 6, 'more image')}"
-    text = f"points cover {said}: nothing holds or tests the rest"
+    text = f"points cover {said}: the rest is untested"
     return (Notice("points-cover-part", text, share=part),)
 
 

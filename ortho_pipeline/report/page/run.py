@@ -188,7 +188,7 @@ def _gravest(facts: Mapping[str, Any], *, tested: bool) -> Signal | None:
 
 
 def _order(row: SceneRow) -> tuple[Any, ...]:
-    """Failed scenes first, then what is to be settled, then those of unknown accuracy, then the largest RMSE."""
+    """Failed scenes first, then those with errors, then those of unknown accuracy, then the largest RMSE."""
     return [*STATES, "ready"].index(row.state), -(row.rmse or 0.0), row.name
 
 

@@ -1,5 +1,5 @@
 "use strict";
-/* Sorting, filtering and highlighting. Without it every number, chip and plot is there all the same. */
+/* Sorting, filtering and highlighting. The page has every number, chip and plot without it. */
 (() => {
   const value = (row, column) => row.cells[column]?.textContent.trim() ?? "";
   const number = (text) => Number.parseFloat(text.replace(/\u2212/g, "-").replace(/[,\u2009]/g, ""));
