@@ -101,6 +101,12 @@ def from_geodataframe(
     ------
     InputError, CrsError, DatumError
         The message names the row and the column.
+
+    Examples
+    --------
+    >>> frame = op.to_geodataframe(op.read_points("sample_data/gcps.geojson"))
+    >>> op.from_geodataframe(frame[frame.role == "check"])
+    <6 points: 6 check; WGS 84; sample_data/gcps.geojson>
     """
     table, sigmas = _table_of(frame)
     return replace(points_of(table, crs, vertical, "corner"), sigma_ground=sigmas)

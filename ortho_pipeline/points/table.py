@@ -390,6 +390,12 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
     InputError
         For another suffix, an id that would change (with blanks around it, or several in a row), or a folder that
         cannot be written.
+
+    Examples
+    --------
+    >>> op.write_points(op.read_points("sample_data/gcps.geojson"), out / "gcps.csv")
+    >>> len(op.read_points(out / "gcps.csv"))
+    18
     """
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}
     suffix = Path(path).suffix.lower()
