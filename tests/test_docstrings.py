@@ -31,6 +31,7 @@ WITHOUT = {
     "KINDS": "a table of classes",
     "LOOKS_PAST": "a notice",
     "SEMI_MAJOR": "a number",
+    "Pushbroom": "`pushbroom_of_tables` returns it",
     "TOPOCENTRIC": "a text",
     "hookimpl": "an object of pluggy; docs/plugins.md shows it",
     # Decorators of click, in the command that docs/plugins.md builds.

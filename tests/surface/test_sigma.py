@@ -60,5 +60,5 @@ def test_what_is_no_standard_deviation_is_refused(tiny, sigma):
     with pytest.raises(InputError) as caught:
         open_surface(SurfaceOptions(dem=tiny.dem, vertical="ellipsoid", sigma=sigma))
     assert (caught.value.field, bool(caught.value.remedy)) == ("surface.sigma", True)
-    with pytest.raises(InputError, match="there is none"):
+    with pytest.raises(InputError, match="none is given"):
         has_surface(SurfaceOptions(sigma=sigma))

@@ -102,12 +102,6 @@ class Pushbroom(SensorModel):
         Prior knowledge, which `constraints` adds to an adjustment.
     light : LightPath
         Aberration and refraction that the attitude does not include.
-
-    Examples
-    --------
-    >>> model = op.open_scene("sample_data/cartosat/BANDF.tif").models["pushbroom"]
-    >>> len(model.param_names)
-    18
     """
 
     kind: ClassVar[str] = "pushbroom"
