@@ -98,11 +98,11 @@ def checked(offset: Sequence[float]) -> tuple[float, float]:
     return float(offset[0]), float(offset[1])
 
 
-def fits(size: tuple[int, int], whole: tuple[int, int], offset: Sequence[float] | None) -> bool:
-    """Return whether an image of `size` is the `whole` image, or with an offset a crop within it."""
+def fits(size: tuple[int, int], larger: tuple[int, int], offset: Sequence[float] | None) -> bool:
+    """Return whether an image of `size` is the `larger` one, or with an offset a crop within it."""
     if offset is None:
-        return size == whole
-    return all(0 <= first <= total - side for first, side, total in zip(checked(offset), size, whole, strict=True))
+        return size == larger
+    return all(0 <= first <= total - side for first, side, total in zip(checked(offset), size, larger, strict=True))
 
 
 def noted_offset(dataset: Any) -> tuple[float, float] | None:
@@ -222,13 +222,13 @@ def _by_size(scene: Scene, dataset: Any, ranges: Array, offset: tuple[float, flo
     own = size_of_image(place(scene.model_source))
     if own is not None and (own == size or fits(size, own, offset)):
         return own != size, f"the RPC file is for an image of {own[0]} x {own[1]} pixels"
-    whole = _size_of_whole(dataset)
-    if whole is None or not fits(size, whole, offset):
+    larger = _size_of_whole(dataset)
+    if larger is None or not fits(size, larger, offset):
         return None
     # The middle of the range is the middle of the image, however far the range extends on both sides.
-    middle = ranges.mean(axis=1) - np.array(whole) / 2
+    middle = ranges.mean(axis=1) - np.array(larger) / 2
     decided = nearer(float(np.hypot(*(middle + offset))), float(np.hypot(*middle)), offset)
-    return None if decided is None else (decided, f"the larger image has {whole[0]} x {whole[1]} pixels")
+    return None if decided is None else (decided, f"the larger image has {larger[0]} x {larger[1]} pixels")
 
 
 def _size_of_whole(dataset: Any) -> tuple[int, int] | None:

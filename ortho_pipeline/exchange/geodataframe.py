@@ -104,9 +104,9 @@ def from_geodataframe(
 
     Examples
     --------
-    >>> frame = op.to_geodataframe(op.read_points("sample_data/gcps.geojson"))
-    >>> op.from_geodataframe(frame[frame.role == "check"])
-    <6 points: 6 check; WGS 84; sample_data/gcps.geojson>
+    >>> import ortho_pipeline as op
+    >>> from_geodataframe(to_geodataframe(op.read_points("sample_data/gcps.geojson")))
+    <18 points: 12 control, 6 check; WGS 84; sample_data/gcps.geojson>
     """
     table, sigmas = _table_of(frame)
     return replace(points_of(table, crs, vertical, "corner"), sigma_ground=sigmas)

@@ -333,9 +333,11 @@ def write_rpc_txt(rpc: RPC, path: str | PathLike[str]) -> None:
 
     Examples
     --------
-    >>> op.write_rpc_txt(op.read_rpc("sample_data/scene_RPC.TXT"), out / "scene_RPC.TXT")
-    >>> op.read_rpc(out / "scene_RPC.TXT").h_off
-    1000.0
+    >>> import tempfile
+    >>> path = f"{tempfile.mkdtemp()}/scene_RPC.TXT"
+    >>> write_rpc_txt(read_rpc_text("sample_data/scene_RPC.TXT"), path)
+    >>> open(path).readline().split()[0]
+    'LINE_OFF:'
     """
     fields = rpc_metadata(rpc)
     lines = [f"{key}: {fields[key]} {unit}" for key, (_, unit) in SCALARS.items()]

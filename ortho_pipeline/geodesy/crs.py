@@ -1,11 +1,10 @@
-"""Coordinate systems, height datums and the ways between them.
+"""Coordinate systems, height datums, and the transformations between them.
 
-Heights inside the package are metres above the WGS84 ellipsoid, whatever the horizontal system is: a point in the
-Belgian Lambert grid carries the same height as in WGS84. Only a vertical datum (`Vertical`) changes a height, and only
-where a file is read.
+Heights inside the package are metres above the WGS84 ellipsoid, for any horizontal CRS: a point in the Belgian Lambert
+grid has the same height as in WGS84. Only a vertical datum (`Vertical`) changes a height, and only when a file is read.
 
-Every transformation is asked for with ``only_best`` and without ballpark: PROJ otherwise leaves heights unchanged, with
-no error, where a geoid grid is not installed. PROJ's network access stays off, so that results depend on files only.
+Every transformation uses ``only_best`` and no ballpark operations. Otherwise PROJ would leave heights unchanged,
+without an error, if a geoid grid is not installed. PROJ's network access is off, so results depend only on files.
 """
 
 from __future__ import annotations
@@ -123,7 +122,7 @@ def map_crs(text: str | pyproj.CRS) -> pyproj.CRS:
     Raises
     ------
     CrsError
-        If it has no horizontal coordinates, or only PROJ knows it, so that no file could say it.
+        If it has no horizontal coordinates, or only PROJ knows it, so that no file could store it.
     """
     crs = parse_crs(text)
     remedy = "give a geographic or a projected CRS, such as EPSG:n"
@@ -148,7 +147,7 @@ def utm_crs(lon: float, lat: float) -> pyproj.CRS:
 
 
 def same_crs(first: pyproj.CRS, second: pyproj.CRS) -> bool:
-    """Tell whether two systems are one, whatever the order of their axes (x is always first here).
+    """Return whether two CRSs are equal, for any order of their axes (x is always first here).
 
     >>> same_crs(parse_crs("EPSG:4326"), parse_crs("OGC:CRS84"))
     True
@@ -194,9 +193,9 @@ class Vertical:
             return _vertical_of_code(plain.upper())
         if Path(plain).suffix.lower() in _GRID_SUFFIXES:
             path = Path(plain)
-            found = cls(str(path.resolve()) if path.exists() else plain)
-            vertical_transformer(found.name)
-            return found
+            grid = cls(str(path.resolve()) if path.exists() else plain)
+            vertical_transformer(grid.name)
+            return grid
         raise DatumError(f"{plain!r} is not a height datum", field="vertical", remedy=f"give {VERTICAL_FORMS}")
 
     @classmethod
@@ -244,7 +243,7 @@ class Vertical:
         Raises
         ------
         DatumError
-            If the grid is not installed (the remedy says how to get it), or gives impossible heights.
+            If the grid is not installed, or gives impossible heights.
         """
         lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=float), np.asarray(lat, dtype=float))
         if self.is_ellipsoid:
@@ -258,8 +257,8 @@ class Vertical:
         refuse_absurd(shift, self.name)
         if not self.name.startswith("EPSG:"):
             refuse_unread(transformer, lon, lat, shift, self.name)
-        asked = np.isfinite(lon) & np.isfinite(lat)
-        if asked.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
+        known = np.isfinite(lon) & np.isfinite(lat)
+        if known.any() and not np.isfinite(shift).any() and self.name.startswith("EPSG:"):
             # PROJ picks among several operations per point, and answers inf, not an error, where none has its grid.
             missing = unavailable_grids(_compound(self.name), "EPSG:4979")
             if missing:
@@ -340,18 +339,18 @@ def _grid_error(vertical: Vertical, message: str) -> DatumError:
 
 
 class GroundTransform:
-    """Map ground points ``(N, 3)`` of one system to another; heights are ellipsoidal metres on both sides.
+    """Transforms ground points ``(N, 3)`` from one CRS to another; heights are ellipsoidal metres on both sides.
 
-    Systems on a modern ellipsoid are promoted to 3D, so small differences between realisations enter the height.
-    Systems on a classical ellipsoid (Bessel, Airy, Hayford ...) are transformed in plan and keep the WGS84 height,
-    because heights are not measured above those. Geocentric systems are allowed on either side.
+    A CRS on a modern ellipsoid is promoted to 3D, so small differences between realisations enter the height. A CRS on
+    a classical ellipsoid (Bessel, Airy, Hayford ...) is transformed horizontally and keeps the WGS84 height, because
+    heights are not measured above such ellipsoids. Geocentric CRSs are allowed on either side.
 
     Instances can be pickled, and shared between threads.
 
     Parameters
     ----------
     source, target : str or pyproj.CRS
-        Of compound and 3D systems the horizontal part is used.
+        Only the horizontal part of a compound or 3D CRS is used.
 
     Raises
     ------
@@ -473,4 +472,4 @@ def ground_transform(source: str | pyproj.CRS, target: str | pyproj.CRS) -> Grou
     >>> ground_transform("EPSG:4979", "EPSG:32633")(np.array([[15.0, 41.9, 150.0]])).round(1).tolist()
     [[500000.0, 4638673.4, 150.0]]
     """
-    return _made_once(*(one if isinstance(one, str) else one.srs for one in (source, target)))
+    return _made_once(*(crs if isinstance(crs, str) else crs.srs for crs in (source, target)))

@@ -18,7 +18,7 @@ from ortho_pipeline.errors import CrsError
 _START = r"""(?:^|[=,@"'“\[(])\s*"""
 #: What PROJ does not look for in its folders: paths from the root, the home or the working folder, drives and URLs.
 _ELSEWHERE = r"(?:[/\\~]|\.\.?[/\\]|[a-z]:[/\\]|[a-z][a-z0-9+.-]+://)"
-#: Addresses of documents, and those that stand for a code, come first and are skipped: nobody opens them.
+#: Addresses of documents, and addresses that represent a code, come first and are skipped: nothing opens them.
 _LEADS = re.compile(
     r"""(?:\b(?:URI|CITATION|REMARK)\s*[\[(]|"(?:\$schema|uri|citation|remarks)"\s*[:,])\s*["“]\s*https?://"""
     rf"|^\s*https?://(?:www\.)?opengis\.net/|(?P<path>{_START}{_ELSEWHERE}|[/\\]\.\.(?![^/\\,\"'\s]))",

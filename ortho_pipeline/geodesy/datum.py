@@ -1,4 +1,4 @@
-"""Datum and unit of the heights of a DEM: what it declares against what the user says."""
+"""Datum and unit of the heights of a DEM: its declaration, checked against the options of the user."""
 
 from __future__ import annotations
 
@@ -66,15 +66,15 @@ def dem_vertical(
         return declared.vertical, [] if declared.certain else [by_name]
     if option == declared.vertical:
         return option, []
-    told, asked = f"the DEM states the height datum {declared.name!r}", Setting("surface.vertical")
-    used = Text(f"{told}; {option.label} was used instead (", asked, ")")
+    stated, setting = f"the DEM states the height datum {declared.name!r}", Setting("surface.vertical")
+    used = Text(f"{stated}; {option.label} was used instead (", setting, ")")
     warning = Notice("dem-datum-overridden", used, declared=declared.name, used=option.name)
     # A grid file is how a user brings the geoid of a declared datum whose own grid is not installed.
     realises = declared.vertical is not None and not declared.vertical.is_ellipsoid and ":" not in option.name[:5]
     realises = realises and not option.is_ellipsoid
     if declared.certain and not override and not realises:
         raise DatumError(
-            Text(f"{told}, but ", asked, f" gives {option.label}"),
+            Text(f"{stated}, but ", setting, f" gives {option.label}"),
             field="surface.vertical",
             remedy=Text(
                 "leave the option out, or override the datum of the file with ", Setting("surface.override_vertical")

@@ -64,10 +64,10 @@ def map_from_enu(crs: pyproj.CRS, ground: Array) -> Array:
     ndarray (N, 3, 3)
         What multiplies derivatives by ground coordinates, so that they are by metres on the ground.
     """
-    found = np.zeros((len(ground), 3, 3))
-    found[:, :2, :2] = inverse_2x2(east_north_from_map(crs, ground))
-    found[:, 2, 2] = 1.0
-    return found
+    slopes = np.zeros((len(ground), 3, 3))
+    slopes[:, :2, :2] = inverse_2x2(east_north_from_map(crs, ground))
+    slopes[:, 2, 2] = 1.0
+    return slopes
 
 
 def inverse_2x2(matrices: Array) -> Array:

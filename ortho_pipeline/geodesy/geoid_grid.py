@@ -29,7 +29,7 @@ _TRIED = 16
 def header_fault(path: Path) -> str | None:
     """Return what is wrong with a grid file that exists: a pipe, or a GTX or TIFF header that does not fit the file.
 
-    PROJ waits for the one, allocates what a GTX asks for, and divides by what a TIFF leaves out.
+    PROJ would wait for a pipe, allocate any size that a GTX states, and divide by a missing number of a TIFF.
     """
     try:
         header = read_bounded(path, _GTX.size - 1) if path.exists() else b""
@@ -53,7 +53,7 @@ def _fault_of_gtx(header: bytes, path: Path) -> str | None:
 
 
 def _fault_of_tiff(data: mmap.mmap) -> str | None:
-    """Return what is wrong with the directories of a TIFF: each has to say in which blocks its heights lie."""
+    """Return what is wrong with the directories of a TIFF: each must state the size of its blocks."""
     order = "<" if data[:2] == b"II" else ">"
     big = data[2:4] in (b"+\0", b"\0+")
     count, entry, offset = (struct.Struct(order + form) for form in (("Q", "HHQQ", "Q") if big else ("H", "HHII", "I")))
@@ -100,24 +100,24 @@ def refuse_absurd(undulation: np.ndarray, name: str) -> None:
 
 
 def refuse_unread(transformer: Transformer, lon: np.ndarray, lat: np.ndarray, shift: np.ndarray, file: str) -> None:
-    """Refuse a grid file that PROJ cannot read at positions ``(N,)`` which lie within it.
+    """Refuse a grid file that PROJ cannot read at positions ``(N,)`` inside the grid.
 
-    PROJ gives no height there without a word, as if they lay outside. Asked for errors, it has one for positions
-    outside and for those without a value, and none where it could not read.
+    PROJ silently gives no height there, as for positions outside. With error checks it reports positions outside and
+    without a value, but not positions that it could not read.
 
     Raises
     ------
     DatumError
-        If it is so at one of a few positions without a height, which are tried.
+        If one of a few tried positions cannot be read.
     """
     lost = np.flatnonzero(np.isnan(shift) & np.isfinite(lon) & np.isfinite(lat))
-    for one in lost[:: max(1, len(lost) // _TRIED)]:
+    for k in lost[:: max(1, len(lost) // _TRIED)]:
         try:
-            transformer.transform(lon.flat[one], lat.flat[one], 0.0, errcheck=True)
+            transformer.transform(lon.flat[k], lat.flat[k], 0.0, errcheck=True)
         except ProjError:
             continue
         raise DatumError(
-            f"the geoid grid cannot be read at {lon.flat[one]:.6g} {lat.flat[one]:.6g}, although the grid covers it",
+            f"the geoid grid cannot be read at {lon.flat[k]:.6g} {lat.flat[k]:.6g}, although the grid covers it",
             file=file,
             field="vertical",
             remedy="the file is cut off or damaged: copy it again",

@@ -1,4 +1,4 @@
-"""Coordinate systems as text: for people, and for programs that read them again."""
+"""Coordinate systems as text, for people and for programs."""
 
 from __future__ import annotations
 

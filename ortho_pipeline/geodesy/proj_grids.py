@@ -42,8 +42,8 @@ def grids() -> list[dict[str, Any]]:
         row: dict[str, Any] = {"datum": name, "crs": code, "found": True, "grid": None, "path": None}
         try:
             definition = vertical_transformer(code).definition
-            found = re.search(r"grids=(\S+)", definition)
-            row["grid"] = found.group(1) if found else None
+            match = re.search(r"grids=(\S+)", definition)
+            row["grid"] = match.group(1) if match else None
         except DatumError as error:
             grid = re.search(r"geoid grid (\S+),", error.message)
             row.update(found=False, grid=grid.group(1) if grid else None, remedy=error.remedy)
@@ -73,24 +73,24 @@ def missing_grid(vertical: str) -> str | None:
 
 
 def fetch_grid(name: str) -> Path:
-    """Fetch a grid from PROJ's own store into the user's folder of PROJ, where it is found from now on.
+    """Download a grid from PROJ's server to the user's PROJ folder, where PROJ finds it.
 
-    Whole or not at all: size and SHA-256 are those of the list that PROJ publishes beside its grids, and the header is
-    that of a grid. The caller is allowed to use the network.
+    The download is complete or fails: size, SHA-256 and header are checked against PROJ's list of grids. The caller
+    must be allowed to use the network.
 
     Raises
     ------
     InputError
         If PROJ has no grid of this name, or the folder cannot be written.
     StorageError
-        If it cannot be fetched as it is stored.
+        If the download fails, or is not the grid.
     """
     from pyproj.sync import get_proj_endpoint
 
     store = Objects(get_proj_endpoint(), allow_network=True)
     try:
         listed = parse_json(store.read(_LIST, _LIST_BYTES)[0], store.of(_LIST), "try again later")
-        facts = next(one["properties"] for one in listed["features"] if one["properties"]["name"] == name)
+        facts = next(feature["properties"] for feature in listed["features"] if feature["properties"]["name"] == name)
         digest = str(facts["sha256sum"])
     except FileNotFoundError as error:
         raise StorageError(
@@ -106,7 +106,7 @@ def fetch_grid(name: str) -> Path:
         raise StorageError(
             "PROJ's server does not have this grid", file=store.of(name), remedy="try again later"
         ) from error
-    # PROJ remembers which grids were not there, until it is told of its folders.
+    # PROJ remembers missing grids until its folders are set again.
     pyproj.datadir.set_data_dir(pyproj.datadir.get_data_dir())
     vertical_transformer.cache_clear()
     return path
@@ -124,5 +124,5 @@ def _fetch(store: Objects, path: Path, digest: str) -> None:
 
 def fetch_missing() -> list[dict[str, Any]]:
     """Fetch the grids of the common height datums that are not there; return the name and the path of each."""
-    wanted = [row["grid"] for row in grids() if not row["found"] and row["grid"]]
-    return [{"grid": name, "path": str(fetch_grid(name))} for name in wanted]
+    missing = [row["grid"] for row in grids() if not row["found"] and row["grid"]]
+    return [{"grid": name, "path": str(fetch_grid(name))} for name in missing]

@@ -1,4 +1,4 @@
-"""Single bands of one acquisition, each taken by a camera of its own, made into one image."""
+"""Stack of single bands of one acquisition, each from its own camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def stack_bands(
 ) -> tuple[Registration, ...]:
     """Register single-band images onto one of them and write a GeoTIFF with all bands.
 
-    The stack has the geometry of the reference. Pixels that a band does not cover are 0, which is declared as nodata.
+    The stack has the geometry of the reference. Pixels that a band does not cover are 0, the nodata value.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def stack_bands(
     names = list(images)
     stack, registrations = register(list(images.values()), names, reference=names.index(reference), transform=transform)
     dtype = next(iter(types))
-    # Splines overshoot; a dark pixel that is there is not nodata.
+    # Splines overshoot; a valid dark pixel must not become nodata.
     low, high = 1, np.iinfo(dtype).max
     filled = np.where(np.isfinite(stack), np.clip(np.rint(stack), low, high), 0).astype(dtype)
     write_bands(filled, names, output)
@@ -67,13 +67,13 @@ def _read(path: str | PathLike[str]) -> np.ndarray[Any, Any]:
 def write_bands(
     stack: np.ndarray[Any, Any], names: list[str], output: str | PathLike[str], *, nodata: int | None = 0
 ) -> None:
-    """Write pixels ``(bands, rows, columns)``, 8 or 16 bit, as a GeoTIFF whose bands have names."""
+    """Write pixels ``(bands, rows, columns)``, 8 or 16 bit, as a GeoTIFF with named bands."""
     count, rows, columns = stack.shape
     kind = gdal.GDT_Byte if stack.dtype == np.uint8 else gdal.GDT_UInt16
     with raster_output(output) as temporary:
         options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "TILED=YES", "BIGTIFF=IF_SAFER"]
-        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, count, kind, options)
-        with written(made) as dataset:
+        created = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, count, kind, options)
+        with written(created) as dataset:
             for index, name in enumerate(names, start=1):
                 band = dataset.GetRasterBand(index)
                 band.SetDescription(name)

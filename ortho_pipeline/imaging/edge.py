@@ -4,12 +4,12 @@ A straight edge that crosses the pixel grid at an angle is sampled at every sub-
 distance, its pixels are the edge spread function (ESF); its derivative is the line spread function (LSF), whose full
 width at half maximum (FWHM) is the effective resolution. A perfect sensor has the aperture of its pixel alone: an LSF
 of FWHM 1.0 and standard deviation :math:`\sqrt{1/12} = 0.29` pixels, whatever the angle. FWHM and `sigma` here include
-that aperture; `psf_sigma` is what optics, motion and processing add to it: the standard deviation of the Gaussian
-that, convolved with the square pixel as it lies against the edge, follows the pixels.
+that aperture. `psf_sigma` is the part of optics, motion and processing: the standard deviation of the Gaussian that,
+convolved with the square pixel at its angle to the edge, fits the pixels.
 
 Source: ISO 12233 (slanted edge, bins of a quarter pixel along the normal); section 1 of Bueyueksalih et al.
-(OrbView-3), whose claim that an effective resolution is not below the ground sample distance rests on such an analysis,
-and who warn that edge enhancement sharpens it: hence `overshoot`.
+(OrbView-3), who conclude from such an analysis that the effective resolution is not below the ground sample distance,
+and warn that edge enhancement sharpens it: hence `overshoot`.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ortho_pipeline.options.texts import Setting, Text, counted
 Array = NDArray[np.float64]
 Segment = tuple[tuple[float, float], tuple[float, float]]
 
-#: Pixels to each side of an edge that are looked at, at most; and the lines of pixels that an edge has to cross.
+#: Largest distance (px) from an edge to analyse, and least number of lines of pixels that an edge must cross.
 HALF_WIDTH, SHORTEST = 10.0, 10
 #: Bins of the edge spread function, pixels (ISO 12233).
 BIN = 0.25
 #: Standard deviation of the aperture of a pixel.
 APERTURE = math.sqrt(1 / 12)
-#: Least step of an edge, in standard deviations of the pixels beside it.
+#: Least step of an edge, in standard deviations of the noise.
 _CONTRAST = 5.0
 _NO_EDGE_REMEDY = Text("give an edge between two even areas with ", Setting("edge", "x1,y1,x2,y2"))
 
@@ -42,10 +42,10 @@ _NO_EDGE_REMEDY = Text("give an edge between two even areas with ", Setting("edg
 class Edge:
     """One edge and its spread; lengths in pixels.
 
-    `segment` is where the edge was found to be, `angle_deg` that of the edge against the nearer pixel axis, `profile`
-    the axis that its normal is nearer to. `noise` is the scatter of the pixels beside the edge, `sigma_error` the
-    standard deviation of `psf_sigma` from it, and `misfit` by how much the pixels near the edge are off the model
-    beyond it, as a share of the step. `distance`, `esf` (0 to 1) and `lsf` (per pixel) are the binned functions.
+    `segment` is the fitted edge, `angle_deg` its angle to the nearer pixel axis, `profile` the axis nearer to its
+    normal. `noise` is the scatter of pixels away from the edge, `sigma_error` the standard deviation of `psf_sigma`.
+    `misfit` is the deviation of pixels near the edge from the model, beyond noise, as a share of the step. `distance`,
+    `esf` (0 to 1) and `lsf` (per pixel) are the binned functions.
     """
 
     segment: Segment
@@ -65,7 +65,7 @@ class Edge:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the line spread, the pixel's aperture included."""
+        """Standard deviation of the line spread, including the aperture of the pixel."""
         return math.hypot(self.psf_sigma, APERTURE)
 
     def to_json(self) -> dict[str, Any]:
@@ -96,15 +96,15 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
     pixels : (H, W)
         NaN where there is no value.
     segment : two points
-        (column, row) of its ends, a few pixels off at most; the outer corner of the first pixel is (0, 0).
+        (column, row) of its ends, to a few pixels; the outer corner of the first pixel is (0, 0).
     half_width : float
-        How far to each side the two areas are even.
+        Width (px) of the even area on each side.
 
     Raises
     ------
     InputError
-        If it lies outside of the pixels, is too short, no edge or too faint, or lies so that the pixel grid samples it
-        at a few distances only (along a pixel axis, or at 45 degrees).
+        If it is outside the pixels, too short, too faint, or no edge; or if the pixel grid samples it at too few
+        distances (along a pixel axis, or at 45 degrees).
     """
     (x1, y1), (x2, y2) = segment
     if not all(map(math.isfinite, (x1, y1, x2, y2))):
@@ -122,7 +122,7 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
     area = _Area.around(view, ends, half_width)
     line = area.first_line()
     fitted = _Fitted.to(area, line)
-    # Only as far as the spread reaches: what lies further off may be something else.
+    # Only as far as the spread: pixels farther away may be something else.
     reach = max(5.0, 5 * math.hypot(fitted.sigma, APERTURE))
     if reach < half_width:
         area = _Area.around(view, fitted.ends(area), reach)
@@ -152,7 +152,7 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
 
 @dataclass(frozen=True, eq=False)
 class _Area:
-    """Pixels ``(rows, columns)`` around an edge that crosses rows: centres `x`, `rows`, and values, NaN where none."""
+    """Pixels ``(rows, columns)`` around an edge that crosses rows: centres `x`, `rows`, and values (NaN if none)."""
 
     rows: Array
     x: Array
@@ -184,7 +184,7 @@ class _Area:
         return cls(np.asarray(rows + 0.5), np.asarray(columns + 0.5), values.astype(np.float64), np.asarray(middle))
 
     def first_line(self) -> tuple[float, float]:
-        """Return a, b of ``x = a + b y`` through the centroids of the steps in each row; outliers are left out."""
+        """Return a, b of ``x = a + b y`` through the centroids of the steps in each row, without outliers."""
         slope = self.values[:, 2:] - self.values[:, :-2]
         x = self.x[:, 1:-1]
         window = np.cos(np.clip((x - self.middle[:, None]) / (x[:, -1:] - x[:, :1] + 1), -0.5, 0.5) * np.pi)
@@ -194,7 +194,7 @@ class _Area:
         known = total > 0
         if known.sum() < 3:
             raise InputError("there is no step in brightness", field="edge", remedy=_NO_EDGE_REMEDY)
-        # The square favours the steepest place over the noise beside it.
+        # The square favours the steepest place over noise.
         at = (x * weight**2).sum(axis=1)[known] / (weight**2).sum(axis=1)[known]
         rows = self.rows[known]
         keep = np.ones(len(rows), dtype=bool)
@@ -210,7 +210,7 @@ class _Area:
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """A Gaussian edge seen through the pixel, fitted to an area: ``x = a + b y``, and the levels to both sides."""
+    """A Gaussian edge with the aperture of the pixel, fitted to an area: ``x = a + b y``, and levels on both sides."""
 
     a: float
     b: float
@@ -230,7 +230,7 @@ class _Fitted:
         known = np.isfinite(area.values)
         y = np.broadcast_to(area.rows[:, None], area.values.shape)[known]
         x, values = area.x[known], area.values[known]
-        # About the middle of the edge, so that place and direction are apart.
+        # About the middle of the edge, to separate position and direction.
         centre = float(area.rows.mean())
         place = line[0] + line[1] * centre
         side = x - place - line[1] * (y - centre)
@@ -243,15 +243,15 @@ class _Fitted:
             return p[2] + (p[3] - p[2]) * edge_response(d, abs(p[4]), normal, abs(p[1]) * normal)
 
         start = np.array([place, line[1], *levels, 0.8])
-        # Soft, for areas are never quite even; the loss starts at the noise beside the edge.
+        # A soft loss, because areas are never quite even; it starts at the noise.
         beside = np.abs(side) > 3
         noise = 1.4826 * float(np.median(np.abs(values - np.where(side < 0, *levels))[beside]))
         if not scale > _CONTRAST * noise:
             raise _faint(scale, noise)
-        # Bounded, for where there is no edge the fit runs away.
+        # Bounded, because without an edge the fit diverges.
         turn = 8.0 / len(area.rows)
         wide = np.array([4.0, turn, 2 * scale, 2 * scale])
-        found = least_squares(
+        solution = least_squares(
             lambda p: (model(p) - values) / scale,
             start,
             loss="soft_l1",
@@ -260,16 +260,16 @@ class _Fitted:
             max_nfev=60,
             bounds=(np.append(start[:4] - wide, 0.0), np.append(start[:4] + wide, HALF_WIDTH)),
         )
-        place, b, low, high, sigma = found.x.tolist()
+        place, b, low, high, sigma = solution.x.tolist()
         normal = 1.0 / math.hypot(1.0, b)
         distance = (x - place - b * (y - centre)) * normal
-        left = values - model(found.x)
+        left = values - model(solution.x)
         far = np.abs(distance) > 2 + 2 * abs(sigma)
         noise = float(np.sqrt((left[far] ** 2).mean())) if far.sum() > 20 else float(left.std())
         near = np.abs(distance) <= 2 + abs(sigma)
         excess = float((left[near] ** 2).mean()) - noise**2 if near.any() else math.inf
         misfit = math.sqrt(max(excess, 0.0)) / scale
-        weak = np.linalg.pinv(found.jac.T @ found.jac)[4, 4]
+        weak = np.linalg.pinv(solution.jac.T @ solution.jac)[4, 4]
         error = math.sqrt(max(weak, 0.0)) * float(left.std()) / scale
         return cls(
             place - b * centre, b, low, high, abs(sigma), error, noise, misfit, distance, (values - low) / (high - low)
@@ -281,7 +281,7 @@ class _Fitted:
         return edge_response(distance, self.sigma, normal, abs(self.b) * normal)
 
     def ends(self, area: _Area) -> Segment:
-        """Return where the edge enters the first row and leaves the last."""
+        """Return where the edge enters the first row and leaves the last one."""
         top, bottom = float(area.rows[0] - 0.5), float(area.rows[-1] + 0.5)
         return (self.a + self.b * top, top), (self.a + self.b * bottom, bottom)
 
@@ -300,11 +300,11 @@ def _levels(side: Array, values: Array) -> tuple[float, float]:
 
 
 def edge_response(distance: Array, sigma: float, wide: Array | float, tall: Array | float) -> Array:
-    """Return what pixels at signed distances from an edge between 0 and 1 see through a Gaussian and a square pixel.
+    """Return the values of pixels at signed distances from an edge (0 to 1), through a Gaussian and a square pixel.
 
-    Against the normal of the edge, the pixel is the convolution of two boxes, `wide` and `tall` (cosine and sine of the
-    angle, of one edge or of each pixel's): so this is the second difference of the second integral of the cumulative
-    normal distribution.
+    Along the normal of the edge, the pixel is the convolution of two boxes, `wide` and `tall` (cosine and sine of the
+    angle, one for all or one for each pixel). So the value is the second difference of the second integral of the
+    cumulative normal distribution.
     """
     from scipy.special import ndtr
 
@@ -314,7 +314,7 @@ def edge_response(distance: Array, sigma: float, wide: Array | float, tall: Arra
         z = at / sigma
         return np.asarray(sigma**2 / 2 * ((z**2 + 1) * ndtr(z) + z * np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)))
 
-    # A box of a thousandth of a pixel is none, and differences over it still have ten digits.
+    # A box of a thousandth of a pixel has no effect, and differences over it still have ten digits.
     long, short = np.maximum(wide, tall), np.maximum(np.minimum(wide, tall), 1e-3)
     out, inner = (long + short) / 2, (long - short) / 2
     ends = twice(distance + out) + twice(distance - out) - twice(distance + inner) - twice(distance - inner)
@@ -342,14 +342,14 @@ def _faint(step: float, noise: float) -> InputError:
 
 
 def _binned(fitted: _Fitted) -> tuple[Array, Array, Array]:
-    """Return the centres of bins, by how much pixels there are off the fitted edge (0 to 1), and the error of that.
+    """Return the centres of bins, the deviation of their pixels from the fitted edge (0 to 1), and its error.
 
     Raises
     ------
     InputError
-        If some bin near the edge is empty: the angle of the edge repeats the same distances.
+        If a bin near the edge is empty, because the angle of the edge repeats the same distances.
     """
-    # A fit that ran away would have distances without end.
+    # A diverged fit would have unlimited distances.
     reach = math.floor(min(np.abs(fitted.distance).max(), 2 * HALF_WIDTH) / BIN - 0.5) * BIN
     edges = np.arange(-reach - BIN / 2, reach + BIN, BIN)
     which = np.digitize(fitted.distance, edges) - 1
@@ -365,20 +365,20 @@ def _binned(fitted: _Fitted) -> tuple[Array, Array, Array]:
             field="edge",
             remedy="give an edge at 3 to 40 degrees to the pixel axes, or a longer one",
         )
-    # What the model leaves, so that it does not matter where in a bin its pixels lie.
+    # Residuals of the model, so positions within a bin do not matter.
     left = fitted.values[inside] - fitted.model(fitted.distance[inside])
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.bincount(which, left, minlength=len(counts)) / counts
         error = np.where(counts > 0, fitted.noise / abs(fitted.high - fitted.low) / np.sqrt(counts), np.nan)
     filled = counts > 0
-    # The unbroken run around the edge.
+    # The continuous run of filled bins around the edge.
     low = len(centres) // 2 - int(np.argmin(np.append(filled[: len(centres) // 2 + 1][::-1], False))) + 1
     high = len(centres) // 2 + int(np.argmin(np.append(filled[len(centres) // 2 :], False)))
     return centres[low:high], mean[low:high], error[low:high]
 
 
 def _line_spread(fitted: _Fitted, distance: Array, left: Array) -> tuple[Array, float]:
-    """Return the LSF at the bins and its FWHM: derivatives of the fitted edge and, smoothed, of what it leaves."""
+    """Return the LSF at the bins and its FWHM: derivatives of the fitted edge and of its smoothed residuals."""
     from scipy.ndimage import gaussian_filter1d
 
     smooth = 0.4 * math.hypot(fitted.sigma, APERTURE)
@@ -402,7 +402,7 @@ def _crossing(at: Array, lsf: Array, peak: int, step: int, half: float) -> float
 
 
 def _overshoot(distance: Array, esf: Array, error: Array, sigma: float) -> float:
-    """Return by which share of the step the ESF exceeds its levels beside the edge; 0 where that may be noise."""
+    """Return the overshoot of the ESF beside the edge, as a share of the step; 0 if it may be noise."""
     beside = (np.abs(distance) > 0.5) & (np.abs(distance) <= 2 + 3 * sigma)
     above = np.where(distance > 0, esf - 1.0, -esf)
     clear = beside & (above > 3 * error)
@@ -410,5 +410,5 @@ def _overshoot(distance: Array, esf: Array, error: Array, sigma: float) -> float
 
 
 def said(segment: Segment) -> str:
-    """Return a segment as the command line takes it."""
+    """Return a segment in the form of the command line."""
     return ",".join(f"{value:.6g}" for end in segment for value in end)

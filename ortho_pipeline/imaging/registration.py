@@ -1,10 +1,10 @@
-"""Band-to-band registration: bands of several cameras brought onto one of them.
+"""Band-to-band registration: aligns bands of several cameras with one of them.
 
-Tie points are patches on a regular grid. Phase correlation (scikit-image) finds each to the pixel, and least squares
-(`matching.least_squares`) to its parts. Patches are measured twice: around the coarse shift of the whole frames, and
-again around the transformation that fits the first pass, so that they overlap to a pixel. A similarity, affine,
-projective or second-order polynomial transformation is fitted by least squares without the tie points that contradict
-the others, and the band is resampled once, by cubic splines.
+Tie points are patches on a regular grid. Phase correlation (scikit-image) finds each to a pixel, and least squares
+(`matching.least_squares`) to a fraction of it. Patches are measured twice: near the coarse shift of the frames, then
+near the transformation of the first pass, so that they overlap to a pixel. A similarity, affine, projective or
+second-order polynomial transformation is fitted by least squares without contradicting tie points. The band is
+resampled once, by cubic splines.
 
 Source: Ok and Turker, section 2.2; Yuksel et al. 2004 (the four cameras of BILSAT-1 onto the red one).
 """
@@ -25,15 +25,15 @@ from ortho_pipeline.options.texts import counted
 
 #: Number of parameters by the name of the transformation.
 TRANSFORMS = {"similarity": 4, "affine": 6, "projective": 8, "poly2": 12}
-#: Pixels around a patch in which least squares look for it.
+#: Search radius (px) of least squares around a patch.
 _REACH = 6
-#: A tie point is dropped beyond this many robust standard deviations, and never below this many pixels.
+#: A tie point is rejected beyond this many robust standard deviations, and never below this many pixels.
 _REJECT_SIGMAS, _REJECT_FLOOR = 3.5, 0.02
-#: Patches with less than this part of the band's usual contrast carry nothing to correlate.
+#: Least contrast of a patch, as part of the band's usual contrast.
 _CONTRAST = 0.2
-#: Patches that correlate less than this could as well be noise.
+#: Least correlation of patches; below, it can be noise.
 _LIKENESS = 0.4
-#: Standard deviation (px) of the blur that is taken away before patches are correlated.
+#: Standard deviation (px) of the blur to subtract before patches are correlated.
 _BROAD = 6.0
 
 
@@ -70,7 +70,7 @@ class Transform:
         Raises
         ------
         InputError, TooFewPoints
-            If there is no such transformation, or there are too few points for it.
+            If the transformation is unknown, or there are too few points.
         """
         if kind not in TRANSFORMS:
             raise InputError(
@@ -89,7 +89,7 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """How one band was brought onto the reference: tie points, transformation, residuals (moving minus fitted, px)."""
+    """Registration of one band: tie points, transformation, residuals (moving minus fitted, px)."""
 
     band: str
     transform: Transform
@@ -123,15 +123,15 @@ def register(
     patch: int = 64,
     spacing: int | None = None,
 ) -> tuple[Array, tuple[Registration, ...]]:
-    """Bring bands of one size onto one of them.
+    """Align bands of one size with one of them.
 
     Parameters
     ----------
     bands : sequence of (rows, columns) arrays
     reference : int
-        Index of the band that stays as it is.
+        Index of the band that does not change.
     patch, spacing : int
-        Side of the correlated patches and distance of their centres, px.
+        Side of the correlated patches, and distance of their centres (px).
 
     Returns
     -------
@@ -161,7 +161,7 @@ def register(
 
 
 def resample(band: Array, transform: Transform) -> Array:
-    """Return a band on the pixels of the reference, by cubic splines; NaN where it has none."""
+    """Return a band on the pixels of the reference, by cubic splines; NaN outside the band."""
     from scipy.ndimage import map_coordinates
 
     rows, columns = np.indices(band.shape)
@@ -170,17 +170,17 @@ def resample(band: Array, transform: Transform) -> Array:
 
 
 def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int) -> tuple[Array, Array]:
-    """Measure tie points: by phase correlation to the pixel, by least squares to its parts.
+    """Measure tie points: by phase correlation to a pixel, then by least squares.
 
     Parameters
     ----------
     guess : callable
-        Where about image points ``(N, 2)`` of `fixed` lie in `moving`.
+        Approximate positions in `moving` of image points ``(N, 2)`` of `fixed`.
 
     Returns
     -------
     reference, moving : ndarray (N, 2)
-        Centres of the patches and where they were found, in pixels from the outer corner.
+        Centres of the patches in both bands, in pixels from the outer corner.
     """
     half = patch // 2
     steps = [np.arange(half + 1, size - half, spacing) for size in fixed.shape]
@@ -188,7 +188,7 @@ def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int
     corners = np.rint(guess(centres.astype(float))).astype(int) - half
     window = np.outer(np.hanning(patch), np.hanning(patch))
     floors = [_CONTRAST * float(band.std()) for band in (fixed, moving)]
-    found = []
+    matches = []
     for centre, (left, top) in zip(centres, corners, strict=True):
         if left < 0 or top < 0 or left + patch > moving.shape[1] or top + patch > moving.shape[0]:
             continue
@@ -198,16 +198,16 @@ def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int
             continue
         shift, likeness = _shift(first, second, window)
         if np.abs(shift).max() < patch / 4 and likeness > _LIKENESS:
-            found.append((*centre, *(np.array([left, top]) + half + np.rint(shift))))
-    table = np.array(found, dtype=np.float64).reshape(-1, 4)
+            matches.append((*centre, *(np.array([left, top]) + half + np.rint(shift))))
+    table = np.array(matches, dtype=np.float64).reshape(-1, 4)
     return _refined(fixed, moving, table[:, :2], table[:, 2:], half)
 
 
 def _refined(fixed: Array, moving: Array, reference: Array, there: Array, half: int) -> tuple[Array, Array]:
-    """Return tie points whose places in `moving` are known to the pixel, measured to its parts; few drop out."""
+    """Return tie points that are known to a pixel in `moving`, measured to a fraction of it; a few are dropped."""
     from ortho_pipeline.imaging.matching import least_squares
 
-    # A patch may have moved over the rim of the other band.
+    # A patch may extend over the edge of the other band.
     rim = half + _REACH
     around = np.pad(moving, rim, constant_values=np.nan)
     chips = [fixed[y - half : y + half, x - half : x + half] for x, y in reference.astype(int)]
@@ -234,17 +234,17 @@ def _register_band(fixed: Array, moving: Array, name: str, transform: str, patch
 
 
 def details(band: Array) -> Array:
-    """Return what is smaller than a dozen pixels: broad differences of brightness pull the peak aside."""
+    """Return the detail smaller than a dozen pixels: broad differences of brightness displace the peak."""
     from scipy.ndimage import gaussian_filter
 
     return np.asarray(band - gaussian_filter(band, _BROAD), dtype=np.float64)
 
 
 def _shift(first: Array, second: Array, window: Array) -> tuple[Array, float]:
-    """Return by how many columns and rows the content of `first` has moved in `second`, and their correlation."""
+    """Return the shift (columns, rows) of the content of `first` in `second`, and their correlation."""
     from skimage.registration import phase_cross_correlation
 
-    # Without normalisation frequencies that carry nothing but noise have no say.
+    # Without normalisation, frequencies that have only noise do not count.
     rows_columns, error, _ = phase_cross_correlation(
         (first - first.mean()) * window,
         (second - second.mean()) * window,
@@ -300,7 +300,7 @@ def _solve_projective(x: Array, y: Array) -> Array:
     zero, terms = np.zeros((len(x), 3)), _terms("affine", x)
     design = np.vstack([np.hstack([terms, zero, -x * y[:, :1]]), np.hstack([zero, terms, -x * y[:, 1:]])])
     start = np.linalg.lstsq(design, y.T.ravel())[0]
-    # The linear solution weights points by their denominator; the image residuals are what counts.
+    # The linear solution weights points by their denominator; minimise image residuals instead.
     return np.asarray(least_squares(lambda p: (_project(p, x) - y).ravel(), start, method="lm").x)
 
 

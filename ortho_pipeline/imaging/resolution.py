@@ -1,8 +1,8 @@
-"""Effective resolution of an image: its edges found and measured, as document, text and plot.
+"""Effective resolution of an image: finds and measures its edges; results as document, text and plot.
 
-Edges are looked for in windows that are spread over the image: straight runs of strong gradient (Canny's outlines, a
-probabilistic Hough transform), of which those between even areas are kept. What is not sharp on the ground widens some
-of them, so that it is the median that counts, and its spread that tells how much.
+Edges are searched in windows spread over the image: straight runs of strong gradient (Canny's outlines, a probabilistic
+Hough transform) between even areas. Edges that are not sharp on the ground are wider, so the median counts, and its
+spread shows their effect.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.source import RasterSource
 
 SCHEMA_VERSION = 1
-#: An image is searched in at most so many windows of so many pixels a side, for at most so many edges.
+#: Largest number of windows, their side (px), and largest number of edges.
 _WINDOWS, _WINDOW, _MOST = 16, 768, 30
-#: Of edges that are found: how far to each side areas have to be even, pixels; least step, in standard deviations of
-#: the pixels beside it; largest misfit of the model near the edge, and error of its width, as shares.
+#: Limits of found edges: width of the even areas (px), least step (in standard deviations of the noise), largest misfit
+#: of the model, and largest error of the width (as shares).
 _NARROW, _CLEAR, _MISFIT, _UNSURE = 5.0, 6.0, 0.06, 0.1
-#: Edges closer than this are one, pixels.
+#: Edges closer than this (px) are the same.
 _APART = 5.0
-#: Longest edge that is measured by hand, pixels, and overshoot from which an image is called sharpened.
+#: Longest given edge (px), and overshoot above which an image is called sharpened.
 _LONGEST, _SHARPENED = 5000, 0.03
-#: Standard deviation of a point spread that cannot be told from none, pixels.
+#: Smallest significant standard deviation (px) of a point spread.
 _NONE = 0.1
 
 # -- finding edges ---------------------------------------------------------------------------------------------------
@@ -50,9 +50,9 @@ def find_edges(pixels: Array, *, most: int = _MOST) -> list[Edge]:
     Returns
     -------
     list of Edge
-        Empty where there is none; each crosses some ten lines of pixels or more.
+        Empty if there is none; each crosses ten lines of pixels or more.
     """
-    found: list[Edge] = []
+    clear: list[Edge] = []
     for segment in _candidates(pixels):
         try:
             edge = analyse_edge(pixels, segment, half_width=_NARROW)
@@ -60,16 +60,16 @@ def find_edges(pixels: Array, *, most: int = _MOST) -> list[Edge]:
             continue
         if edge.contrast < _CLEAR * edge.noise or edge.misfit > _MISFIT or edge.sigma_error > _UNSURE * edge.sigma:
             continue
-        found.append(edge)
-        if len(found) >= 2 * most:
+        clear.append(edge)
+        if len(clear) >= 2 * most:
             break
-    return _distinct(found, most)
+    return _distinct(clear, most)
 
 
 def _distinct(edges: Iterable[Edge], most: int) -> list[Edge]:
-    """Return the clearest edges, without parts of edges that are among them."""
+    """Return the clearest edges, without parts of other edges."""
     kept: list[Edge] = []
-    for edge in sorted(edges, key=lambda one: one.noise / one.contrast):
+    for edge in sorted(edges, key=lambda edge: edge.noise / edge.contrast):
         middle = np.mean(edge.segment, axis=0)
         if all(_distance(middle, other.segment) > _APART for other in kept):
             kept.append(edge)
@@ -77,7 +77,7 @@ def _distinct(edges: Iterable[Edge], most: int) -> list[Edge]:
 
 
 def _distance(point: Array, segment: Segment) -> float:
-    """Return how far a point is from a segment, prolonged by as much as edges have to be apart."""
+    """Return the distance of a point from a segment, extended by `_APART` at both ends."""
     first, last = np.array(segment)
     length = float(np.hypot(*(last - first)))
     along = (last - first) / length
@@ -114,7 +114,7 @@ def _shortened(first: Array, last: Array) -> Segment:
 # -- a file ----------------------------------------------------------------------------------------------------------
 
 
-def parse_edge(given: str) -> Segment:
+def parse_edge(text: str) -> Segment:
     """Read ``x1,y1,x2,y2``.
 
     Raises
@@ -122,23 +122,25 @@ def parse_edge(given: str) -> Segment:
     InputError
         If it is not four finite numbers.
     """
-    found = numbers_of(given)
-    if len(found) != 4 or any(map(math.isnan, found)):
+    numbers = numbers_of(text)
+    if len(numbers) != 4 or any(map(math.isnan, numbers)):
         raise InputError(
-            f"{given!r} is not an edge", field="edge", remedy="give columns and rows of both ends, as 120.5,30,140,95"
+            f"{text!r} is not an edge",
+            field="edge",
+            remedy="give columns and rows of both ends, such as 120.5,30,140,95",
         )
-    return (found[0], found[1]), (found[2], found[3])
+    return (numbers[0], numbers[1]), (numbers[2], numbers[3])
 
 
 def measure(
     image: str | os.PathLike[str], *, edge: Segment | None = None, band: int = 1, allow_network: bool = False
 ) -> list[Edge]:
-    """Measure one given edge of an image, or those that are found in windows spread over it.
+    """Measure one given edge of an image, or the edges found in windows spread over it.
 
     Raises
     ------
     InputError
-        If the image or the edge cannot be used, or none is found.
+        If the image or the edge cannot be used, or no edge is found.
     """
     source = RasterSource(image, allow_network=allow_network)
     if not 1 <= band <= source.count:
@@ -150,17 +152,17 @@ def measure(
         )
     if edge is not None:
         return [_given(source, edge, band)]
-    found: list[Edge] = []
+    edges: list[Edge] = []
     for left, top, width, height in _windows(source.width, source.height):
         inside = find_edges(_pixels(source, band, left, top, width, height))
-        found += [_moved(one, left, top) for one in inside]
-    if not found:
+        edges += [_moved(part, left, top) for part in inside]
+    if not edges:
         raise InputError(
             "no suitable edge found: it must be straight, between even areas, and oblique to the pixel axes",
             file=source.path,
             remedy=Text("give one with ", Setting("edge", "x1,y1,x2,y2")),
         )
-    return _distinct(found, _MOST)
+    return _distinct(edges, _MOST)
 
 
 def _given(source: RasterSource, edge: Segment, band: int) -> Edge:
@@ -225,7 +227,7 @@ def _moved(edge: Edge, left: int, top: int) -> Edge:
 def document(edges: Sequence[Edge], image: str | os.PathLike[str], band: int) -> dict[str, Any]:
     """Return what ``ortho edge --json`` prints (docs/engineering/formats.md): each edge, and medians by direction."""
     groups = {"all": list(edges)}
-    groups |= {name: [one for one in edges if one.profile == name] for name in ("along the row", "along the column")}
+    groups |= {name: [edge for edge in edges if edge.profile == name] for name in ("along the row", "along the column")}
     return {
         "schema_version": SCHEMA_VERSION,
         "image": os.fspath(image),
@@ -239,14 +241,14 @@ def _medians(edges: Sequence[Edge]) -> dict[str, Any] | None:
     """Return median and spread (scaled median absolute deviation; None for one edge) of each width."""
     if not edges:
         return None
-    found: dict[str, Any] = {"n": len(edges)}
+    medians: dict[str, Any] = {"n": len(edges)}
     for name in ("fwhm", "sigma", "psf_sigma"):
         values = np.array([getattr(edge, name) for edge in edges])
         median = float(np.median(values))
-        found[f"{name}_px"] = median
-        found[f"{name}_spread_px"] = None if len(edges) < 2 else 1.4826 * float(np.median(np.abs(values - median)))
-    found["overshoot"] = float(np.median([edge.overshoot for edge in edges]))
-    return found
+        medians[f"{name}_px"] = median
+        medians[f"{name}_spread_px"] = None if len(edges) < 2 else 1.4826 * float(np.median(np.abs(values - median)))
+    medians["overshoot"] = float(np.median([edge.overshoot for edge in edges]))
+    return medians
 
 
 def typical(edges: Sequence[Edge]) -> Edge:
@@ -256,7 +258,7 @@ def typical(edges: Sequence[Edge]) -> Edge:
 
 
 def text(result: dict[str, Any]) -> str:
-    """Return the document as a table and what it means."""
+    """Return the document as a table, with its interpretation."""
     lines = [
         f"{'edge (x1,y1,x2,y2)':<36}{'angle':>6}{'lines':>7}{'contrast':>10}{'noise':>8}{'FWHM':>8}{'sigma':>8}"
         f"{'PSF sigma':>16}"
@@ -284,14 +286,14 @@ def text(result: dict[str, Any]) -> str:
             f"Effective resolution {group['fwhm_px']:.2f}{spread} px (FWHM; {count}{what}), "
             f"PSF sigma {group['psf_sigma_px']:.2f} px"
         )
-    lines.append("FWHM and sigma include the aperture of the pixel (alone: 1.00 and 0.29 px), the PSF sigma does not.")
+    lines.append("FWHM and sigma include the aperture of the pixel (alone: 1.00 and 0.29 px); the PSF sigma does not.")
     if median["all"]["overshoot"] > _SHARPENED:
         share = 100 * median["all"]["overshoot"]
         lines.append(
-            f"The edges overshoot by {share:.0f} % of their step, as sharpened images do: the optics are worse."
+            f"The edges overshoot by {share:.0f} % of their step: the image is sharpened, and the optics are worse."
         )
     if median["all"]["fwhm_px"] < 0.9:
-        lines.append("That is narrower than the aperture of a pixel: sharpened, or sampled without an aperture.")
+        lines.append("This is narrower than the aperture of a pixel: sharpened, or sampled without an aperture.")
     return "\n".join(lines)
 
 

@@ -135,9 +135,9 @@ def _box(
         middle = image[usable].mean(axis=0)
         design = np.column_stack([np.ones(int(usable.sum())), image[usable] - middle])
         plane = np.linalg.lstsq(design, ground[usable], rcond=1e-6)[0]
-        found = np.column_stack([np.ones(4), corners - middle]) @ plane
-        found[:, 2] = ground[usable, 2].mean()
-        reached.append(found)
+        seen = np.column_stack([np.ones(4), corners - middle]) @ plane
+        seen[:, 2] = ground[usable, 2].mean()
+        reached.append(seen)
     everything = np.concatenate(reached)
     near = np.isfinite(ground).all(axis=1)
     if size is not None:

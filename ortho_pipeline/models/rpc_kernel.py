@@ -24,7 +24,7 @@ BLOCK = 256
 
 @inlined
 def normalised(lon, lat, h, offsets, scales):
-    """Return longitude, by the shorter way round the Earth, latitude and height as the polynomials take them."""
+    """Return normalised longitude (the shorter way around the Earth), latitude and height."""
     east = lon - offsets[0]
     east = east - 360.0 * np.rint(east / 360.0)
     return east / scales[0], (lat - offsets[1]) / scales[1], (h - offsets[2]) / scales[2]
@@ -43,9 +43,9 @@ def polynomial(a, x, y, z):
 
 @inlined
 def slopes(a, x, y, z):
-    """Return its derivatives by x, y and z."""
+    """Return the derivatives of a polynomial by x, y and z."""
     xx, yy, zz = x * x, y * y, z * z
-    # What squares are multiplied by.
+    # The factors of the squares.
     p, q, r = a[7] + y * a[14] + z * a[17], a[8] + x * a[12] + z * a[18], a[9] + x * a[13] + y * a[16]
     return (
         a[1] + y * (a[4] + z * a[10]) + z * a[5] + 2.0 * x * p + 3.0 * xx * a[11] + yy * a[12] + zz * a[13],
@@ -56,13 +56,13 @@ def slopes(a, x, y, z):
 
 @inlined
 def is_within(x, y, z, limits):
-    """Tell whether a place is within the limits of an RPC."""
+    """Return whether a place is within the limits of an RPC."""
     return (abs(x) <= limits[0]) & (abs(y) <= limits[0]) & (limits[1] <= z) & (z <= limits[2])
 
 
 @inlined
 def is_point(u, v, m, q):
-    """Tell whether two ratios are an image point: neither denominator is at or behind its pole."""
+    """Return whether two ratios are an image point: neither denominator is at or behind its pole."""
     return (m > 0.0) & (q > 0.0) & (abs(u) < np.inf) & (abs(v) < np.inf)
 
 
@@ -109,7 +109,7 @@ def project(ground, offsets, scales, coefficients, limits, image):
 def linearise_rpc(count, offsets, scales, table, limits, work):
     """Fill rows 3 to 10 of `work` ``(11, n)`` with columns, rows, and their partials by lon, lat, h.
 
-    Rows 0 to 2 hold `count` normalised places.
+    Rows 0 to 2 have `count` normalised places.
     """
     for k in range(count):
         x, y, z = work[0, k], work[1, k], work[2, k]
@@ -141,7 +141,7 @@ def projected(ground, offsets, scales, coefficients, limits, image, partials):
 
 @inlined
 def _newton(work, table, col_scale, row_scale, tolerance):
-    """Take the points of a block that have not closed a step further; return how many are left after it."""
+    """Do a Newton step for the points of a block that have not converged; return how many are left."""
     left = 0
     for k in range(BLOCK):
         x, y, z, missed = work[0, k], work[1, k], work[2, k], work[3, k]
@@ -150,7 +150,7 @@ def _newton(work, table, col_scale, row_scale, tolerance):
         vx, vy, _ = _ratio_slopes(table[2], table[3], v, q, x, y, z)
         du, dv, scale = work[4, k] - u, work[5, k] - v, 1.0 / (ux * vy - uy * vx)
         dx, dy = (vy * du - uy * dv) * scale, (ux * dv - vx * du) * scale
-        # A step beyond the domain comes from a bad linearisation far from the solution: go a shorter way.
+        # A step beyond the domain comes from a bad linearisation far from the solution: shorten it.
         longest = max(abs(dx), abs(dy), 1.0)
         due = missed > tolerance
         work[0, k], work[1, k] = x + dx / longest if due else x, y + dy / longest if due else y
@@ -165,14 +165,14 @@ def _newton(work, table, col_scale, row_scale, tolerance):
 def image_to_ground(image, heights, offsets, scales, coefficients, limits, tolerance, verified, steps, ground):
     """Fill `ground` ``(N, 3)`` with the points at ellipsoidal `heights` ``(N,)`` whose projections are `image`.
 
-    Newton's method from the middle of the domain, as for any model, with all of a block in each step.
+    Newton's method from the middle of the domain, as for any model, with the whole block in each step.
     """
-    # Normalised place, by how many pixels it missed before its last step, and the ratios that it is to have.
+    # Normalised place, its error (px) before the last step, and its target ratios.
     work, table = np.zeros((6, BLOCK)), coefficients.copy()
     for first in range(0, len(image), BLOCK):
         count = min(BLOCK, len(image) - first)
         for k in range(BLOCK):
-            # The last block is filled with points that have closed.
+            # The last block is filled up with converged points.
             work[0, k], work[1, k], work[3, k] = 0.0, 0.0, np.inf if k < count else 0.0
         for k in range(count):
             work[2, k] = (heights[first + k] - offsets[2]) / scales[2]

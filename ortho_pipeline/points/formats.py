@@ -193,12 +193,12 @@ def _of_image(
         return table
     kept: list[PointRow] = []
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
-        wanted, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
+        stem, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
         # A point that was measured in several images counts once: in this image, else in the first piece.
         kept += [
             replace(row, piece=piece)
             for row in table.rows
-            if row.image_name and Path(row.image_name).stem.lower() == wanted and row.id not in ids
+            if row.image_name and Path(row.image_name).stem.lower() == stem and row.id not in ids
         ]
     if not kept and table.format == "GeoJSON" and len(named) == 1:
         # The 'filename' of a GeoJSON is only a note; a renamed image still has these points.

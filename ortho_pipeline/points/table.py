@@ -393,8 +393,10 @@ def write_points(points: Points, path: str | os.PathLike[str], *, images: Sequen
 
     Examples
     --------
-    >>> op.write_points(op.read_points("sample_data/gcps.geojson"), out / "gcps.csv")
-    >>> len(op.read_points(out / "gcps.csv"))
+    >>> import tempfile
+    >>> path = f"{tempfile.mkdtemp()}/points.csv"
+    >>> write_points(read_points("sample_data/gcps.geojson"), path)
+    >>> len(read_points(path))
     18
     """
     writers = {".csv": _csv_text, ".tsv": _csv_text, ".geojson": _geojson_text, ".points": _qgis_text}

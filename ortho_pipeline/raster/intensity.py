@@ -17,13 +17,13 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.source import RasterSource, first_line
 
-#: At most so many bands are averaged: those with the most content, if it is at least this part of the most.
+#: Largest number of bands to average, and the least content of one, as part of that of the best band.
 _BANDS, _WORTH = 4, 0.5
-#: Bands are compared in so many windows of so many pixels a side with values; at most so many windows are tried.
+#: Numbers of windows with values in which bands are compared, their side (px), and the most windows to try.
 _WINDOWS, _WINDOW, _TRIED = 9, 64, 150
 #: A band with values in less than this part of the pixels of the fullest band would cost the other ones theirs.
 _FULL = 0.9
-#: Values are told apart in so many steps between the percentiles 1 and 99 of a band.
+#: Steps between the percentiles 1 and 99 of a band that distinguish values.
 _STEPS = 256
 #: From the first frequency on (cycles per pixel) a raster that was enlarged by two shows at most this part of what it
 #: shows between the other two; noise and edges of a raster that was not show more. Of some 20 real and simulated
@@ -49,29 +49,29 @@ class Intensity:
         self.source = source
         self.width, self.height = source.width, source.height
         self.bands = tuple(bands)
-        # The brightest value of whole numbers says "at least this".
+        # The largest integer means "at least this value".
         kind = source.dtype
         self.saturated = float(np.iinfo(kind).max) if kind.kind in "iu" else np.inf
 
     @cached_property
     def averaged(self) -> tuple[int, ...]:
-        """Numbers of the bands that are averaged; they are chosen when pixels are first asked for."""
+        """Numbers of the bands to average; chosen when pixels are first needed."""
         return self.bands or self.best()
 
     def best(self, most: int = _BANDS) -> tuple[int, ...]:
-        """Return the numbers of at most so many bands, those with the most content; alpha is none."""
+        """Return the numbers of at most `most` bands, those with the most content; without alpha."""
         colours = [band.GetColorInterpretation() for band in self.source.bands]
         known = np.flatnonzero([colour != gdal.GCI_AlphaBand for colour in colours])
         if len(known) < 2:
             return (int(known[0]) + 1 if len(known) else 1,)
         samples = list(itertools.islice(self._samples(), _WINDOWS))
-        found = contents(np.stack(samples, axis=1)[known]) if samples else np.zeros(len(known))
-        if not found.any():
+        content = contents(np.stack(samples, axis=1)[known]) if samples else np.zeros(len(known))
+        if not content.any():
             # A raster of one value, or none where it was looked at: bands from its whole spectrum.
             spread = np.linspace(0, len(known) - 1, min(most, len(known)))
             return tuple((known[np.round(spread).astype(int)] + 1).tolist())
-        best = np.argsort(-found, kind="stable")[:most]
-        return tuple(sorted((known[best[found[best] >= _WORTH * found.max()]] + 1).tolist()))
+        best = np.argsort(-content, kind="stable")[:most]
+        return tuple(sorted((known[best[content[best] >= _WORTH * content.max()]] + 1).tolist()))
 
     @cached_property
     def enlarged(self) -> bool:
@@ -89,11 +89,11 @@ class Intensity:
             left, top = int(across * (self.width - width + 1)), int(down * (self.height - height + 1))
             pixels = self.source.read(left, top, width, height)
             valid = self.source.read_valid(left, top, pixels)
-            found = pixels.astype(np.float32)
+            values = pixels.astype(np.float32)
             if valid is not None:
-                found[~valid] = np.nan
-            if np.isfinite(found).mean(axis=(1, 2)).max() > 0.5:
-                yield found
+                values[~valid] = np.nan
+            if np.isfinite(values).mean(axis=(1, 2)).max() > 0.5:
+                yield values
 
     def read(self, left: int, top: int, width: int, height: int, factor: int = 1) -> NDArray[np.float32]:
         """Return intensities ``(height, width)`` of means of `factor` x `factor` pixels; NaN where not valid.
@@ -101,12 +101,12 @@ class Intensity:
         Parameters
         ----------
         left, top : int
-            First pixel; the window may lie outside in part or whole.
+            First pixel; the window may be partly or fully outside.
         width, height : int
-            Of the result: the window is `factor` times as large.
+            Size of the result; the window is `factor` times as large.
         """
         out = np.full((height, width), np.nan, dtype=np.float32)
-        # Only whole groups of pixels that lie inside.
+        # Only full groups of pixels inside the raster.
         first_column, first_row = max(0, -(left // factor)), max(0, -(top // factor))
         last_column = min(width, (self.width - left) // factor)
         last_row = min(height, (self.height - top) // factor)
@@ -140,7 +140,7 @@ class Intensity:
         Parameters
         ----------
         single : bool
-            Where there are no overviews, take single pixels for all that they stand for.
+            Without overviews, use single pixels instead of means.
         """
         size = {"buf_xsize": columns, "buf_ysize": rows}
         found = np.zeros((rows, columns), dtype=np.float32)
@@ -169,7 +169,7 @@ def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
     range. Classes and what was enlarged have few. Noise has many, and is not correlated with its neighbour; so the bits
     are multiplied by that correlation.
     """
-    found = np.zeros(len(bands))
+    content = np.zeros(len(bands))
     full = np.isfinite(bands).mean(axis=(1, 2, 3))
     for number in np.flatnonzero((full > 0) & (full >= _FULL * full.max())).tolist():
         band = bands[number]
@@ -183,12 +183,12 @@ def contents(bands: NDArray[np.float32]) -> NDArray[np.float64]:
         for step in steps:
             counts = np.unique(np.rint(step), return_counts=True)[1] / max(len(step), 1)
             alike = 1.0 - float((step**2).mean()) / (2 * variance) if len(step) and variance > 0 else 0.0
-            found[number] += max(alike, 0.0) * float(-(counts * np.log2(counts)).sum()) / len(steps)
-    return found
+            content[number] += max(alike, 0.0) * float(-(counts * np.log2(counts)).sum()) / len(steps)
+    return content
 
 
 def enlarged(windows: NDArray[np.float32]) -> bool:
-    """Tell whether a raster was enlarged by two or more: windows ``(n, h, w)`` show nothing as fine as their pixels."""
+    """Return whether a raster was enlarged by two or more: windows ``(n, h, w)`` have no detail as fine as a pixel."""
     height, width = windows.shape[1:]
     down, across = (np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2 for count in (height, width))
     level = windows - windows.mean(axis=(1, 2), keepdims=True)

@@ -47,21 +47,21 @@ class Profile:
     def of(cls, source: RasterSource, dtype: str | None = None, nodata: float | str | None = None) -> Profile:
         """Return the profile of an ortho of `source`.
 
-        Nodata stays nodata (one value for all bands, as GeoTIFF has it), alpha stays alpha; everything else gets a
-        mask, because no pixel value may be given a meaning that it did not have. Under a mask, bands of floating point
-        without a value are NaN; integers cannot say that, so there a pixel is valid only if all of its bands are.
+        Nodata stays nodata (one value for all bands, as in GeoTIFF), and alpha stays alpha. All other sources get a
+        mask, because no pixel value may get a new meaning. Under a mask, floating-point bands without a value are NaN.
+        Integers have no NaN, so there a pixel is valid only if all of its bands are.
 
         Parameters
         ----------
         dtype : str, optional
-            GDAL's name of the type of the pixels; that of the source without.
+            GDAL's name of the pixel type. Default: that of the source.
         nodata : float or 'nan', optional
             Value of pixels without an image, whatever the source has.
 
         Raises
         ------
         InputError
-            If the type cannot hold the nodata value, or the source says by an alpha band what is valid.
+            If the type cannot hold the nodata value, or an alpha band of the source already marks valid pixels.
         """
         kind = source.dtype if dtype is None else pixel_type(dtype)
         # NaN is not equal to itself, and would make a set of several.
@@ -161,10 +161,10 @@ def value_range(dtype: np.dtype[Any], profile: Profile) -> tuple[float, float, b
 
 
 def keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low: float) -> None:
-    """Move valid pixels that happened to get the nodata value to the value beside it, for every kernel.
+    """Change valid pixels that happen to have the nodata value to a neighbouring value, for every kernel.
 
-    To the one that GDAL takes: of integers one less (one more for the least), of floating point the next. GDAL before
-    3.11 does so for integers that it interpolates only.
+    The value is the same as GDAL's: for integers one less (one more for the minimum), for floating point the next one.
+    GDAL before 3.11 does this only for integers that it interpolates.
     """
     if np.isnan(fill):
         return
@@ -179,12 +179,12 @@ def keep_off_nodata(out: NDArray[Any], valid: NDArray[np.bool_], fill: Any, low:
 
 
 def refuse_empty(valid_pixels: int, path: str | os.PathLike[str]) -> None:
-    """Refuse an ortho none of whose pixels has a value.
+    """Refuse an ortho without any pixel value.
 
     Raises
     ------
     InputError
-        Inside of a `RasterWriter`, so that no file is left.
+        Raise it inside a `RasterWriter`, so that no file remains.
     """
     if not valid_pixels:
         raise InputError(
@@ -225,7 +225,7 @@ class RasterWriter:
         if driver not in ("COG", "GTiff"):
             raise InputError(f"orthos cannot be written as {driver!r}", field="format", remedy="COG or GTiff")
         self.path, self.grid, self.profile, self.driver = Path(path), grid, profile, driver
-        # The bands of a block lie together in the file, and GDAL holds several such blocks.
+        # The bands of a block are adjacent in the file, and GDAL keeps several such blocks.
         self._side = square_side(profile, 512)
         self.options = checked_options(driver, dict(creation_options or {}), threads, self._side)
         if threads > 1 or self.options.get("NUM_THREADS", "1") != "1":
@@ -274,7 +274,7 @@ class RasterWriter:
                     self._dataset.GetRasterBand(1).GetMaskBand().FlushCache()
 
     def _completes_blocks(self, left: int, top: int, width: int, height: int) -> bool:
-        """Tell whether all blocks that were begun are complete with a window, if windows come row by row."""
+        """Return whether all started blocks are complete after a window, if windows come row by row."""
         across, down = self._dataset.GetRasterBand(1).GetBlockSize()
         right, bottom = left + width, top + height
         beside = right == self.grid.width or left % across == right % across == 0
@@ -287,8 +287,8 @@ class RasterWriter:
         code = gdal_array.NumericTypeCodeToGDALTypeCode(profile.dtype.type)
         with gdal_errors(self.path), contextlib.ExitStack() as failed:
             driver, where = ("MEM", "") if path is None else ("GTiff", str(path))
-            given = [] if path is None else [f"{k}={v}" for k, v in options.items()]
-            dataset = gdal.GetDriverByName(driver).Create(where, grid.width, grid.height, profile.count, code, given)
+            creation = [] if path is None else [f"{k}={v}" for k, v in options.items()]
+            dataset = gdal.GetDriverByName(driver).Create(where, grid.width, grid.height, profile.count, code, creation)
             failed.callback(abandon, dataset)
             dataset.SetProjection(grid.crs.to_wkt())
             dataset.SetGeoTransform(grid.geotransform)
@@ -298,8 +298,8 @@ class RasterWriter:
             for i in range(profile.count):
                 _describe(dataset.GetRasterBand(i + 1), profile, i)
             if profile.validity == "mask":
-                # On a full disk it fails here, and the dataset can be closed; GDAL 3.13 ends the process where one is
-                # closed whose mask it began without room for the directory in front.
+                # On a full disk it fails here, and the dataset can be closed. GDAL 3.13 ends the process when it closes
+                # a dataset with a started mask and no space for the directory before it.
                 dataset.FlushCache()
                 dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
             failed.pop_all()
@@ -321,19 +321,19 @@ class RasterWriter:
                     )
                 )
             self._dataset = None
-        # GDAL leaves out blocks of a file beyond 4 GB into which nothing was written.
+        # GDAL omits empty blocks of a file larger than 4 GB.
         partly = self._written < self.grid.width * self.grid.height
         sparse = partly or self.options.get("SPARSE_OK", "NO").upper() in ("YES", "TRUE", "ON")
         check_written(self._temporary, self.path, size=(self.grid.width, self.grid.height), sparse=sparse)
 
     def _advance(self, share: float, *_: Any) -> int:
-        """Pass GDAL's progress on, and let it go on."""
+        """Report GDAL's progress, and continue."""
         assert self._progress is not None
         self._progress("Writing the COG", share)
         return 1
 
     def scratch(self, name: str) -> Path:
-        """Return the path of a temporary raster beside the output, which is removed with the output's own."""
+        """Return the path of a temporary raster beside the output; it is removed together with that of the output."""
         return self._temporary.with_name(f"{self._temporary.name}.{name}.tif")
 
     def copy(self, path: Path) -> int:

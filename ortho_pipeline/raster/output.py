@@ -36,9 +36,9 @@ _SAMPLES = 12
 
 @contextlib.contextmanager
 def raster_output(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path for a raster that is written by GDAL and appears at `path` when it is whole.
+    """Yield a temporary path for a raster that GDAL writes; the raster appears at `path` when it is complete.
 
-    What is written has to be closed by `close` or `written` within the block. Masks go into the file itself.
+    Close it with `close` or `written` within the block. Masks are written into the file itself.
 
     Raises
     ------
@@ -75,8 +75,8 @@ def close(dataset: gdal.Dataset | None) -> None:
     Raises
     ------
     RuntimeError
-        If GDAL could not write the rest of it, which Python would ignore where a dataset is only deleted; or could not
-        make it, which some of its drivers say by returning none.
+        If GDAL could not write the rest (Python would ignore this if the dataset were only deleted), or could not
+        create the dataset (some drivers then return None).
     """
     if dataset is None:
         raise RuntimeError(gdal.GetLastErrorMsg() or "GDAL could not create the file")
@@ -140,32 +140,32 @@ def png_bytes(pixels: NDArray[np.uint8]) -> bytes:
 def check_written(
     written: Path, path: str | os.PathLike[str], *, size: tuple[int, int] | None = None, sparse: bool = False
 ) -> None:
-    """Check that a GeoTIFF holds every block that it says it has: place within the file, and some of them by reading.
+    """Check that a GeoTIFF has all of its blocks: their offsets in the file, and some blocks by reading.
 
     Parameters
     ----------
     written, path : path
-        Where it lies now, and what an error names.
+        Its present path, and the path for errors.
     size : (int, int), optional
-        Columns and rows that it has to have.
+        Required columns and rows.
     sparse : bool
         Whether blocks without a value may be absent.
 
     Raises
     ------
     InputError
-        If it was not written whole.
+        If it is incomplete.
     """
-    told: dict[str, Any] = {"file": path, "remedy": "check the free disk space"}
+    context: dict[str, Any] = {"file": path, "remedy": "check the free disk space"}
     try:
         dataset = gdal.OpenEx(os.fspath(written), gdal.OF_RASTER, allowed_drivers=["GTiff"], sibling_files=[])
         if size is not None and (dataset.RasterXSize, dataset.RasterYSize) != size:
-            raise InputError("the output was not written whole", **told)
+            raise InputError("the output is incomplete", **context)
         end = written.stat().st_size
         for band in _images(dataset):
             blocks = _blocks(band)
             if any(offset + count > end or not (count or sparse) for offset, count, _, _ in blocks):
-                raise InputError("the output was not written whole", **told)
+                raise InputError("the output is incomplete", **context)
             # The last in the file, and some from everywhere.
             sample = {max(blocks), *blocks[:: max(1, len(blocks) // _SAMPLES)]}
             width, height = band.GetBlockSize()
@@ -174,21 +174,21 @@ def check_written(
                     left, top = column * width, row * height
                     band.ReadRaster(left, top, min(width, band.XSize - left), min(height, band.YSize - top))
     except RuntimeError as error:
-        raise InputError(f"the output cannot be read back ({first_line(error)})", **told) from error
+        raise InputError(f"the output cannot be read back ({first_line(error)})", **context) from error
 
 
 # -- whole files ------------------------------------------------------------------------------------------------------
 
 
 def require_whole(path: str | os.PathLike[str], **access: Any) -> None:
-    """Refuse a raster on disk whose file ends before its pixels do; what is no raster is accepted.
+    """Refuse a truncated raster on disk; a file that is not a raster is accepted.
 
-    A GeoTIFF is asked for the place of every block and no pixel is read. Of other formats the last block is read.
+    For a GeoTIFF the offset of every block is checked, and no pixel is read. For other formats the last block is read.
 
     Parameters
     ----------
     access : dict
-        As of `raster.source.open_dataset`.
+        Arguments of `raster.source.open_dataset`.
 
     Raises
     ------
@@ -199,12 +199,12 @@ def require_whole(path: str | os.PathLike[str], **access: Any) -> None:
         dataset = open_dataset(path, **access)
     except InputError:
         return
-    told: dict[str, Any] = {"file": path, "remedy": "copy or download it again"}
+    context: dict[str, Any] = {"file": path, "remedy": "copy or download it again"}
     if dataset.GetDriver().ShortName == "GTiff":
         end = os.path.getsize(path)
         for band in _images(dataset):
             if any(offset + count > end for offset, count, _, _ in _blocks(band)):
-                raise InputError("the file is truncated: it ends before its pixels do", **told)
+                raise InputError("the file is truncated: some pixels are missing", **context)
         return
     band = dataset.GetRasterBand(dataset.RasterCount)
     width, height = band.GetBlockSize()
@@ -213,7 +213,7 @@ def require_whole(path: str | os.PathLike[str], **access: Any) -> None:
         band.ReadRaster(left, top, band.XSize - left, band.YSize - top)
     except RuntimeError as error:
         raise InputError(
-            f"the file is damaged: its last pixels cannot be read ({first_line(error)})", **told
+            f"the file is damaged: its last pixels cannot be read ({first_line(error)})", **context
         ) from error
 
 
@@ -233,18 +233,18 @@ def _images(dataset: gdal.Dataset) -> Iterator[gdal.Band]:
 def _blocks(band: gdal.Band) -> list[tuple[int, int, int, int]]:
     """Return offset and count of bytes, column and row of each block; an absent one has 0 bytes at 0."""
     width, height = band.GetBlockSize()
-    found = []
+    blocks = []
     for row in range(math.ceil(band.YSize / height)):
         for column in range(math.ceil(band.XSize / width)):
             place = f"{column}_{row}"
             offset, count = (band.GetMetadataItem(f"BLOCK_{what}_{place}", "TIFF") for what in ("OFFSET", "SIZE"))
-            found.append((int(offset or 0), int(count or 0), column, row))
-    return found
+            blocks.append((int(offset or 0), int(count or 0), column, row))
+    return blocks
 
 
 # -- creation options --------------------------------------------------------------------------------------------------
 
-#: Those that say how the file is laid out. Others name files and addresses, or give the ortho another grid or CRS.
+#: Creation options for the layout of a file. Others name files and addresses, or change the grid or CRS of the ortho.
 _LAYOUT = frozenset(
     re.findall(
         r"\S+",
@@ -260,11 +260,11 @@ _LAYOUT = frozenset(
 _PLAIN_VALUE = re.compile(r"[\w.,+-]{1,80}")
 
 
-def checked_options(driver: str, given: dict[str, str], threads: int, side: int = 512) -> dict[str, str]:
+def checked_options(driver: str, chosen: dict[str, str], threads: int, side: int = 512) -> dict[str, str]:
     """Return lossless defaults, a `side` of blocks, under what the user gave; what no driver knows is an error."""
-    given = {key.upper(): value for key, value in given.items()}
+    chosen = {key.upper(): value for key, value in chosen.items()}
     known = _known_options(driver)
-    for key, value in given.items():
+    for key, value in chosen.items():
         if key not in known:
             meant = difflib.get_close_matches(key, known, 1)
             raise InputError(
@@ -293,14 +293,14 @@ def checked_options(driver: str, given: dict[str, str], threads: int, side: int 
     defaults = {"BIGTIFF": "IF_SAFER"}
     if driver == "GTiff":
         defaults |= {"TILED": "YES", "BLOCKXSIZE": str(side), "BLOCKYSIZE": str(side)}
-        if given.get("TILED", "YES").upper() == "NO":
+        if chosen.get("TILED", "YES").upper() == "NO":
             defaults = {"BIGTIFF": "IF_SAFER"}
     else:
         defaults |= {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6", "NUM_THREADS": str(max(1, threads))}
-        if given.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
+        if chosen.get("COMPRESS", "DEFLATE").upper() not in ("DEFLATE", "ZSTD", "LZW"):
             defaults.pop("PREDICTOR")
             defaults.pop("LEVEL")
-    return defaults | given
+    return defaults | chosen
 
 
 def _known_options(driver: str) -> dict[str, Any]:
@@ -312,7 +312,7 @@ def _known_options(driver: str) -> dict[str, Any]:
 
 
 def _fits(option: Any, value: str) -> bool:
-    """Tell whether a value is one that a creation option takes; GDAL itself only warns, and takes its default."""
+    """Return whether a creation option accepts a value; GDAL itself only warns, and uses its default."""
     kind = (option.get("type") or "string").lower()
     if kind == "string-select":
         names = {name for one in option.findall("Value") for name in (one.text, one.get("alias")) if name}

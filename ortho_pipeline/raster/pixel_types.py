@@ -26,7 +26,7 @@ def nodata_of(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
 
 
 def holds(dtype: np.dtype[Any], value: float) -> bool:
-    """Tell whether a pixel of this type can have a value (of floating point: nearly)."""
+    """Return whether a pixel of this type can have a value (approximately, for floating point)."""
     if dtype.kind == "f":
         return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
     limits = np.iinfo(dtype)

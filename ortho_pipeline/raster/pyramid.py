@@ -1,7 +1,8 @@
-"""A raster as it is looked at: intensities at any reduction, where what is coarse is read once and kept.
+"""A raster for display: intensities at any reduction, with a coarse copy in memory.
 
-Up to `intensity.EXACT` a window is read and averaged. Beyond, the whole raster is brought to one coarse copy in memory,
-from its overviews or, where it has none, by single pixels of every few rows; that serves to look and never to measure.
+Up to `intensity.EXACT` a window is read and averaged. For larger reductions there is one coarse copy of the raster in
+memory, from its overviews, or without overviews from single pixels of every few rows. It is for display, never for
+measurement.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 from ortho_pipeline.raster.intensity import EXACT, Intensity
 from ortho_pipeline.raster.source import RasterSource
 
-#: The coarse copy has a pixel for so many by so many, at least; and no more pixels than that in all.
+#: Least reduction of the coarse copy, and its largest number of pixels.
 _COARSE, _MOST_PIXELS = 2 * EXACT, 16_000_000
 
 
 def stretch(values: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Return what is shown as black and as white of intensities: percentiles 1 and 99; None where none is valid."""
+    """Return the intensities to show as black and as white: percentiles 1 and 99; None if none is valid."""
     seen = values[np.isfinite(values)]
     if not len(seen):
         return None
@@ -41,7 +42,7 @@ class Pyramid(Intensity):
 
     @property
     def coarse(self) -> NDArray[np.float32]:
-        """The whole raster ``(rows, columns)``, made when it is first asked for; NaN where not valid."""
+        """The coarse copy ``(rows, columns)``, made when it is first needed; NaN where not valid."""
         with self._lock:
             if self._copy is None:
                 self._copy = self._decimated()

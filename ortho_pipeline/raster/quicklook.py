@@ -41,7 +41,7 @@ def preview_png(
 def shaded_png(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> bytes:
     """Return pixels ``(1 or 3, h, w)`` as PNG, each band stretched, transparent where not `valid` ``(h, w)``."""
     planes = [_stretched(band, valid) for band in pixels]
-    # Opaque throughout needs no plane that says so: a fifth of the bytes of a busy picture.
+    # A fully opaque picture needs no alpha plane, which is a fifth of the bytes of a busy picture.
     return png_bytes(np.stack(planes if valid.all() else [*planes, np.where(valid, 255, 0).astype(np.uint8)]))
 
 
@@ -72,5 +72,5 @@ def percentile(values: NDArray[np.float64], percent: float) -> float:
     below = int(place)
     above, part = min(below + 1, len(values) - 1), place - below
     low, high = np.partition(values, (below, above))[[below, above]]
-    # As there: the way from the nearer end, so that what lies between equal values is that value.
+    # As there, from the nearer end, so that a value between equal values is exact.
     return float(high - (high - low) * (1 - part) if part >= 0.5 else low + (high - low) * part)

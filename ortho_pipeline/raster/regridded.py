@@ -1,8 +1,8 @@
 """Pixels of an ortho on the grid of another one.
 
-It may lie on another grid, in another CRS. On the same grid its pixels are taken over as they are;
-otherwise GDAL's warper brings them there with its exact transformer, in blocks at fixed places and with a fixed size of
-its kernels, so that the result does not depend on tiles, memory or threads.
+It may have another grid or another CRS. On the same grid its pixels are copied. Otherwise GDAL's warper resamples them
+with its exact transformer, in blocks at fixed places and with kernels of fixed size, so that the result does not depend
+on tiles, memory or threads.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
 
 
 class Regridded:
-    """An ortho on the grid of another one; safe to use from several threads.
+    """An ortho on the grid of another one; thread-safe.
 
     Parameters
     ----------
     grid : Grid
-        On which its pixels are wanted.
+        Grid of its pixels.
     resampling : str
-        Between pixels of another grid, by GDAL's name.
+        GDAL's name of the resampling from another grid.
 
     Raises
     ------
     InputError
-        If it is no ortho, or lies elsewhere.
+        If it is not an ortho, or does not overlap the grid.
     """
 
     def __init__(
@@ -88,10 +88,10 @@ class Regridded:
     def require(self, profile: Profile) -> None:
         """Raise an `InputError` unless it has the bands and the type of an ortho of this profile."""
         own = f"{counted(self._source.count, 'band')} of {self._source.dtype}"
-        wanted = f"{counted(profile.count, 'band')} of {profile.dtype}"
-        if own != wanted:
+        needed = f"{counted(profile.count, 'band')} of {profile.dtype}"
+        if own != needed:
             raise InputError(
-                f"this ortho has {own}, but {wanted} is needed to fill gaps",
+                f"this ortho has {own}, but {needed} is needed to fill gaps",
                 file=self.path,
                 remedy=Text(
                     "make it with the same bands and type (",
@@ -122,13 +122,13 @@ class Regridded:
     def _resampled(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         count = self._source.count
         try:
-            found = self._warped.ReadAsArray(left, top, width, height)
+            stack = self._warped.ReadAsArray(left, top, width, height)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
             ) from error
-        pixels = found[:count]
-        valid = np.broadcast_to(found[-1] >= _ENOUGH, pixels.shape).copy()
+        pixels = stack[:count]
+        valid = np.broadcast_to(stack[-1] >= _ENOUGH, pixels.shape).copy()
         if pixels.dtype.kind == "f":
             valid &= ~np.isnan(pixels)
         return pixels, valid

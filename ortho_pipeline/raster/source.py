@@ -43,7 +43,7 @@ MAX_SIDE = 4_000_000
 MAX_BLOCK = 1 << 30
 #: Default memory of reading and warping, in bytes.
 MEMORY = 512_000_000
-#: Endings of files beside an image that GDAL's readers of metadata look for.
+#: Endings of sidecars that GDAL's readers of metadata search.
 _SIDE_CARS = re.compile(r"(?is).+\.(xml|txt|imd|rpb|pvl|met|att|eph|tfw|wld|prj|hdr|ovr|msk|rpc|dim)$")
 _WHOLE = "give a complete raster in an allowed format ('ortho doctor' lists them), or copy it again"
 
@@ -151,9 +151,9 @@ def _refuse_pipes(path: Path) -> None:
     """Raise an `InputError` if metadata or a sidecar of an image is a pipe or a device: GDAL would wait for ever."""
     folder = path if path.is_dir() else path.parent
     with contextlib.suppress(OSError):
-        found = listing(folder)
-        related = {name for name in found.special if path.stem in name}
-        related |= found.special.intersection(found.matching(_SIDE_CARS))
+        files = listing(folder)
+        related = {name for name in files.special if path.stem in name}
+        related |= files.special.intersection(files.matching(_SIDE_CARS))
         for name in related - {path.name}:
             kind = 0
             with contextlib.suppress(OSError):  # a link that leads nowhere: there is nothing to read
@@ -183,12 +183,12 @@ def _check_size(dataset: gdal.Dataset, name: str) -> None:
 
 def _in_archive(name: str) -> str:
     archive = Location(name).archive if name.startswith("/vsi") else Path(name)
-    found = members(archive) if archive is not None else []
-    return f"name the image in it: {', '.join(found)}" if found else "name the image in it: /vsizip/FILE.zip/IMAGE"
+    names = members(archive) if archive is not None else []
+    return f"name the image in it: {', '.join(names)}" if names else "name the image in it: /vsizip/FILE.zip/IMAGE"
 
 
 def first_line(error: BaseException, of: object = "") -> str:
-    """Return the first line of what an error says: without the file `of` it, and without a full stop."""
+    """Return the first line of an error's text, without the name of the file `of` it and without a full stop."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0].removeprefix(str(of)).removeprefix(Path(str(of)).name).lstrip(",: ").rstrip(". ") or lines[0]
 
@@ -304,7 +304,7 @@ class _RasterFile:
         self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
         flags = self._io(bands[0].GetMaskFlags)
-        # GDAL's own order: a mask of the dataset stands beside nodata.
+        # GDAL's own order: a mask of the dataset counts in addition to nodata.
         self._masked = bool(flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA))
         if any(value is not None for value in self.nodata):
             self.validity = "nodata"
@@ -328,9 +328,9 @@ class _RasterFile:
         return [self.dataset.GetRasterBand(number) for number in self.numbers]
 
     def read(self, left: int, top: int, out: NDArray[Any]) -> None:
-        """Fill `out` ``(count, height, width)`` with a window that lies inside the raster."""
-        given = {"buf_obj": out, "band_list": list(self.numbers)}
-        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], **given)
+        """Fill `out` ``(count, height, width)`` with a window inside the raster."""
+        arguments = {"buf_obj": out, "band_list": list(self.numbers)}
+        self._io(self.dataset.ReadAsArray, left, top, out.shape[2], out.shape[1], **arguments)
 
     def read_valid(self, left: int, top: int, pixels: NDArray[Any]) -> NDArray[np.bool_] | None:
         """Return which of the `pixels` of a window ``(count, h, w)`` are valid; None where all are."""
@@ -372,10 +372,10 @@ class RasterSource:
     path, *others : path
         The files, in the order of their bands.
     bands : sequence of int, optional
-        Which bands, counted from 1 over all files, in the order wanted.
+        Bands to read, in this order, counted from 1 over all files. Default: all.
     dtype : str, optional
-        Pixel type of the ortho, as GDAL names it. Pixels of another type are read as floating point that holds
-        both, so that interpolated values are rounded and clamped only once, when they are written.
+        Pixel type of the ortho, by GDAL's name. Pixels of another type are read as floating point that holds both, so
+        interpolated values are rounded and clamped only once, when they are written.
     memory : int
         Largest allowed size of a block in bytes; see `open_pixels`.
 
@@ -383,7 +383,7 @@ class RasterSource:
     ----------
     width, height, count : int
     dtype : numpy.dtype
-        Common type of all bands, as they are read.
+        Common type of all bands when they are read.
     nodata : tuple of float or None, per band
     validity : {'all', 'nodata', 'mask', 'alpha'}
         How the raster marks its valid pixels. NaN is never valid.

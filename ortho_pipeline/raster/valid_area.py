@@ -62,9 +62,9 @@ def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], 
     centre = np.mean([polygon.centroid.x for polygon in parts])
     # All parts to one side of the world before they are cut.
     moved = [shapely.transform(p, lambda xy, p=p: xy - [360 * round((p.centroid.x - centre) / 360), 0]) for p in parts]
-    whole = shapely.union_all(moved)
-    west, south, east, north = whole.bounds
-    cut = _cut(whole, west, east)
+    area = shapely.union_all(moved)
+    west, south, east, north = area.bounds
+    cut = _cut(area, west, east)
     box = [-180.0, south, 180.0, north] if east - west >= 360 else [_in_range(west), south, _in_range(east), north]
     return _listed(shapely.geometry.mapping(cut)), [round(float(value), _DECIMALS) for value in box]
 
@@ -84,12 +84,12 @@ def _unwrapped(ring: Array) -> Array:
     return np.vstack([ring, [[lon[-1], pole], [lon[0], pole]], ring[:1]])
 
 
-def _cut(whole: BaseGeometry, west: float, east: float) -> BaseGeometry:
+def _cut(area: BaseGeometry, west: float, east: float) -> BaseGeometry:
     """Return parts with longitudes of -180 to 180 degrees."""
     parts = []
     for turn in range(int(np.floor((west + 180) / 360)), int(np.floor((east + 180) / 360)) + 1):
         strip = shapely.box(360.0 * turn - 180, -90, 360.0 * turn + 180, 90)
-        inside = shapely.intersection(whole, strip)
+        inside = shapely.intersection(area, strip)
         parts += [shapely.transform(p, lambda xy, turn=turn: xy - [360.0 * turn, 0]) for p in _polygons(inside)]
     rounded = _polygons(shapely.set_precision(shapely.MultiPolygon(parts), 10.0**-_DECIMALS))
     oriented = [shapely.geometry.polygon.orient(part) for part in rounded]

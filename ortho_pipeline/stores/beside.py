@@ -1,9 +1,9 @@
-"""Questions about files behind URLs and what lies beside them, asked at once.
+"""Parallel requests for files behind URLs and their sidecars.
 
-GDAL and its readers of metadata, and sensors, look for some fifty side-cars of an image. A store lists a folder with
-one answer; a web server is asked for one name after the other, and each question takes as long as the way there and
-back. GDAL remembers answers: what was asked here together is known when it is asked again one by one. A name that is
-not in these lists is only found later.
+GDAL, its readers of metadata, and sensors search about fifty sidecars of an image. A store lists a folder with one
+answer, but a web server needs a request for each name, and each request is a full round trip. GDAL caches the answers:
+after these parallel requests it knows the names when it searches them one by one. A name that is not in these lists is
+only searched later.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ortho_pipeline.runtime.process_limits import thread_pool
 
 #: Questions at a time.
 _AT_ONCE = 16
-#: What follows the whole name of an image, its stem, its stem in capitals, and what stands before the rest of its stem.
+#: Endings after the name of an image, after its stem, after its stem in capitals; and beginnings before its stem.
 _AFTER_NAME = (".ovr", ".msk", ".aux.xml", ".aux", ".AUX", ".OVR", ".MSK")
 _AFTER_STEM = (
     "_rpc.txt",
@@ -59,22 +59,22 @@ _BEFORE_REST = ("HDR", "RPC")
 _IN_FOLDER = ("METADATA.DIM", "metadata.dim", "summary.txt", "SUMMARY.TXT")
 #: GDAL reads this much of a file before it knows what it is.
 _HEADER = 16_384
-#: GDAL's names of what has been asked for by this process.
+#: GDAL's names of the files that this process has requested.
 _known: set[str] = set()
 
 
 def ask_beside(*paths: AnyPath | None, allow_network: bool = False) -> None:
-    """Ask servers for files and what may lie beside them, unless that was done; files of this machine are left alone.
+    """Request remote files and their possible sidecars once; local files are ignored.
 
-    Nothing is an error here: who opens the file is told what is wrong.
+    A missing file is no error here; it is one when the file is opened.
 
     Raises
     ------
     InputError
         If the network is not allowed.
     """
-    given = (path for path in paths if path is not None and Location(path).is_far)
-    far = {os.fspath(located(path, allow_network=allow_network)) for path in given}
+    far_paths = (path for path in paths if path is not None and Location(path).is_far)
+    far = {os.fspath(located(path, allow_network=allow_network)) for path in far_paths}
     new = [VsiPath(name) for name in sorted(far - _known)]
     if not new:
         return
@@ -88,7 +88,7 @@ def ask_beside(*paths: AnyPath | None, allow_network: bool = False) -> None:
 
 
 def _questions(path: VsiPath) -> Iterator[VsiPath]:
-    """Yield what is asked for beside a file: nothing where the folder is listed."""
+    """Yield the names to request beside a file; none if the folder is listed."""
     if not str(path).startswith("/vsicurl/"):
         return
     rest, letters = path.stem[3:], path.suffix[1:]

@@ -87,5 +87,5 @@ def _record_of(names: list[str], contents: list[Content]) -> bytes:
 
 
 def address_of(folder: str | os.PathLike[str] | None) -> str | None:
-    """Return a folder as address, None where it lies on this machine."""
+    """Return a folder as address, or None if it is on this machine."""
     return os.fspath(folder) if folder is not None and Location(folder).is_address else None

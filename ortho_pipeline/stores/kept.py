@@ -1,10 +1,9 @@
-"""What is kept on this machine of files that lie elsewhere: whole or not there, and checked whenever it is used.
+"""The local cache of remote files: each file is complete or absent, and is checked whenever it is used.
 
-Beside each file stands a record (its name and ``.json``) of where it came from, its size and its SHA-256. A file that
-does not agree with its record, or has none, counts as not there and is fetched again. Several processes share the
-folder; who needs a file that another one is fetching waits for it. A file and its record are written as the outputs of
-a command are (`files.together`), but in a context of their own: they are no part of the outputs that are under way, nor
-confined to their folder.
+Each file has a record (its name and ``.json``) with its address, size and SHA-256. A file that does not agree with its
+record, or has none, is downloaded again. Several processes share the folder; a process waits for a file that another
+one is downloading. A file and its record are written like the outputs of a command (`files.together`), but in a
+separate context: they are not part of the current outputs, and not limited to their folder.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ FOLDER = "ORTHO_CACHE"
 _RECORD = ".json"
 _REMEDY = f"set the environment variable {FOLDER} to a folder with write access and enough free space"
 _RECORD_BYTES = 100_000
-#: Members of a record, and of which types they are.
+#: Members of a record, and their types.
 _FIELDS: dict[str, tuple[type, ...]] = {"address": (str,), "bytes": (int,), "sha256": (str,), "fetched": (int, float)}
 #: The states in which files agreed with their records in this process.
 _agreed: dict[str, tuple[int, int, int]] = {}
@@ -64,36 +63,36 @@ def folder() -> Path:
     InputError
         If there is none, or its path is relative: it would be a folder in the working folder.
     """
-    given = os.environ.get(FOLDER)
-    found = Path(given) if given else cache_folder()
-    if found is None or not found.is_absolute():
-        wrong = f"{FOLDER} has a relative path" if given else "there is no home folder"
+    text = os.environ.get(FOLDER)
+    path = Path(text) if text else cache_folder()
+    if path is None or not path.is_absolute():
+        wrong = f"{FOLDER} has a relative path" if text else "there is no home folder"
         raise InputError(
             f"downloaded files cannot be cached ({wrong})",
             field=FOLDER,
             remedy=f"set the environment variable {FOLDER} to the absolute path of a folder that you may write to",
         )
-    return found
+    return path
 
 
 def kept(
     kind: str, address: str, fetch: Callable[[Path], Content], *, fault: Callable[[Path], str] | None = None
 ) -> Path:
-    """Return the file that is kept of an address, fetched if it is not there or not what it was.
+    """Return the cached file of an address; download it if it is missing or changed.
 
     Parameters
     ----------
     kind : str
-        The folder that it lies in, such as ``dem``.
+        Its folder in the cache, such as ``dem``.
     fetch : callable (path) -> Content
-        Writes the file under a temporary name. What it raises, this raises, and nothing is kept.
+        Writes the file under a temporary name. If it raises an exception, this function raises it and caches nothing.
     fault : callable (path) -> str, optional
-        What is wrong with a file that was fetched; empty if nothing is.
+        Returns what is wrong with a downloaded file; empty if nothing is.
 
     Raises
     ------
     InputError
-        If the folder cannot be written, or there is a fault in what was fetched.
+        If the folder cannot be written, or the downloaded file is wrong.
     """
     path = folder() / kind / _name_of(address)
     if not _agrees(path, address):
@@ -118,9 +117,9 @@ def _fill(path: Path, address: str, fetch: Callable[[Path], Content], fault: Cal
 def records() -> Iterator[CachedFile]:
     """Yield what is kept, by name."""
     for path in sorted(folder().glob(f"*/[!.]*{_RECORD}")):
-        found = _read(path)
-        if found is not None:
-            yield found
+        record = _read(path)
+        if record is not None:
+            yield record
 
 
 def clear() -> tuple[int, int]:
@@ -137,7 +136,7 @@ def clear() -> tuple[int, int]:
 
 
 def _agrees(path: Path, address: str) -> bool:
-    """Tell whether a file is there as it was fetched from this address."""
+    """Return whether a file exists, unchanged since its download from this address."""
     record = _read(_record_of(path))
     if record is None or record.address != address:
         return False
@@ -151,8 +150,8 @@ def _agrees(path: Path, address: str) -> bool:
 def _read(path: Path) -> CachedFile | None:
     """Return the record of a kept file; None where it is none, so that the file is fetched again."""
     try:
-        given = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
-        record = CachedFile(path.with_name(path.name.removesuffix(_RECORD)), **{name: given[name] for name in _FIELDS})
+        fields = parse_json(read_bounded(path, _RECORD_BYTES), path, "fetch the file again")
+        record = CachedFile(path.with_name(path.name.removesuffix(_RECORD)), **{name: fields[name] for name in _FIELDS})
     except (InputError, KeyError, TypeError):
         return None
     kinds = all(type(getattr(record, name)) in kinds for name, kinds in _FIELDS.items())
@@ -169,6 +168,6 @@ def _record_of(path: Path) -> Path:
 
 
 def _name_of(address: str) -> str:
-    """Return a name of a file that is told from those of other addresses, and ends as this one does."""
+    """Return a file name that is unique for an address, with its ending."""
     last = re.sub(r"[^A-Za-z0-9._-]", "_", address.rpartition("/")[2])[-120:]
     return f"{hashlib.sha256(address.rpartition('/')[0].encode()).hexdigest()[:12]}_{last}"

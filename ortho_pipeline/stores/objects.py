@@ -1,10 +1,9 @@
 """Folders of objects: behind ``https://``, and in the stores of ``s3://``, ``gs://`` and ``az://``.
 
-Whole objects only: what is read in windows is read by GDAL. Requests that fail in passing (429, 5xx, a connection that
-is cut) are repeated with growing pauses, and a download that is cut goes on where it was cut, by `obstore`. What
-arrives is held against the size and the checksum that the store states. Credentials are those that the store's own
-clients find (environment, role of the machine); nothing of them, and nothing that a server says in its own words, is in
-a message.
+Only complete objects; GDAL reads windows. `obstore` retries temporary failures (429, 5xx, a lost connection) with
+increasing pauses, and resumes an interrupted download. Received data are compared with the size and the checksum that
+the store states. Credentials are those of the store's own clients (environment, role of the machine). Messages contain
+no credentials and no text of a server.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ RETRIES: dict[str, Any] = {
     "retry_timeout": timedelta(minutes=3),
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=15), "base": 2},
 }
-#: How often an object is fetched whose content is not what the store says of it.
+#: Attempts to download an object whose content differs from what the store states.
 _ATTEMPTS = 3
 #: Objects that are written on a condition are small (bytes).
 _MOST_ON_A_CONDITION = 100_000_000
@@ -99,16 +98,16 @@ class Objects:
     # -- reading -----------------------------------------------------------------------------------------------------
 
     def read(self, name: str, limit: int) -> tuple[bytes, Content]:
-        """Return an object of at most `limit` bytes, and what it is.
+        """Return an object of at most `limit` bytes, and its `Content`.
 
         Raises
         ------
         FileNotFoundError
-            If there is none.
+            If it does not exist.
         InputError
-            If it is larger, or may not be read.
+            If it is larger, or access is denied.
         StorageError
-            If the store does not answer, or gives other bytes than it says.
+            If the store does not answer, or the bytes differ from what it states.
         """
         return self._attempts(name, limit, b"".join)
 
@@ -151,8 +150,8 @@ class Objects:
         """Yield names and sizes of the objects whose names begin so; a plain web server lists none."""
         with self._errors(prefix):
             for chunk in self._store.list(prefix or None):
-                for one in chunk:
-                    yield one["path"], one["size"]
+                for item in chunk:
+                    yield item["path"], item["size"]
 
     def stated(self, name: str) -> tuple[int, str]:
         """Return the size of an object and the tag that its store gives this version (empty if it gives none).
@@ -179,7 +178,7 @@ class Objects:
         return None if found is None else str(found)
 
     def exists(self, name: str) -> bool:
-        """Tell whether there is such an object."""
+        """Return whether an object exists."""
         try:
             with self._errors(name):
                 self._store.head(name)
@@ -211,9 +210,9 @@ class Objects:
             return self._put_if(name, data, content, "create" if new else {self._version: replacing})
         for _ in range(_ATTEMPTS):
             with self._errors(name):
-                made = self._store.put(name, data, attributes=self._note(content), chunk_size=PART, max_concurrency=4)
-                if self._encrypted or (made["e_tag"] or "").strip('"') in content.tags:
-                    return replace(content, version=made[self._version], tag=made["e_tag"] or "")
+                result = self._store.put(name, data, attributes=self._note(content), chunk_size=PART, max_concurrency=4)
+                if self._encrypted or (result["e_tag"] or "").strip('"') in content.tags:
+                    return replace(content, version=result[self._version], tag=result["e_tag"] or "")
                 stored = self._store.head(name)
             wrong = _difference(content, stored, ours=True)
             if not wrong and _TAG.fullmatch(stored["e_tag"] or "") is None:
@@ -241,10 +240,10 @@ class Objects:
             wrong, failed = "", None
             try:
                 with self._errors(name):
-                    made = self._store.put(name, data, attributes=self._note(content), mode=mode, use_multipart=False)
-                stated = {"size": content.size, "e_tag": made["e_tag"]}
+                    result = self._store.put(name, data, attributes=self._note(content), mode=mode, use_multipart=False)
+                stated = {"size": content.size, "e_tag": result["e_tag"]}
                 if self._encrypted or not (wrong := _difference(content, stated, ours=True)):
-                    return replace(content, version=made[self._version])
+                    return replace(content, version=result[self._version])
             except StorageError as error:
                 failed = error
             with contextlib.suppress(FileNotFoundError):
@@ -263,7 +262,7 @@ class Objects:
         )
 
     def _note(self, content: Content) -> Any:
-        """Return what is noted beside an object whose ETag will say nothing of its content."""
+        """Return attributes with the checksum of an object whose ETag is no checksum."""
         return {_SHA256: content.sha256} if self._encrypted else None
 
     def delete(self, name: str) -> None:
@@ -273,7 +272,7 @@ class Objects:
 
     @contextlib.contextmanager
     def _errors(self, name: str) -> Iterator[None]:
-        """Say what went wrong in our words: those of libraries and servers may hold signed addresses."""
+        """Convert exceptions to errors in our own words: texts of libraries and servers may have signed addresses."""
         from obstore import exceptions
 
         try:
@@ -310,7 +309,7 @@ class _Digests:
         self._parts: list[bytes] = []
 
     def through(self, chunks: Iterable[Any], limit: int) -> Iterator[bytes]:
-        """Yield the chunks; stop with an error beyond `limit` bytes, whatever a server said of their number."""
+        """Yield the chunks; raise an error beyond `limit` bytes, whatever size the server stated."""
         for chunk in chunks:
             piece = bytes(chunk)
             self._sha256.update(piece)
@@ -352,9 +351,9 @@ def _content(data: bytes | Path) -> Content:
 
 
 def _difference(content: Content, stated: Mapping[str, Any], *, ours: bool = False) -> str:
-    """Return how a content differs from what a store states of it; empty if it does not.
+    """Return how a content differs from what a store states; empty if it does not.
 
-    The ETag of what others stored in parts says nothing of the content alone.
+    The ETag of a multipart upload is not a checksum of the content alone.
     """
     if content.size != stated["size"]:
         return f"{content.size} bytes, but the store states {stated['size']}"
@@ -376,9 +375,9 @@ def _noted_difference(content: Content, stated: Mapping[str, Any], attributes: M
 
 
 def _status(error: Exception) -> str:
-    found = re.search(r"status code: (\d{3})", str(error))
-    if found:
-        return f"HTTP status {found[1]}"
+    match = re.search(r"status code: (\d{3})", str(error))
+    if match:
+        return f"HTTP status {match[1]}"
     return "cannot connect" if "connect" in str(error) else "the connection failed"
 
 
@@ -389,29 +388,29 @@ def _store_of(address: str) -> Any:
     scheme = address.partition("://")[0]
     if scheme == "http" or os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes"):
         options["allow_http"] = True
-    given = _SETTINGS[scheme]() if scheme in _SETTINGS else {}
-    if given.get("endpoint", given.get("base_url", "")).startswith("http://"):
+    settings = _SETTINGS[scheme]() if scheme in _SETTINGS else {}
+    if settings.get("endpoint", settings.get("base_url", "")).startswith("http://"):
         options["allow_http"] = True
     make: Any = store.from_url  # one signature for each kind of store
-    return make(address, client_options=options, retry_config=RETRIES, **given)
+    return make(address, client_options=options, retry_config=RETRIES, **settings)
 
 
 def _s3_settings() -> dict[str, Any]:
-    """Return what the names of GDAL and of Amazon's clients say and `obstore` does not read itself."""
-    given: dict[str, Any] = {}
+    """Return settings from the variables of GDAL and Amazon's clients that `obstore` does not read itself."""
+    settings: dict[str, Any] = {}
     endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_S3_ENDPOINT")
     if endpoint:
         plain = os.environ.get("AWS_HTTPS", "YES").upper() in ("NO", "FALSE", "0")
-        given["endpoint"] = endpoint if "://" in endpoint else f"http{'' if plain else 's'}://{endpoint}"
+        settings["endpoint"] = endpoint if "://" in endpoint else f"http{'' if plain else 's'}://{endpoint}"
     if _key_management():
-        given["checksum_algorithm"] = "SHA256"
+        settings["checksum_algorithm"] = "SHA256"
     if os.environ.get("AWS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
-        given["skip_signature"] = True
-    return given
+        settings["skip_signature"] = True
+    return settings
 
 
 def _azure_settings() -> dict[str, Any]:
-    """Return what the names of GDAL and of Azure's clients say and `obstore` does not read itself."""
+    """Return settings from the variables of GDAL and Azure's clients that `obstore` does not read itself."""
     stated = os.environ.get("AZURE_STORAGE_CONNECTION_STRING", "")
     parts = {key: value for key, sign, value in (part.partition("=") for part in stated.split(";")) if sign}
     named = {
@@ -423,14 +422,14 @@ def _azure_settings() -> dict[str, Any]:
 
 
 def _google_settings() -> dict[str, Any]:
-    """Return what the names of GDAL say and `obstore` does not read itself."""
-    given: dict[str, Any] = {}
+    """Return settings from the variables of GDAL that `obstore` does not read itself."""
+    settings: dict[str, Any] = {}
     endpoint = os.environ.get("CPL_GS_ENDPOINT")
     if endpoint:
-        given["base_url"] = endpoint.rstrip("/")
+        settings["base_url"] = endpoint.rstrip("/")
     if os.environ.get("GS_NO_SIGN_REQUEST", "").upper() in ("YES", "TRUE", "1"):
-        given["skip_signature"] = True
-    return given
+        settings["skip_signature"] = True
+    return settings
 
 
 #: Settings of the clients of stores, by scheme.

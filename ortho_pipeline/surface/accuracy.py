@@ -1,10 +1,10 @@
-"""How good a DEM is: its heights against check heights, by the slope of the terrain.
+"""Accuracy of a DEM: its heights compared with check heights, by the slope of the terrain.
 
-The error of a DEM moves a point of an ortho along the line of sight, so it belongs into every budget of accuracy. It
-grows with the slope, because a shift in plan is an error in height there.
+An error of the DEM moves a point of an ortho along the line of sight, so every accuracy budget needs it. It increases
+with the slope, because a horizontal shift causes an error in height there.
 
 Source: Höhle and Höhle 2009, "Accuracy assessment of digital elevation models by means of robust statistical methods"
-(median, NMAD, quantiles beside mean and RMSE, because errors of DEMs have long tails).
+(median, NMAD and quantiles in addition to mean and RMSE, because errors of DEMs have long tails).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 SLOPES = (5.0, 10.0, 20.0, 30.0)
 #: NMAD of a normal distribution is its standard deviation.
 _NMAD = 1.4826
-#: A difference so many NMAD away from the median is named.
+#: Differences farther from the median than this many NMAD are listed.
 _GROSS = 5.0
 #: The 90 % quantile of fewer differences is one of the largest of them, and is not given.
 _ENOUGH = 10
@@ -100,11 +100,11 @@ class DemAccuracy:
     def by_slope(self) -> list[tuple[float, float | None, HeightErrors]]:
         """Return lower and upper limit (degrees, None: no limit) and the differences of each class of slope."""
         edges = [0.0, *SLOPES, np.inf]
-        found = []
+        rows = []
         for low, high in itertools.pairwise(edges):
             inside = (self.slopes >= low) & (self.slopes < high) & np.isfinite(self.differences)
-            found.append((low, None if np.isinf(high) else high, HeightErrors.of(self.differences[inside])))
-        return found
+            rows.append((low, None if np.isinf(high) else high, HeightErrors.of(self.differences[inside])))
+        return rows
 
     def gross(self) -> list[str]:
         """Return the points whose difference is far from all others."""
@@ -141,7 +141,7 @@ def check_dem(surface: DemSurface, ground: Array, crs: str | pyproj.CRS, ids: Se
     Returns
     -------
     DemAccuracy
-        NaN at points where the DEM has no height: they are counted and take no part.
+        NaN at points where the DEM has no height; they are counted but not used.
     """
     lonlat = ground_transform(parse_crs(crs), "EPSG:4979")(ground)
     surface = surface.with_fill("mask").around(float(np.nanmedian(lonlat[:, 0])))
@@ -178,7 +178,7 @@ def typical_sigma(surface: Surface) -> float | None:
 def read_check_heights(
     path: str | os.PathLike[str], crs: str | None = None, vertical: str | None = None
 ) -> tuple[Array, pyproj.CRS, tuple[str, ...]]:
-    """Read check heights: CSV or GeoJSON with x, y, h; what else stands there (image coordinates) is not used.
+    """Read check heights: CSV or GeoJSON with x, y, h. Other columns, such as image coordinates, are not used.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def read_check_heights(
     Raises
     ------
     InputError, CrsError, DatumError
-        As `points.read_points`; also where no point has a height.
+        As `points.read_points`; also if no point has a height.
     """
     table = read_block_table(path, OF_HEIGHTS)
     ground, plane = ground_of(
@@ -209,11 +209,11 @@ def summary(document: dict[str, Any]) -> str:
         return f"{errors['count']:>6}" + "".join(f"{'-' if v is None else f'{v:.2f}':>9}" for v in values)
 
     lines = [f"{'slope':<12}{'points':>6}{'mean':>9}{'RMSE':>9}{'median':>9}{'NMAD':>9}{'LE90':>9}{'largest':>9}  (m)"]
-    for one in document["by_slope"]:
-        low, high = one["slope_deg"]
-        if one["count"]:
+    for row in document["by_slope"]:
+        low, high = row["slope_deg"]
+        if row["count"]:
             name = f"over {low:g}°" if high is None else f"{low:g}-{high:g}°"
-            lines.append(f"{name:<12}{cells(one)}")
+            lines.append(f"{name:<12}{cells(row)}")
     lines.append(f"{'all':<12}{cells(document['overall'])}")
     lines.append("DEM minus check height; of slopes without points there is no line")
     if document["without_height"]:

@@ -105,7 +105,7 @@ class Surface(abc.ABC):
     def heights(self, xy: ArrayLike, crs: str | pyproj.CRS | None = None) -> Array:
         """Return heights ``(N,)`` at positions ``(N, 2)`` (x, y) of `crs` (that of the surface by default).
 
-        Bilinear between sample centres; NaN outside and beside a void, unless `fill` gives them a height.
+        Bilinear between sample centres; NaN outside and next to a void, unless `fill` gives them a height.
         """
 
     @abc.abstractmethod
@@ -207,7 +207,7 @@ def positions(xy: ArrayLike) -> Array:
     InputError
         If they have another shape.
     """
-    found = np.asarray(xy, dtype=float)
-    if found.ndim != 2 or found.shape[1] < 2:
-        raise InputError(f"expected positions of shape (N, 2), not {found.shape}")
-    return found[:, :2]
+    points = np.asarray(xy, dtype=float)
+    if points.ndim != 2 or points.shape[1] < 2:
+        raise InputError(f"expected positions of shape (N, 2), not {points.shape}")
+    return points[:, :2]

@@ -32,8 +32,8 @@ from ortho_pipeline.surface.voids import nearest_heights
 NEAREST_REACH, NEAREST_METRES = 512, 20_000.0
 #: The undulation is computed exactly on a lattice about this wide (m) and interpolated between: within 2 mm.
 UNDULATION_SPACING = 500.0
-#: Side (samples) of what is read and kept for single positions. Rays that are followed together each stand on a tile of
-#: their own, over a thousand of them: small tiles are all kept until the rays have left them.
+#: Side (samples) of a tile that is read and cached for single positions. More than a thousand rays are followed
+#: together, each on its own tile; small tiles all stay in the cache until their rays have left them.
 TILE = 64
 #: The part of a job's memory that tiles may take.
 _TILES_SHARE = 8
@@ -75,9 +75,8 @@ def open_dem(
 
     Examples
     --------
-    >>> dem = op.open_dem("sample_data/dem.tif", fill="nearest")
-    >>> [round(height, 1) for height in dem.height_range]
-    [700.0, 1191.9]
+    >>> open_dem("sample_data/dem.tif").heights([[33.35, 37.25]], "EPSG:4326").round(1)
+    array([723.5])
     """
     access = {"allow_network": allow_network, "roots": tuple(roots)}
     files = matching_files(path)
@@ -146,14 +145,14 @@ class TileCache:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        made = make()
+        array = make()
         with self._lock:
             if key not in self._kept:
-                self._kept[key] = made
-                self._held += made.nbytes
+                self._kept[key] = array
+                self._held += array.nbytes
             while self._held > self._size and len(self._kept) > 1:
                 self._held -= self._kept.popitem(last=False)[1].nbytes
-        return made
+        return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,16 +163,16 @@ class DemSurface(Surface):
     ----------
     file : Samples
     grid : SampleGrid
-        Where the samples lie; in a DEM that goes round the world, with its seam.
+        Grid of the samples; for a global DEM, with its seam.
     vertical : Vertical
-        What the heights are measured above.
+        Height datum.
     metres_per_unit : float
     fill : 'error', 'mask', 'nearest' or float
-        What stands for a void.
+        Value in a void (see `Surface`).
     record : mapping
-        The provenance, but for `fill`.
+        The provenance, without `fill`.
     cache_bytes : int
-        Of heights that are kept after they were read.
+        Bytes of cached heights.
     sigma : float, Surface or None
     """
 
@@ -192,7 +191,7 @@ class DemSurface(Surface):
         object.__setattr__(self, "_tiles", TileCache(self.cache_bytes))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return DemSurface, tuple(getattr(self, one.name) for one in fields(self) if one.init)
+        return DemSurface, tuple(getattr(self, item.name) for item in fields(self) if item.init)
 
     # -- what it is --------------------------------------------------------------------------------------------------
 
@@ -232,7 +231,7 @@ class DemSurface(Surface):
         return {**self.record, "fill": self.fill}
 
     def describe(self) -> str:
-        """Say where a point on the surface lies."""
+        """Return where a point on the surface is, in words."""
         return "on the DEM"
 
     def with_fill(self, fill: str | float) -> DemSurface:
@@ -240,7 +239,7 @@ class DemSurface(Surface):
         return replace(self, fill=parse_fill(fill))
 
     def around(self, lon: float) -> DemSurface:
-        """Return this DEM with its seam opposite to `lon` (degrees) if it goes round the world, else as it is."""
+        """Return a global DEM with its seam opposite to `lon` (degrees); any other DEM unchanged."""
         sigma = self.sigma.around(lon) if isinstance(self.sigma, Surface) else self.sigma
         grid = self.grid.around(lon)
         return self if grid is self.grid and sigma is self.sigma else replace(self, grid=grid, sigma=sigma)
@@ -272,7 +271,7 @@ class DemSurface(Surface):
             return out
         empty = np.isnan(out) & np.isfinite(u) & np.isfinite(v)
         if self.fill == "nearest":
-            # Outside, the edge goes on.
+            # Outside, the edge continues.
             rows, columns = self.shape
             inner_u, inner_v = np.clip(u, 0, columns - 1), np.clip(v, 0, rows - 1)
             with np.errstate(invalid="ignore"):
@@ -290,13 +289,13 @@ class DemSurface(Surface):
         return float(np.isfinite(heights).mean()) if len(heights) else 1.0
 
     def above(self, ground: Array, crs: str | pyproj.CRS) -> Array:
-        """Return how far (m) points ``(N, 3)`` lie above the DEM; NaN where it has no height."""
+        """Return how far (m) points ``(N, 3)`` are above the DEM; NaN where it has no height."""
         return ground[:, 2] - self.heights(ground[:, :2], crs)
 
     def _places(self, xy: ArrayLike, crs: str | pyproj.CRS | None) -> tuple[Array, Array]:
         plan = positions(xy)
-        found = self.samples_at(plan) if crs is None else self.sampler(crs)(_on_ellipsoid(plan))
-        return found[:, 0], found[:, 1]
+        samples = self.samples_at(plan) if crs is None else self.sampler(crs)(_on_ellipsoid(plan))
+        return samples[:, 0], samples[:, 1]
 
     def _interpolated(self, u: Array, v: Array, filled: bool) -> Array:
         """Return heights ``(N,)`` at sample coordinates; NaN outside."""
@@ -417,7 +416,7 @@ def _on_ellipsoid(plan: Array) -> Array:
 def _undulations(vertical: Vertical, grid: SampleGrid, window: tuple[int, int, int, int]) -> Array:
     """Return the undulation ``(height, width)`` of samples of a window (left, top, width, height).
 
-    The lattice lies on multiples of its spacing in the DEM, so a sample's value does not depend on the window.
+    The lattice is on multiples of its spacing in the DEM, so the value of a sample does not depend on the window.
     """
 
     def at(u: NDArray[Any], v: NDArray[Any]) -> Array:
@@ -441,7 +440,7 @@ def _undulations(vertical: Vertical, grid: SampleGrid, window: tuple[int, int, i
 
 
 def _by_tile(u: Array, v: Array, index: NDArray[np.intp], across: int) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
-    """Yield row and column of each tile that some of the positions lie in, and which; `across` tiles are a row."""
+    """Yield row and column of each tile with positions, and these positions; a row has `across` tiles."""
     tiles = (v[index] // TILE).astype(int) * across + (u[index] // TILE).astype(int)
     order = np.argsort(tiles, kind="stable")
     unique, first = np.unique(tiles[order], return_index=True)

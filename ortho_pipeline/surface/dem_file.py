@@ -1,4 +1,4 @@
-"""The file of a DEM: where its samples lie, and what they say in metres."""
+"""The file of a DEM: the grid of its samples, and their heights in metres."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ Affine = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """Where the samples of a DEM lie.
+    """The grid of the samples of a DEM.
 
     Parameters
     ----------
     crs : pyproj.CRS
-        Their horizontal system, x first.
+        Horizontal CRS, x first.
     shape : tuple
         (rows, columns).
     crs_from_pixel : tuple of 6 floats
         ``x = a + b u + c v``, ``y = d + e u + f v``; (0, 0) is the centre of the first sample.
     first_column : int
-        Column of the file that is the first of the grid, in one that goes round the world.
+        Column of the file that is the first of a global grid.
     """
 
     crs: pyproj.CRS
@@ -83,7 +83,7 @@ class SampleGrid:
         return unit * float(np.linalg.norm(sides, axis=1).max())
 
     def around(self, lon: float) -> SampleGrid:
-        """Return the grid with the seam opposite to `lon` (degrees) if it goes round the world, else as it is."""
+        """Return a global grid with the seam opposite to `lon` (degrees); any other grid unchanged."""
         x, a, b, y, c, d = self.crs_from_pixel
         columns = self.shape[1]
         if not self.crs.is_geographic or b or c or abs(abs(a) * columns - 360) > 1e-6 * abs(a):
@@ -130,7 +130,7 @@ def _crs_of(wkt: str) -> tuple[pyproj.CRS, pyproj.CRS]:
 
 @dataclass(frozen=True, eq=False)
 class DemFile:
-    """The samples as they stand in a file; every thread has a GDAL handle of its own.
+    """The samples of a file; every thread has its own GDAL handle.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""A DEM in many files: one grid of samples over all of them, of one horizontal system and one height datum.
+"""A DEM in many files: one grid of samples for all of them, with one horizontal CRS and one height datum.
 
-Files of one spacing have to lie on one grid, as the cells of a DEM do. Rows are the same everywhere. Where cells become
-wider towards the poles (Copernicus, DTED), the grid has columns on which the samples of all cells lie: 3600 and 2400
-columns per degree make 7200. A row is linear between the samples of its own cell, over the border of two cells of one
-kind too, so bilinear heights are those of the cell's own grid. Between the last row of one width and the first of
-another, heights go linearly from one row to the other.
+Files with the same spacing must be on one grid, as the cells of a DEM are. Rows are the same everywhere. If cells
+become wider towards the poles (Copernicus, DTED), the grid has columns for the samples of all cells: 3600 and 2400
+columns per degree make 7200. A row is linear between the samples of its cell, also across the border of two equal
+cells, so bilinear heights are those of the cell's own grid. Between the last row of one width and the first row of
+another, heights are linear from one row to the other.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
 _OPEN_FILES = 32
 #: Files that one DEM may have.
 _MOST_FILES = 30_000
-#: Part of a sample by which a file may lie off the grid, and part of a spacing by which another may differ.
+#: Largest offset of a file from the grid, in parts of a sample, and largest relative difference of spacings.
 _OFF_GRID, _SAME_STEP = 0.01, 1e-6
-#: So many columns of the grid may lie between two of the finest file. Copernicus needs 3 (2400, 1800, 1200 columns).
+#: Largest number of grid columns between two columns of the finest file. Copernicus needs 3 (2400, 1800, 1200 columns).
 _MOST_BETWEEN = 12
-#: Samples of an arc that says to be the whole circle.
+#: Degrees of the full circle.
 _CIRCLE = 360.0
 
 
@@ -85,22 +85,22 @@ def matching_files(pattern: str | os.PathLike[str]) -> list[str] | None:
         return None  # a pattern of assets in a STAC document
     if not glob.has_magic(text) or os.path.exists(text) or "://" in text or text.startswith("/vsi"):
         return None
-    found = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
-    if not 0 < len(found) <= _MOST_FILES:
+    paths = sorted(path for path in glob.iglob(text) if os.path.isfile(path))
+    if not 0 < len(paths) <= _MOST_FILES:
         raise InputError(
-            f"{counted(len(found), 'file')} of this pattern",
+            f"{counted(len(paths), 'file')} of this pattern",
             file=text,
             field="surface.dem",
             remedy="give a DEM, or a pattern of the files that make one",
         )
-    return found
+    return paths
 
 
 @dataclass(frozen=True)
 class Part:
-    """Samples that belong to a mosaic: whose they are, and where they lie in its layer.
+    """Samples of a file in a mosaic, and their position in its layer.
 
-    `column` and `row` are those of their first sample, `shape` is (rows, columns).
+    `column` and `row` are those of the first sample, `shape` is (rows, columns).
     """
 
     samples: Samples
@@ -111,18 +111,18 @@ class Part:
 
 @dataclass(frozen=True)
 class ResolutionLayer:
-    """Parts of one spacing.
+    """Parts with the same spacing.
 
     Parameters
     ----------
     parts : tuple of Part
-        Of two at one place the later one counts where it has a height.
+        Where two overlap, the later one is used if it has a height.
     first : int
-        Column of the mosaic at which its column 0 lies.
+        Column of the mosaic that is its column 0.
     step : int
-        Columns of the mosaic from one of its own columns to the next.
+        Columns of the mosaic from one of its columns to the next.
     columns : int
-        How many it has; all of them go round the world if `closed`.
+        Number of its columns; if `closed`, they go around the Earth.
     """
 
     parts: tuple[Part, ...]
@@ -134,11 +134,11 @@ class ResolutionLayer:
     @functools.cached_property
     def _boxes(self) -> NDArray[np.int64]:
         """Left, top, right, bottom ``(4, N)`` of the parts."""
-        rows = [(one.column, one.row, one.column + one.shape[1], one.row + one.shape[0]) for one in self.parts]
+        rows = [(part.column, part.row, part.column + part.shape[1], part.row + part.shape[0]) for part in self.parts]
         return np.array(rows, dtype=np.int64).T
 
     def within(self, left: int, top: int, width: int, height: int) -> Iterator[tuple[Part, int]]:
-        """Yield the parts that reach into a window, in their order, and the column at which they lie there."""
+        """Yield the parts that overlap a window, in their order, with their column there."""
         west, north, east, south = self._boxes
         for turn in (-self.columns, 0, self.columns) if self.closed else (0,):
             meets = (west + turn < left + width) & (east + turn > left) & (north < top + height) & (south > top)
@@ -148,7 +148,7 @@ class ResolutionLayer:
 
 @dataclass(frozen=True, eq=False)
 class DemMosaic:
-    """The samples of many files as those of one; see `DemFile`, which it stands for."""
+    """The samples of many files, with the interface of `DemFile`."""
 
     path: str
     crs: pyproj.CRS
@@ -230,29 +230,29 @@ def _between(own: Array, at: NDArray[np.int64], part: Array) -> Array:
 
 
 def open_mosaic(name: str, paths: Sequence[str], access: Mapping[str, Any]) -> DemMosaic:
-    """Return many files as one DEM; where two have a height, the later one counts.
+    """Return many files as one DEM; where two have a height, the later one is used.
 
     Parameters
     ----------
     name : str
-        What the whole is called in messages.
+        Name of the DEM in messages.
     access : mapping
         What `raster.open_pixels` may do for it.
 
     Raises
     ------
     CrsError
-        If they have several horizontal systems, or no grid holds them all.
+        If they have different horizontal CRSs, or no grid fits all of them.
     DatumError
-        If they say different things of what their heights are measured above, or of their unit.
+        If they have different height datums or units.
     InputError
         If one cannot be read.
     """
     samples = [DemFile(path, access) for path in paths]
     placed: list[tuple[Samples, pyproj.CRS, SampleGrid, str]] = []
-    for one in samples:
-        placed.append((one, *one.place(), one.unit))
-        one.close()
+    for file in samples:
+        placed.append((file, *file.place(), file.unit))
+        file.close()
     # Gaps between the files are voids, not heights of 0.
     warp = f"`gdalwarp -r bilinear -dstnodata -9999 {typed_pattern(name)} dem.tif`"
     with completed(remedy=f"resample them to one grid: {warp}; or leave out the files that do not belong"):
@@ -278,8 +278,8 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
         layers.setdefault(steps[0] if steps else own.crs_from_pixel[1], []).append((samples, own))
     # The finest last: it counts where it has heights.
     members = [layers[step] for step in sorted(layers, key=abs, reverse=True)]
-    whole = _whole_grid(name, [grid for _, _, grid, _ in placed], _between_columns(members))
-    return DemMosaic(name, crs, whole, unit, tuple(_layer(whole, theirs) for theirs in members))
+    grid_of_all = _whole_grid(name, [grid for _, _, grid, _ in placed], _between_columns(members))
+    return DemMosaic(name, crs, grid_of_all, unit, tuple(_layer(grid_of_all, theirs) for theirs in members))
 
 
 def _refuse_other_system(
@@ -324,17 +324,17 @@ def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) ->
     fine = members[-1][0][1].crs_from_pixel[1]
     x = min((_west(theirs) for theirs in members), key=lambda value: value * np.sign(fine))
     steps = np.array([theirs[0][1].crs_from_pixel[1] / fine for theirs in members])
-    # A layer may lie off by a part of its own samples, as its files may.
+    # A layer may be off by a part of its own samples, as its files may.
     offsets, slack = np.array([(_west(theirs) - x) / fine for theirs in members]), _OFF_GRID * steps
     for count in range(1, _MOST_BETWEEN + 1):
         even = np.abs(steps * count - np.rint(steps * count)) < _SAME_STEP * steps * count
         on = np.abs(offsets * count - np.rint(offsets * count)) <= slack * count
         if (even & on).all():
             return count
-    one, other = members[-1][0][0], members[0][0][0]
+    finest, other = members[-1][0][0], members[0][0][0]
     raise CrsError(
         f"the columns of this file do not match those of {other.path}",
-        file=one.path,
+        file=finest.path,
         field="geotransform",
     )
 
@@ -342,7 +342,7 @@ def _between_columns(members: Sequence[Sequence[tuple[Samples, SampleGrid]]]) ->
 def _whole_grid(name: str, grids: Sequence[SampleGrid], between: int) -> SampleGrid:
     """Return the grid over all grids, from the first sample in x and y to the last ones.
 
-    Its columns are the finest, each divided into so many.
+    Its columns are the finest ones, each divided by `between`.
     """
     dx = min((grid.crs_from_pixel[1] for grid in grids), key=abs) / between
     dy = grids[0].crs_from_pixel[5]
@@ -353,7 +353,7 @@ def _whole_grid(name: str, grids: Sequence[SampleGrid], between: int) -> SampleG
     bottom = max(round((g.crs_from_pixel[3] - y) / dy) + g.shape[0] for g in grids)
     columns = right + 1
     if grids[0].crs.is_geographic and columns * abs(dx) > _CIRCLE - 1.5 * max(abs(g.crs_from_pixel[1]) for g in grids):
-        # The last samples of coarse cells lie before the end of a circle that these cells close.
+        # The last samples of coarse cells are before the end of the circle that these cells close.
         columns = round(_CIRCLE / abs(dx))
     size = bottom * columns
     if not 0 < size <= 1e13:
@@ -365,7 +365,7 @@ def _layer(whole: SampleGrid, members: Sequence[tuple[Samples, SampleGrid]]) -> 
     """Return parts of one spacing as a layer of the whole."""
     x, dx, _, y, _, dy = whole.crs_from_pixel
     step = members[0][1].crs_from_pixel[1]
-    # Columns that are those of the whole are counted in it, whatever rounding says of the spacing.
+    # Columns of the whole grid are counted in it, despite rounding of the spacing.
     first, width = (x, dx) if round(step / dx) == 1 else (_west(members), step)
     parts = []
     for samples, grid in members:

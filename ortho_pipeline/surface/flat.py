@@ -50,11 +50,11 @@ class FlatSurface(Surface):
         return {"constant_height": self.height}
 
     def describe(self) -> str:
-        """Say where a point on the surface lies."""
+        """Return where a point on the surface is, in words."""
         return f"at {self.height:.0f} m above the ellipsoid"
 
     def with_fill(self, fill: str | float) -> FlatSurface:
-        """Return this surface with another rule for voids, of which it has none."""
+        """Return this surface; it has no voids."""
         return replace(self, fill=parse_fill(fill))
 
     def around(self, lon: float) -> FlatSurface:

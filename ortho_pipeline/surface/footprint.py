@@ -1,8 +1,8 @@
-"""Where a scene lies: its footprint on the surface, how much of it the DEM covers, and the output grid that follows.
+"""The footprint of a scene on the surface, its coverage by the DEM, and the output grid.
 
 Heights come from the surface under the scene. The extent never comes from the DEM alone: where the ray of a border
-pixel leaves the DEM, both ends of the range of heights there stand in, so a DEM that covers half the scene cannot cut
-the ortho in half.
+pixel leaves the DEM, both ends of the range of heights replace it. So a DEM that covers half the scene cannot cut the
+ortho in half.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ortho_pipeline.surface.dem import DemSurface
 from ortho_pipeline.surface.flat import FlatSurface
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Points per side of the image at which the DEM is asked for.
+#: Sample points per side of the image for the coverage by the DEM.
 _COVERAGE_SIDE = 33
 _BORDER_SIDE = 65
 #: Samples of the DEM per side of the blocks in which voids are counted.
 _BLOCK = 1024
-#: A model is meant for the heights under its scene and this part of their range beyond, or so many metres.
+#: Margin of the heights under a scene for its model: part of their range, and least margin (m).
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
 _SOUND = Text(
     "give the metadata of this image (",
@@ -76,27 +76,27 @@ def facing(model: SensorModel, surface: Surface, width: int, height: int) -> Sur
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Where a scene lies on a surface, and what heights it has there; from `lay`.
+    """The footprint of a scene on a surface, and its heights; from `lay`.
 
     Parameters
     ----------
     surface : Surface
-        What it lies on, with the seam of a global DEM opposite to the scene.
+        With the seam of a global DEM opposite to the scene.
     ring : (N, 3)
-        The border of the image on the ground, in the model's CRS: on the surface, and where a ray leaves the DEM, at
-        the height `middle`. Rays that do not meet the ground are left out.
+        The border of the image on the ground, in the model's CRS: on the surface, or where a ray leaves the DEM, at the
+        height `middle`. Rays that do not meet the ground are omitted.
     reach : (M, 3)
-        Ground that the image may reach: `ring`, and the lost rays at both ends of `heights`.
+        Ground that the image may show: `ring`, and the lost rays at both ends of `heights`.
     heights : (float, float)
-        Lowest and highest ellipsoidal height (m) of the surface under the scene; the model's own range where no ray
-        meets the surface.
+        Lowest and highest ellipsoidal height (m) of the surface under the scene; the model's range if no ray meets the
+        surface.
     middle : float
-        Height (m) at which the middle of the image is seen.
+        Height (m) of the ground in the middle of the image.
     coverage : float
-        Share (0 to 1) of the area of the scene on the ground for which the surface has heights of its own: the same
-        for every fill, because it is measured without one. A ray that finds no height goes on to `middle` there.
+        Share (0 to 1) of the scene's area on the ground with heights of the surface, without filled ones. A ray that
+        meets no height continues to `middle`.
     complete : bool
-        Whether every ray met the surface at a height of its own; small voids between the rays may still be there.
+        Whether every ray met the surface at a height that is not filled; there may be small voids between the rays.
     voids : int
         Samples of the DEM within the scene that have no height.
     unmet : bool
@@ -117,18 +117,18 @@ class Footprint:
     beyond: str = ""
 
     def require_coverage(self) -> None:
-        """Raise a `CoverageError` if the surface does not cover the scene and nothing was said about the rest.
+        """Raise an error if the surface does not cover the scene and has no fill rule.
 
         Raises
         ------
         CoverageError
-            If a ray found no height and the surface has no fill rule.
+            If a ray met no height and the surface has no fill rule.
         """
         surface = self.surface
         if not isinstance(surface, DemSurface):
             return  # flat ground is everywhere
         file = surface.provenance.get("path")
-        wanted = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
+        choice = Text("choose how to fill the rest: ", Setting("surface.fill", "mask"), " (no pixels there)")
         if self.beyond and ((surface.fill == "error" and not self.complete) or not self.coverage):
             raise CoverageError(
                 self.beyond,
@@ -138,7 +138,7 @@ class Footprint:
                     "check the height datum and unit of the DEM (",
                     Setting("surface.vertical"),
                     ") and the position of the scene, or ",
-                    wanted,
+                    choice,
                 ),
             )
         if not self.complete and surface.fill == "error":
@@ -147,7 +147,7 @@ class Footprint:
                 file=file,
                 remedy=Text(
                     "give a DEM that covers the whole scene, or ",
-                    wanted,
+                    choice,
                     ", nearest, or an ellipsoidal height in metres",
                 ),
             )
@@ -164,17 +164,17 @@ class Footprint:
                 "the nearest height of the DEM",
                 file=file,
                 field="surface.fill",
-                remedy=Text("give a larger DEM, or ", wanted),
+                remedy=Text("give a larger DEM, or ", choice),
             )
 
     def notes(self) -> list[Notice]:
         """Return a notice if the DEM does not cover the scene as a whole, or only with heights beyond the model."""
-        said = [f"{self.beyond}: these places have no pixels"] if self.beyond else []
+        texts = [f"{self.beyond}: these places have no pixels"] if self.beyond else []
         if self.coverage < 1.0:
             what = "has no pixels in the ortho" if self.surface.fill in ("error", "mask") else "was filled"
             inside = f" ({counted(self.voids, 'sample')} without a height inside it)" if self.voids else ""
-            said.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the rest {what}")
-        return [Notice("dem-covers-part", "; ".join(said), coverage=self.coverage)] if said else []
+            texts.append(f"the DEM covers {share(self.coverage)} of the scene{inside}: the rest {what}")
+        return [Notice("dem-covers-part", "; ".join(texts), coverage=self.coverage)] if texts else []
 
     def fitted(self, model: SensorModel) -> SensorModel:
         """Return the model, meant for the heights here and a margin, where its own range is no more than a guess."""
@@ -194,32 +194,32 @@ def lay(model: SensorModel, surface: Surface, width: int, height: int) -> Footpr
         If no border pixel meets the ground.
     """
     surface = facing(model, surface, width, height)
-    found, met, projects = _laid(model, surface, width, height)
-    if not len(found.reach):
+    footprint, met, projects = _laid(model, surface, width, height)
+    if not len(footprint.reach):
         raise _nowhere(model, surface)
-    found = replace(found, beyond=_beyond(model, surface, found))
+    footprint = replace(footprint, beyond=_beyond(model, surface, footprint))
     if not isinstance(surface, DemSurface):
-        return found
+        return footprint
     unmet = bool((projects & ~met).any())
-    ring = found.ring
-    if surface.fill not in ("error", "mask"):  # what fills the rest has no say in how much there is
+    ring = footprint.ring
+    if surface.fill not in ("error", "mask"):  # the fill does not change the coverage
         surface = surface.with_fill("mask")
         bare, met, projects = _laid(model, surface, width, height)
         ring = bare.ring
     own = met.sum() / max(projects.sum(), 1)
     voids, area, sampled = _voids(model, surface, ring)
-    # Whichever looks closer has the say; where a ray finds no height, the DEM does not cover all.
+    # Use the finer of both samples; if a ray meets no height, the DEM does not cover all.
     fine = area > _COVERAGE_SIDE**2 and (sampled < 1.0 or own >= 1.0)
     covered = sampled if fine else min(own, sampled)
-    return replace(found, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
+    return replace(footprint, coverage=float(covered), complete=bool(own >= 1.0), voids=voids, unmet=unmet)
 
 
 def _laid(
     model: SensorModel, surface: Surface, width: int, height: int
 ) -> tuple[Footprint, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return where a scene lies on a surface, and which rays of a grid over the image find a height, and may find one.
+    """Return the footprint of a scene, and which rays of a grid over the image meet a height, and which can meet one.
 
-    The latter are ``(n,)`` each; a ray may find a height if it meets the ground at all.
+    The last two are ``(n,)``; a ray can meet a height if it meets the ground at all.
     """
     ring = border(width, height)
     image = np.concatenate([image_grid(width, height, _COVERAGE_SIDE), ring])
@@ -237,7 +237,7 @@ def _laid(
 
 
 def _nowhere(model: SensorModel, surface: Surface) -> InputError:
-    """Return the error of a scene none of whose pixels meets the ground."""
+    """Return the error for a scene without any pixel that meets the ground."""
     low, high = model.height_range
     if not isinstance(surface, FlatSurface) or low <= surface.height <= high:
         return InputError(
@@ -252,14 +252,14 @@ def _nowhere(model: SensorModel, surface: Surface) -> InputError:
     )
 
 
-def _beyond(model: SensorModel, surface: Surface, found: Footprint) -> str:
-    """Say that the surface has heights under a scene at which its model does not project; nothing if it has not."""
+def _beyond(model: SensorModel, surface: Surface, footprint: Footprint) -> str:
+    """Return a sentence if the surface has heights under a scene that its model does not project; empty if not."""
     low, high = model.height_limits
     if not (math.isfinite(low) or math.isfinite(high)):
         return ""
-    lowest, highest = found.heights
+    lowest, highest = footprint.heights
     with contextlib.suppress(CoverageError):
-        lowest, highest = surface.range_under(found.reach, model.crs)
+        lowest, highest = surface.range_under(footprint.reach, model.crs)
     if low <= lowest and highest <= high:
         return ""
     return (
@@ -308,7 +308,7 @@ def _voids(model: SensorModel, surface: DemSurface, ring: Array) -> tuple[int, f
         outline = shapely.MultiPoint(samples).convex_hull
     inside = shapely.intersection(outline, shapely.box(0, 0, columns - 1, rows - 1))
     if inside.is_empty or outline.area == 0:
-        return 0, 0.0, 1.0  # the rays have the only say
+        return 0, 0.0, 1.0  # only the rays count
     beyond = 0.0 if shapely.equals(inside, outline) else 1.0 - inside.area / outline.area
     shapely.prepare(inside)
     left, top, right, bottom = (int(value) for value in (*np.floor(inside.bounds[:2]), *np.ceil(inside.bounds[2:])))
@@ -361,7 +361,7 @@ def two_digits(value: float) -> float:
 
 def choose_grid(
     model: SensorModel,
-    found: Footprint,
+    footprint: Footprint,
     size: tuple[int, int],
     *,
     crs: pyproj.CRS | None = None,
@@ -373,8 +373,8 @@ def choose_grid(
 
     Parameters
     ----------
-    found : Footprint
-        Where the scene lies.
+    footprint : Footprint
+        The footprint of the scene.
     size : (int, int)
         Columns and rows of the image.
     crs : pyproj.CRS, optional
@@ -383,21 +383,21 @@ def choose_grid(
         In units of `crs`, one number or x and y. Default: the ground sample distance at the height of the middle of the
         image, to two significant digits.
     extent : xmin, ymin, xmax, ymax, optional
-        Taken as it is, or widened to whole multiples of the resolution with `align`. Default: the footprint, widened.
+        Used unchanged, or with `align` widened to multiples of the resolution. Default: the footprint, widened.
 
     Raises
     ------
     InputError
-        If extent or resolution make no grid.
+        If extent or resolution give no grid.
     """
     width, height = size
     crs = crs or output_crs(model, width, height)
     if resolution is None:
-        resolution = two_digits(ground_sample_distance(model, crs, width, height, found.middle))
+        resolution = two_digits(ground_sample_distance(model, crs, width, height, footprint.middle))
     step = (resolution, resolution) if isinstance(resolution, int | float) else (resolution[0], resolution[1])
     if extent is not None:
         return Grid.of_extent(crs, extent, step, align=align)
-    ground = _continuous(ground_transform(model.crs, crs)(found.reach), crs)
+    ground = _continuous(ground_transform(model.crs, crs)(footprint.reach), crs)
     if not np.isfinite(ground).any():
         raise InputError(
             f"the scene is outside the area of {crs.name!r}", field="output.crs", remedy="choose another CRS"
@@ -405,7 +405,7 @@ def choose_grid(
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     if (np.array(step) > (high - low)[:2]).all():
         unit = crs.axis_info[0].unit_name
-        usual = f"{two_digits(ground_sample_distance(model, crs, width, height, found.middle)):.12f}".rstrip("0")
+        usual = f"{two_digits(ground_sample_distance(model, crs, width, height, footprint.middle)):.12f}".rstrip("0")
         raise InputError(
             f"a resolution of {step[0]:g} means {step[0]:g} {unit}s in {crs.name!r}; "
             "the whole scene is smaller than one pixel",
@@ -415,7 +415,7 @@ def choose_grid(
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
 
 
-def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
+def scene_pixels(model: SensorModel, footprint: Footprint, grid: Grid) -> float:
     """Return how many pixels of a grid the scene covers, or a few more: those within the hull of what it may reach.
 
     Raises
@@ -425,7 +425,7 @@ def scene_pixels(model: SensorModel, found: Footprint, grid: Grid) -> float:
     """
     import shapely
 
-    ground = _continuous(ground_transform(model.crs, grid.crs)(found.reach), grid.crs)
+    ground = _continuous(ground_transform(model.crs, grid.crs)(footprint.reach), grid.crs)
     ground = ground[np.isfinite(ground).all(axis=1), :2]
     xmin, ymin, xmax, ymax = grid.extent
     if grid.crs.is_geographic and len(ground):

@@ -1,11 +1,11 @@
 """Compiled search for where rays first meet a DEM, from above; see rays.py.
 
-A ray is a curve: the DEM coordinates (u, v) as polynomials in the normalised height, five coefficients each. Upwards
-it rises faster than the terrain, but in *steep* cells of four samples: those that climb faster than the ray. So a place
-where it is on the terrain, which Newton's method finds, is where it first meets it, if it is above all steep cells that
-it may pass on its way up. Where that is not sure it is followed from above, from cell to cell. Within a cell the
-terrain along it is a quadratic function, so that whether and where it comes down to it is known, not sampled; and cells
-are not visited where it is above all of them: squares of 8 x 8 cells, of 16 x 16, and so on know their highest sample.
+A ray is a curve: the DEM coordinates (u, v) as polynomials in the normalised height, with five coefficients each.
+Upwards it rises faster than the terrain, except in *steep* cells of four samples, which climb faster than the ray.
+Newton's method finds a point of the ray on the terrain. It is the first one if the ray is above all steep cells on its
+way up. If this is not certain, the ray is followed from above, from cell to cell. Within a cell the terrain along the
+ray is a quadratic function, so the meeting point is exact, not sampled. Groups of cells below the ray are skipped:
+squares of 8 x 8 cells, of 16 x 16, and so on have their highest sample.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ Array = NDArray[np.float64]
 
 #: Cells per side of the smallest square, as a power of two.
 SQUARE_BITS = 3
-#: Rays of a block that are taken on together, and rows of their workspace: the ten coefficients, the normalised height,
-#: the misfit, the place in the cell, its corners. One array of known size, so that loops become vector instructions.
+#: Rays of a block, and rows of their workspace: ten coefficients, normalised height, misfit, position in the cell, its
+#: corners. One array of known size, so that loops become vector instructions.
 BLOCK = 256
 _T, _MISS, _FX, _FY, _H00, _H10, _H01, _H11, _ROWS = range(10, 19)
-#: Steps of Newton's method after which a ray is followed from cell to cell.
+#: Newton steps before a ray is followed from cell to cell.
 _STEPS = 8
-#: Longest last step of that (samples).
+#: Longest last Newton step (samples).
 _LAST = 0.01
-#: A ray is followed from so much above the highest sample (m): more than rounding.
+#: Height (m) above the highest sample at which a ray starts: more than rounding.
 _MARGIN = 1e-4
 
 
@@ -44,10 +44,10 @@ class BoundedHeights(NamedTuple):
     middle, half : float
         The normalised height is -1 at middle - half and 1 at middle + half (m).
     tops : (n,)
-        The highest sample of each square of cells, rim included, -inf where there is none: first those of 8 x 8 cells,
-        row by row, then those of twice the side, until one square holds all.
+        The highest sample of each square of cells, edges included, -inf without samples: first those of 8 x 8 cells,
+        row by row, then those of twice the side, until one square contains all.
     steep : (rows, columns)
-        Of squares of 8 x 8 cells the highest corner of any steep cell that a ray from there upwards may pass.
+        For squares of 8 x 8 cells, the highest corner of any steep cell that a ray upwards from there can pass.
     steepest : float
         The largest difference (m) of neighbouring samples.
     """
@@ -66,7 +66,7 @@ def terrain_of(heights: Array, left: int, top: int, middle: float, half: float, 
     """Return heights ``(rows, columns)`` as terrain for the rays between `nodes` ``(..., n)``: see `curves_at`."""
     first = nodes[..., (1, 6)].reshape(-1, 2)
     rest = (np.abs(nodes[..., (2, 3, 4, 7, 8, 9)]).reshape(-1, 2, 3) * (2, 3, 4)).sum(axis=2)
-    # Samples per metre upwards: nowhere less or more. Where no node is known there are no rays.
+    # Least and greatest number of samples per metre upwards. Without known nodes there are no rays.
     known = np.isfinite(first + rest).all(axis=1)
     low, high = np.zeros(2), np.zeros(2)
     if known.any():
@@ -75,7 +75,7 @@ def terrain_of(heights: Array, left: int, top: int, middle: float, half: float, 
     tops, steep, voids = (np.empty(tuple(((side - 2) >> SQUARE_BITS) + 1 for side in heights.shape)) for _ in range(3))
     steepest = float(find_squares(heights, low, high, tops, steep, voids))
     if voids.any():
-        # Of all cells beside a void: a ray may come out of it below the terrain.
+        # For all cells next to a void: a ray may come out of it below the terrain.
         wide = np.pad(voids, 1)
         near = [wide[j : j + len(voids), i : i + voids.shape[1]] for j in range(3) for i in range(3)]
         steep = np.where(np.any(near, axis=0), tops, steep)
@@ -125,7 +125,7 @@ def meet(curves: Array, terrain: BoundedHeights, tolerance: float) -> Array:
 
 @inlined
 def climbs(heights, j, i, low, high):
-    """Tell whether a cell climbs faster than a line of `low` to `high` samples a metre; no cell beside a void does."""
+    """Return whether a cell is steeper than a line of `low` to `high` samples per metre; never next to a void."""
     h00, h10, h01, h11 = heights[j, i], heights[j, i + 1], heights[j + 1, i], heights[j + 1, i + 1]
     across = max(low[0] * (h10 - h00), high[0] * (h10 - h00), low[0] * (h11 - h01), high[0] * (h11 - h01))
     down = max(low[1] * (h01 - h00), high[1] * (h01 - h00), low[1] * (h11 - h10), high[1] * (h11 - h10))
@@ -185,7 +185,7 @@ def curves_at(nodes: Any, places: Any, curves: Any) -> None:
 
 @inlined
 def _locate(work, cells, left, top, rows, columns):
-    """Find the cells of the rays of a block and the places in them, at their heights."""
+    """Find the cells of the rays of a block, and the positions in them, at their heights."""
     for k in range(BLOCK):
         t = work[_T, k]
         x = work[0, k] + t * (work[1, k] + t * (work[2, k] + t * (work[3, k] + t * work[4, k]))) - left
@@ -199,7 +199,7 @@ def _locate(work, cells, left, top, rows, columns):
 
 @inlined
 def _improve(work, middle, half, tolerance):
-    """Take the rays of a block that are not on the terrain a step of Newton's method on; return how many they were."""
+    """Do a Newton step for the rays of a block that are not on the terrain; return how many they were."""
     left = 0
     for k in range(BLOCK):
         t, fx, fy = work[_T, k], work[_FX, k], work[_FY, k]
@@ -209,7 +209,7 @@ def _improve(work, middle, half, tolerance):
         miss = middle + half * t - (work[_H00, k] + a * fx + b * fy + c * fx * fy)
         step = miss / (half - (a + c * fy) * across - (b + c * fx) * down)
         far = abs(miss) > tolerance
-        # The last step, from where it is near enough, is made if the ray stays where it is.
+        # The last step, from a near position, is only made if the ray stays in its cell.
         going = (work[_MISS, k] > tolerance) & (far | (abs(step) * (abs(across) + abs(down)) < _LAST))
         work[_T, k] = min(max(t - step, -1.0), 1.0) if going else t
         work[_MISS, k] = abs(miss) if work[_MISS, k] > tolerance else work[_MISS, k]
@@ -219,7 +219,7 @@ def _improve(work, middle, half, tolerance):
 
 @compiled
 def approach(curves: Any, terrain: BoundedHeights, tolerance: float, found: Any) -> int:
-    """Fill the heights at which rays surely first meet the terrain, NaN for the others; return how many these are."""
+    """Fill the heights at which rays certainly first meet the terrain, NaN for the others; return how many are NaN."""
     heights, rows, columns = terrain.heights, terrain.heights.shape[0] - 1, terrain.heights.shape[1] - 1
     work, cells, others = np.zeros((_ROWS, BLOCK)), np.zeros((2, BLOCK), np.int64), 0
     for first in range(0, curves.shape[1], BLOCK):
@@ -255,7 +255,7 @@ def _place(curve, t, terrain):
 
 @inlined
 def _surface(heights, i, j, x, y):
-    """Height of the surface through the corners of a cell, within it and beside it; NaN beside a void."""
+    """Height of the surface through the corners of a cell, inside and outside it; NaN next to a void."""
     fx, fy = x - i, y - j
     upper = heights[j, i] + (heights[j, i + 1] - heights[j, i]) * fx
     lower = heights[j + 1, i] + (heights[j + 1, i + 1] - heights[j + 1, i]) * fx
@@ -264,7 +264,7 @@ def _surface(heights, i, j, x, y):
 
 @inlined
 def _clearance(curve, terrain, i, j, t):
-    """Height of a ray above the terrain, in half ranges of height; that of the cell (i, j) where it is beside it."""
+    """Height of a ray above the terrain, in half ranges of height; above the cell (i, j) if it is next to a void."""
     x, y = _place(curve, t, terrain)
     heights = terrain.heights
     column, row = min(max(int(x), 0), heights.shape[1] - 2), min(max(int(y), 0), heights.shape[0] - 2)
@@ -291,7 +291,7 @@ def _narrowed(curve, terrain, i, j, high, above, low, below, t, tolerance):
 
 @inlined
 def _square(tops, rows, columns, i, j, bits):
-    """Highest sample of the square of so many bits that holds a cell."""
+    """Highest sample of the square, with side 2^bits, that contains a cell."""
     begin = 0
     for k in range(SQUARE_BITS, bits):
         begin += (((rows - 1) >> k) + 1) * (((columns - 1) >> k) + 1)
@@ -300,7 +300,7 @@ def _square(tops, rows, columns, i, j, bits):
 
 @inlined
 def _coarsest(length):
-    """Return the bits of the smallest squares that are as wide as that."""
+    """Return the bits of the smallest squares that are at least `length` wide."""
     bits = SQUARE_BITS
     while length > 1 << bits:
         bits += 1
@@ -309,7 +309,7 @@ def _coarsest(length):
 
 @inlined
 def _free(terrain, i, j, t, coarse):
-    """Return the bits of the largest square about a cell that a ray is above, or zero, and how far down it is that."""
+    """Return the bits of the largest square around a cell that is below a ray (or zero), and how far down that is."""
     rows, columns = terrain.heights.shape[0] - 1, terrain.heights.shape[1] - 1
     bits, drop = coarse, 0.0
     while bits >= SQUARE_BITS:
@@ -330,17 +330,17 @@ def _entry(x, y, across, down, rows, columns):
 
 @inlined
 def _crossed(curve, terrain, i, j, across, down, t, above, after, below, tolerance):
-    """Return where a ray that passes a cell from t to `after` meets it first; infinity where it does not.
+    """Return where a ray that crosses a cell from t to `after` first meets it; infinity if it does not.
 
-    It is `above` the terrain by so much where it comes and by `below` where it goes.
+    Its clearance is `above` where it enters the cell and `below` where it leaves.
     """
     heights, step = terrain.heights, t - after
-    # The clearance on the way is c + b s + a s^2, s from 0 to 1.
+    # The clearance between both is c + b s + a s^2, s from 0 to 1.
     twist = heights[j, i] + heights[j + 1, i + 1] - heights[j, i + 1] - heights[j + 1, i]
     a = -twist * across * down * step * step
     b = below - above - a
     if below > 0.0 and a > 0.0 and -2.0 * a < b < 0.0 and above - b * b / (4.0 * a) < 2.0 * tolerance:
-        # It comes down to the terrain on the way, or nearly so.
+        # It meets the terrain in between, or nearly.
         after = t + step * b / (2.0 * a)
         below = _clearance(curve, terrain, i, j, after)
         a, b = 0.0, below - above
@@ -355,10 +355,10 @@ def _first_meeting(curve, terrain, tolerance):
     """Return the normalised height at which a ray first meets the terrain, from above; NaN where it does not.
 
     `curve` has five coefficients of each of the DEM coordinates (u, v), polynomials in the normalised height, which
-    falls from 1 to -1. A ray that comes out of a void, or from beside the DEM, below the terrain has met it there.
+    decreases from 1 to -1. A ray that leaves a void, or enters the DEM, below the terrain meets it there.
     """
     rows, columns = terrain.heights.shape[0] - 1, terrain.heights.shape[1] - 1
-    # Samples per unit of normalised height downwards, by the chord, and never quite straight down.
+    # Samples per unit of normalised height downwards, along the chord, and never exactly vertical.
     across, down = -(curve[1] + curve[3]), -(curve[6] + curve[8])
     across, down = across if across != 0.0 else 1e-30, down if down != 0.0 else 1e-30
     if not abs(across) + abs(down) < 1e5:
@@ -376,7 +376,7 @@ def _first_meeting(curve, terrain, tolerance):
         side, end = right if across > 0.0 else left, lower if down > 0.0 else upper
         step_x, step_y = (side - x) / across, (end - y) / down
         step = max(min(step_x, step_y, t + 1.0), 0.0)
-        # The curve is not its chord: once more from where that has led to.
+        # The curve differs from its chord: repeat from the new position.
         x, y = _place(curve, t - step, terrain)
         step_x, step_y = step + (side - x) / across, step + (end - y) / down
         step = max(min(step_x, step_y, t + 1.0), 0.0)

@@ -67,7 +67,7 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
     low, high = max(lowest - 1.0, limits[0]), min(highest + 1.0, limits[1])
     if not low < high:
         return np.full((len(image), 3), np.nan)
-    # The window ends where the DEM does; a fill rule goes on beyond.
+    # The window ends at the edge of the DEM; a fill rule continues beyond.
     many = len(image) >= MANY and surface.fill in ("error", "mask")
     height = _march_many(ray, window, low, high, tolerance) if many else None
     if height is not None:
@@ -142,13 +142,13 @@ class _Ray:
         return height - self.surface.heights_at(*self.places(index, height).T)
 
     def reach(self) -> tuple[tuple[int, int, int, int], tuple[float, float]] | None:
-        """Samples (column, row, columns, rows) of the DEM that the rays may meet, and the range of heights there.
+        """Samples (column, row, columns, rows) of the DEM that the rays can meet, and the range of heights there.
 
-        The window follows from a range of heights and the range from a window: from the model's own range on, until
-        the terrain lies within it. None if the rays miss the DEM.
+        The window depends on a range of heights, and the range on the window. They are iterated from the model's range
+        until the terrain is within it. None if the rays miss the DEM.
         """
         low, high = self.model.height_range
-        found = None
+        window_and_heights = None
         for _ in range(4):
             window = self._window(low, high)
             if window is None:
@@ -157,14 +157,14 @@ class _Ray:
                 lowest, highest = self.surface.range_within(*window)
             except CoverageError:
                 return None
-            found = window, (lowest, highest)
+            window_and_heights = window, (lowest, highest)
             if low <= lowest and highest <= high:
                 break
             low, high = min(low, lowest - 1.0), max(high, highest + 1.0)
-        return found
+        return window_and_heights
 
     def _window(self, low: float, high: float) -> tuple[int, int, int, int] | None:
-        """Samples under the rays between two heights; a frame around the points stands for all of them."""
+        """Samples under the rays between two heights; a frame around the points represents all of them."""
         if not self.any:
             return None
         steps = self.low + (self.high - self.low) * np.linspace(0, 1, 9)[:, None]
@@ -174,7 +174,7 @@ class _Ray:
         uv = uv[np.isfinite(uv).all(axis=1)]
         size = np.array(self.surface.shape[::-1])
         filled = self.surface.fill not in ("error", "mask")
-        # A fill rule goes on beyond the DEM, and what it takes may come from there.
+        # A fill rule continues beyond the DEM, and needs samples from there.
         beyond = self.surface.nearest_reach if self.surface.fill == "nearest" else 0
         first = np.clip(np.floor(uv.min(axis=0, initial=np.inf)) - 2 - beyond, 0, size - 2 if filled else size)
         last = np.clip(np.ceil(uv.max(axis=0, initial=-np.inf)) + 3 + beyond, first + 2 if filled else 0, size)
@@ -201,7 +201,7 @@ class _Parabolas(_Ray):
 def _march_many(
     ray: _Ray, window: tuple[int, int, int, int], low: float, high: float, tolerance: float
 ) -> Array | None:
-    """Return the heights of the first intersections ``(N,)`` by way of a lattice; None if none is good enough."""
+    """Return the heights of the first intersections ``(N,)`` with a lattice; None if no lattice is accurate enough."""
     from ortho_pipeline.surface import ray_kernel
 
     if window[2] * window[3] > _MOST_SAMPLES:
@@ -219,14 +219,14 @@ def _march_many(
         flat = curve_nodes(nodes)
         terrain = ray_kernel.terrain_of(heights, window[0], window[1], middle, half, flat)
         if _lattice_error(ray, nodes, origin, extent, spacing, middle, half) * 2 * terrain.steepest <= tolerance:
-            found = np.empty(len(image))
+            normalised = np.empty(len(image))
             curves = np.empty((flat.shape[2], _TOGETHER))
             for first in range(0, len(image), _TOGETHER):
                 places = (image[first : first + _TOGETHER] - origin) / spacing
                 some = curves[:, : len(places)]
                 ray_kernel.curves_at(flat, places, some)
-                found[first : first + _TOGETHER] = ray_kernel.meet(some, terrain, tolerance)
-            return middle + half * found
+                normalised[first : first + _TOGETHER] = ray_kernel.meet(some, terrain, tolerance)
+            return middle + half * normalised
     return None
 
 
@@ -254,8 +254,8 @@ def _lattice_error(
     fx, fy = (place - np.floor(place)).T[:, :, None, None]
     upper = nodes[j, i] * (1 - fx) + nodes[j, i + 1] * fx
     lower = nodes[j + 1, i] * (1 - fx) + nodes[j + 1, i + 1] * fx
-    found = np.einsum("nk,nka->na", t[:, None] ** np.arange(LEVELS), upper * (1 - fy) + lower * fy)
-    error = np.abs(found - ray.samples(image, middle + half * t)).max(axis=1)
+    places = np.einsum("nk,nka->na", t[:, None] ** np.arange(LEVELS), upper * (1 - fy) + lower * fy)
+    error = np.abs(places - ray.samples(image, middle + half * t)).max(axis=1)
     return float(np.where(np.isnan(error), np.inf, error).max())
 
 
@@ -264,7 +264,7 @@ def _bracket(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
     count = len(ray.image)
     every = np.arange(count)
     top, length = _tops(ray, low, high)
-    # A ray of which no part is known (beyond the model) is still worth a try, at the pace of the others.
+    # Try also a ray without any known part (beyond the model), with the step of the others.
     typical = float(np.nanmax(length)) if np.isfinite(length).any() else 1.0
     steps = np.clip(np.ceil(np.where(np.isfinite(length), length, typical)), 1, 2000).astype(int)
     above, below = np.full(count, np.nan), np.full(count, np.nan)
@@ -298,9 +298,9 @@ def _tops(ray: _Ray, low: float, high: float) -> tuple[Array, Array]:
     known, unknown = np.full(len(short), low), np.full(len(short), high)
     for _ in range(_HALVINGS if len(short) else 0):
         middle = (known + unknown) / 2
-        found = np.hypot(*(ray.places(short, middle) - foot[short]).T)
-        good = np.isfinite(found)
-        length[short[good]], top[short[good]] = found[good], middle[good]
+        lengths = np.hypot(*(ray.places(short, middle) - foot[short]).T)
+        good = np.isfinite(lengths)
+        length[short[good]], top[short[good]] = lengths[good], middle[good]
         known, unknown = np.where(good, middle, known), np.where(good, unknown, middle)
     return top, length
 

@@ -18,7 +18,8 @@ def nearest_heights(
 ) -> Array:
     """Return a window of heights with voids filled by the nearest valid sample, if one is within `reach` samples.
 
-    Outside of the raster its edge goes on so far. Does not depend on how a window is cut into smaller ones.
+    Outside the raster its edge continues for `reach` samples. The result is the same if a window is cut into smaller
+    ones.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def _piece(
         wide = read(west, north, east - west, south - north)
         void = np.isnan(wide)
         if not void.all():
-            # Without the distances of the surroundings, which nobody asks for: a third of the memory.
+            # Without distances, which are not needed: a third of the memory.
             nearest = distance_transform_edt(void, return_distances=False, return_indices=True)
             own = (slice(top - north, bottom - north), slice(left - west, right - west))
             near_v, near_u = nearest[0][own], nearest[1][own]

@@ -21,19 +21,19 @@ def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float,
     Parameters
     ----------
     heights : (rows, columns)
-        Metres above the vertical datum of `crs`, from the northwest; rounded, they pack much better.
+        Metres above the vertical datum of `crs`, from the northwest; rounded heights compress much better.
     corner : (float, float)
         Outer corner of the first sample.
     crs : str
-        Compound CRS such as EPSG:32636+5773, so that nobody has to say the datum.
+        Compound CRS with the height datum, such as EPSG:32636+5773.
     """
     system = osr.SpatialReference()
     system.SetFromUserInput(crs)
     rows, columns = heights.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
     with raster_output(path) as temporary:
-        made = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
-        with written(made) as dataset:
+        created = gdal.GetDriverByName("GTiff").Create(str(temporary), columns, rows, 1, gdal.GDT_Float32, options)
+        with written(created) as dataset:
             dataset.SetGeoTransform((corner[0], step, 0.0, corner[1], 0.0, -step))
             dataset.SetProjection(system.ExportToWkt())
             dataset.GetRasterBand(1).SetNoDataValue(-32768.0)
@@ -48,14 +48,14 @@ def write_terrain(
     crs: str,
     vertical: str,
 ) -> None:
-    """Write the DEM of a terrain that is known everywhere: its heights at posts, without error but for rounding.
+    """Write the DEM of a terrain that is known everywhere: its exact heights at posts, rounded.
 
     Parameters
     ----------
     terrain : callable (lon, lat) -> heights
         Degrees to ellipsoidal metres, all ``(N,)``.
     box : (2, 2)
-        Least and greatest x, y in `crs`, which the DEM covers; its posts lie on multiples of `step`.
+        Least and greatest x, y in `crs` that the DEM covers; its posts are on multiples of `step`.
     crs, vertical : str
         EPSG codes of the map and of the height datum.
     """

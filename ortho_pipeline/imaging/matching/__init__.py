@@ -1,6 +1,6 @@
-"""Matching: control points from a reference orthoimage, tie points between scenes, without a hand.
+"""Automatic matching: control points from a reference orthoimage, tie points between scenes.
 
-Imports `surface` and what is below; a sensor model is only asked where it puts things.
+Imports `surface` and the rooms below; it needs only the projections of a sensor model.
 """
 
 from ortho_pipeline.imaging.matching.matcher import REASONS, Matches, MatchSettings, match

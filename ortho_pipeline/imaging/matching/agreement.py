@@ -1,4 +1,4 @@
-"""Affine corrections of a search: one after another, and the one on which chips agree."""
+"""Affine corrections of a search: how to combine them, and which one the chips agree on."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def agreed(
 ) -> tuple[ImageCorrection, NDArray[np.bool_]]:
     """Return a better correction, fitted to most of the offsets ``(n, 2)`` (px), and which of them agree with it.
 
-    A chip at p shows what the model puts at p + offset, so that the model has to put it `offset` earlier.
+    A chip at p shows the ground that the model projects to p + offset, so the correction subtracts the offset.
     """
     middle = np.median(offsets, axis=0)
     agreeing = np.hypot(*(offsets - middle).T) <= 3 * tolerance
     origin = np.array(correction.origin)
     design = np.column_stack([np.ones(len(centres)), centres - origin])
-    # Three numbers per axis want many chips all over the scene; with few of them only the mean is believed.
+    # Three numbers per axis need many chips all over the scene; with few, only the mean is used.
     slopes = agreeing.sum() >= 12 and np.ptp(centres[agreeing], axis=0).min() > 0
     design = design if slopes else design[:, :1]
     fitted = np.broadcast_to(middle, offsets.shape)
@@ -37,7 +37,7 @@ def agreed(
             break
         agreeing = again
     agreeing = np.hypot(*(offsets - fitted).T) <= tolerance
-    # corrected(p) = p - offset(p), put after the correction that there is.
+    # corrected(p) = p - offset(p), after the existing correction.
     step = np.zeros(6)
     step[[0, 3]] = -coefficients[0]
     if slopes:
@@ -52,12 +52,12 @@ def affine_step(matrix: Array, shift: Array) -> Array:
 
 
 def shifted(correction: ImageCorrection, shift: Array) -> ImageCorrection:
-    """Return a correction that is followed by a shift (px)."""
+    """Return a correction followed by a shift (px)."""
     return followed_by(correction, affine_step(np.eye(2), shift))
 
 
 def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
-    """Return the affine correction that a second one, of coefficients `step` about the same origin, makes of it."""
+    """Return a correction followed by a second one, with the coefficients `step` about the same origin."""
     second = np.eye(2) + step[[1, 2, 4, 5]].reshape(2, 2)
     matrix = second @ correction.matrix
     shift = second @ correction.coefficients[[0, 3]] + step[[0, 3]]

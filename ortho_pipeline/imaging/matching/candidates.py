@@ -1,4 +1,4 @@
-"""Where to look: the cells of a scene, and in each the place with the most structure in two directions.
+"""Candidates for matching: the cells of a scene, and in each the chip with the most structure in two directions.
 
 Source: Foerstner and Guelch 1987 (interest operator: the smaller eigenvalue of the structure tensor).
 """
@@ -14,16 +14,16 @@ from scipy import ndimage
 from ortho_pipeline.imaging.matching.targets import SceneView
 from ortho_pipeline.models.base import Array
 
-#: Largest window (chip px) that is looked at in a cell: so the cost does not depend on the size of the scene.
+#: Largest window (chip px) to search in a cell, so the cost does not depend on the size of the scene.
 _WINDOW = 128
-#: Share of saturated pixels in a chip above which it is taken for a cloud or a roof in the sun.
+#: A chip with a larger share of saturated pixels is a cloud or a sunlit roof.
 _SATURATED = 0.2
-#: Parts of the border that are left free (chip px).
+#: Width of the border to keep free (chip px).
 _RIM = 2
 
 
 def cells_of(width: float, height: float, count: int) -> tuple[int, int]:
-    """Return columns and rows of a grid of about `count` cells that are nearly squares."""
+    """Return columns and rows of a grid of about `count` nearly square cells."""
     columns = max(1, round(math.sqrt(count * width / height)))
     return columns, max(1, round(count / columns))
 
@@ -36,39 +36,39 @@ def candidates(
     factor: int,
     inside: NDArray[np.bool_],
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """Return first pixels ``(n, 2)`` of chips, the one with the most structure of each cell, and their cells ``(n,)``.
+    """Return first pixels ``(n, 2)`` of the chip with the most structure in each cell, and the cells ``(n,)``.
 
     Parameters
     ----------
     region : (left, top, right, bottom)
-        The part of the scene (px) that is looked at.
+        The part of the scene (px) to search.
     cells : (int, int)
         Columns and rows of the grid over it.
     size, factor : int
         A chip has `size` x `size` means of `factor` x `factor` pixels.
     inside : (rows, columns) of bool
-        Cells that are looked at.
+        Cells to search.
     """
     width, height = region[2] - region[0], region[3] - region[1]
-    found = []
+    chosen = []
     for number in np.flatnonzero(inside.ravel()).tolist():
         row, column = divmod(number, cells[0])
         left, right = (region[0] + width * place / cells[0] for place in (column, column + 1))
         top, bottom = (region[1] + height * place / cells[1] for place in (row, row + 1))
         place = _best(view, (left, top, right, bottom), size, factor)
         if place is not None:
-            found.append((*place, number))
-    table = np.array(found, dtype=int).reshape(-1, 3)
-    # Cells may choose the same place on the side that they share.
+            chosen.append((*place, number))
+    table = np.array(chosen, dtype=int).reshape(-1, 3)
+    # Neighbouring cells may choose the same place on their common side.
     table = table[np.sort(np.unique(table[:, :2], axis=0, return_index=True)[1])]
     return table[:, :2], table[:, 2]
 
 
 def _best(view: SceneView, cell: tuple[float, float, float, float], size: int, factor: int) -> tuple[int, int] | None:
-    """Return the first pixel of the chip with the most structure whose centre lies in a cell."""
+    """Return the first pixel of the chip with the most structure whose centre is in a cell."""
     width, height = view.size
     middle = (cell[0] + cell[2]) / 2, (cell[1] + cell[3]) / 2
-    # Centres of chips: within the cell, and not so near to the border that a chip does not fit.
+    # Centres of chips: within the cell, and so far from the border that the chip fits.
     reach = [
         min((last - first) / 2, (_WINDOW - size) / 2 * factor)
         for first, last in ((cell[0], cell[2]), (cell[1], cell[3]))
@@ -92,18 +92,18 @@ def _best(view: SceneView, cell: tuple[float, float, float, float], size: int, f
 
 
 def _structure(pixels: NDArray[np.float32], size: int, saturated: float) -> Array:
-    """Return the smaller eigenvalue of the mean structure tensor of each chip; NaN where a pixel of it is not valid."""
+    """Return the smaller eigenvalue of the mean structure tensor of each chip; NaN if one of its pixels is invalid."""
     valid = np.isfinite(pixels)
     filled = np.where(valid, pixels, 0.0).astype(float)
     down, across = np.gradient(ndimage.gaussian_filter(filled, 1.0))
 
     def mean(values: Array) -> Array:
-        whole = ndimage.uniform_filter(values, size, mode="constant", origin=0)
+        means = ndimage.uniform_filter(values, size, mode="constant", origin=0)
         first = size // 2
-        return whole[first : first + values.shape[0] - size + 1, first : first + values.shape[1] - size + 1]
+        return means[first : first + values.shape[0] - size + 1, first : first + values.shape[1] - size + 1]
 
     xx, yy, xy = mean(across**2), mean(down**2), mean(across * down)
     value = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
-    whole = mean(valid.astype(float)) > 1 - 0.5 / size**2
+    complete = mean(valid.astype(float)) > 1 - 0.5 / size**2
     bright = mean((filled >= saturated).astype(float)) > _SATURATED
-    return np.where(whole & ~bright & (value > 0), value, np.nan)
+    return np.where(complete & ~bright & (value > 0), value, np.nan)

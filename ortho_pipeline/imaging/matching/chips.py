@@ -1,9 +1,8 @@
 """Chips: small windows of a scene, and what a target shows there, rendered into the geometry of the scene.
 
-The target is brought into the scene's own pixels through model and surface, so that both chips differ by a shift and
-by nothing else: no rotation, no scale, no relief displacement. A chip has a lattice of its own that gives, as
-polynomials in height, positions in the DEM and in the target; compiled code follows the ray of each pixel. So the cost
-does not depend on the sensor model.
+Model and surface bring the target into the pixels of the scene, so both chips differ only by a shift: no rotation, no
+scale, no relief displacement. Each chip has a lattice of positions in the DEM and in the target, as polynomials in
+height. Compiled code follows the ray of each pixel, so the cost does not depend on the sensor model.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import LEVELS, curve_nodes, levels, polynomials
 
 Pixels = NDArray[np.float32]
-#: Nodes per side of a chip's lattice, tried until it is this exact (pixels of the target).
+#: Nodes per side of a chip's lattice, increased until its error (px of the target) is small enough.
 _NODES, _EXACT = (3, 5, 9, 17), 0.002
-#: Nodes are no farther apart than this (px), and the DEM is asked for at so many places per side.
+#: Largest distance between nodes (px), and number of DEM samples per side.
 _SPACING, _PLACES = 128.0, 3
-#: Rays meet the surface within this height (m): a thousandth of a pixel where a metre moves a third of one.
+#: Rays meet the surface within this height (m): a thousandth of a pixel if a metre moves a third of one.
 _TOLERANCE = 0.003
-#: Larger windows of a target or a DEM than this are not read for one chip: its model leads far away.
+#: Largest window of a target or a DEM for one chip (samples); a larger one means a wrong model.
 _LARGEST = 64_000_000
-#: Part of a chip that a target shows, above which no other target is asked.
+#: A target that shows more than this part of a chip is enough; no other one is tried.
 _NEARLY_ALL = 0.95
-#: Chips whose lattice is held against the model.
+#: Number of chips whose lattice is compared with the model.
 _PROBED = 24
 
 
@@ -52,10 +51,10 @@ def scene_chips(view: SceneView, origins: NDArray[np.int_], size: int, factor: i
 
 
 class Renderer:
-    """Renders what targets show at chips of a scene: of each chip the first target that shows nearly all of it.
+    """Renders targets at chips of a scene; for each chip the first target that shows nearly all of it.
 
-    The lattices of all chips are made at once, because models are fastest for many points; rendering may then be
-    shared among threads.
+    The lattices of all chips are made at once, because models are fastest for many points. Threads may share the
+    rendering.
     """
 
     def __init__(
@@ -67,15 +66,15 @@ class Renderer:
 
     def of(self, targets: Sequence[Target]) -> Renderer:
         """Return a renderer of the same chips for other bands of the same targets."""
-        found = copy.copy(self)
-        found._targets = targets
-        return found
+        other = copy.copy(self)
+        other._targets = targets
+        return other
 
     def render(self, index: NDArray[np.int_]) -> Pixels:
-        """Return the chips of these numbers ``(n, size, size)``; NaN where nothing is shown."""
+        """Return the chips with these numbers ``(n, size, size)``; NaN where no target shows anything."""
         out = np.full((len(index), self._size, self._size), np.nan, dtype=np.float32)
         places = np.empty((self._size, self._size, 2))
-        one = np.empty((self._size, self._size), dtype=np.float32)
+        chip = np.empty((self._size, self._size), dtype=np.float32)
         for row, k in enumerate(index.tolist()):
             share = 0.0
             for target, nodes in zip(self._targets, self._nodes, strict=True):
@@ -83,11 +82,11 @@ class Renderer:
                     break
                 if not nodes.positions(k, self._surface, places):
                     continue
-                one[:] = np.nan
-                _read(target, places, one)
-                seen = float(np.isfinite(one).mean())
+                chip[:] = np.nan
+                _read(target, places, chip)
+                seen = float(np.isfinite(chip).mean())
                 if seen > share:
-                    out[row], share = one, seen
+                    out[row], share = chip, seen
         return out
 
 
@@ -101,7 +100,7 @@ def _read(target: Target, places: Array, out: Pixels) -> None:
     size = target.intensity.width, target.intensity.height
     if (high < 0).any() or low[0] > size[0] or low[1] > size[1]:
         return
-    # Pixels of the target in one of the chip: more than one are averaged, or detail would appear as false structure.
+    # Pixels of the target in a chip pixel; several are averaged, or fine detail would become false structure.
     factor = max(1, round(math.sqrt(extent[4] * extent[5])))
     left, top = (int(value) - chip_kernel.TAPS // 2 * factor for value in low)
     columns, rows = (
@@ -129,11 +128,11 @@ class _Nodes:
             if self._error(nodes) <= _EXACT:
                 break
         self.shown = np.zeros(count, dtype=bool)
-        # Beyond where a model is defined a chip has no pixels; the others are no worse for it.
+        # A chip outside the domain of a model has no pixels; the others are not affected.
         self.shown[self.seen] = np.isfinite(self.coefficients[self.seen]).any(axis=(1, 2, 3, 4))
 
     def positions(self, k: int, surface: Surface, places: Array) -> bool:
-        """Fill the target's coordinates of the pixels of a chip; False where it shows nothing."""
+        """Fill the target coordinates of the pixels of a chip; return False if the target shows nothing."""
         left, top, right, bottom = self.windows[k]
         if not self.shown[k] or (right - left) * (bottom - top) > _LARGEST:
             return False
@@ -150,7 +149,7 @@ class _Nodes:
         return True
 
     def _heights(self) -> list[int]:
-        """Find the heights that the rays of each chip may meet; return the chips that meet any."""
+        """Find the heights that the rays of each chip can meet; return the chips that meet any."""
         model, surface = self._view.model, self._view.surface
         low, high = (np.full(len(self._origins), value) for value in model.height_range)
         limits = model.height_limits
@@ -158,7 +157,7 @@ class _Nodes:
         offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         corners = self._origins[:, None] + offsets
         left = np.arange(len(self._origins))
-        found: list[int] = []
+        meeting: list[int] = []
         for turn in range(4):
             samples = self._samples(corners[left], low[left], high[left])
             again = []
@@ -177,17 +176,17 @@ class _Nodes:
                     continue
                 inside = low[k] <= narrow[0] and narrow[1] <= high[k]
                 self.windows[k] = window
-                # Once more between the heights that are there: their window is smaller, and polynomials are better.
+                # Repeat between the actual heights: the window is smaller, and polynomials are better.
                 low[k], high[k] = narrow if inside else (min(low[k], narrow[0]), max(high[k], narrow[1]))
                 if inside and turn:
-                    found.append(k)
+                    meeting.append(k)
                 else:
                     again.append(k)
             left = np.array(again, dtype=int)
             if not len(left):
                 break
         self.middle, self.half = (low + high) / 2, (high - low) / 2
-        return sorted(found)
+        return sorted(meeting)
 
     def _samples(self, corners: Array, low: Array, high: Array) -> Array:
         """Return DEM sample coordinates ``(n, 2 m, 2)`` of places ``(n, m, 2)`` at two heights."""
@@ -223,8 +222,8 @@ class _Nodes:
         cell = self._extent / (nodes - 1)
         image = self._origins[chips] + cell * 0.5
         heights = self.middle[chips] + 0.7 * self.half[chips]
-        found = self.coefficients[chips][:, :2, :2].mean(axis=(1, 2))
+        middle = self.coefficients[chips][:, :2, :2].mean(axis=(1, 2))
         powers = 0.7 ** np.arange(LEVELS)
-        error = np.abs(np.einsum("k,nka->na", powers, found) - self._exact(image, heights))[:, 2:]
+        error = np.abs(np.einsum("k,nka->na", powers, middle) - self._exact(image, heights))[:, 2:]
         error = error[np.isfinite(error).all(axis=1)]
         return float(error.max(initial=0.0))

@@ -1,9 +1,9 @@
-"""Correlation of chips by their structure: where is the scene's chip in the larger one that a target was rendered to.
+"""Correlation of chips by structure: the position of a scene's chip in a larger chip of a target.
 
-Two images of other seasons, bands or sensors share edges rather than intensities. So chips are compared by the
-*orientation* of their gradients with the angle doubled, which an inverted contrast does not change, and with a length
-that saturates, so that no bright roof outvotes a field. All shifts are compared at once by the fast Fourier transform,
-normalised by what of both chips is valid at each shift.
+Images of different seasons, bands or sensors have common edges, but different intensities. So chips are compared by the
+*orientation* of their gradients. The doubled angle is independent of inverted contrast, and the length saturates, so a
+bright roof does not outvote a field. A fast Fourier transform compares all shifts at once, normalised by the valid
+parts of both chips at each shift.
 
 Source: Fitch et al. 2002, Orientation correlation; Fookes and others on doubled angles; Padfield 2012, Masked object
 registration in the Fourier domain.
@@ -21,16 +21,16 @@ from scipy import fft, ndimage
 from ortho_pipeline.models.base import Array
 
 Field = NDArray[np.complex64]
-#: Standard deviation (chip px) of the blur before gradients are taken.
+#: Standard deviation (chip px) of the blur before gradients.
 _BLUR = 0.7
-#: A gradient of this part of the usual one has half of the greatest weight.
+#: A gradient of this part of the usual one has half the largest weight.
 _SOFT = 0.5
-#: Less than this part of a chip's structure overlapping says nothing.
+#: Least part of a chip's structure that must overlap.
 _LEAST_OVERLAP = 0.4
 
 
 def orientation(chips: NDArray[np.float32]) -> Field:
-    """Return the doubled gradient orientation ``(n, h, w)`` of chips, of length 0 to 1; 0 where it is not known."""
+    """Return the doubled gradient orientation ``(n, h, w)`` of chips, with length 0 to 1; 0 where unknown."""
     valid = np.isfinite(chips)
     filled = np.where(valid, chips, 0.0).astype(np.float32)
     weight = valid.astype(np.float32)
@@ -49,7 +49,7 @@ def orientation(chips: NDArray[np.float32]) -> Field:
     )
     gradient[~inner] = 0.0
     squared = gradient.real**2 + gradient.imag**2
-    # The usual gradient of each chip: of its own, because haze and shadows change contrast from place to place.
+    # The usual gradient of each chip itself, because haze and shadows change contrast from place to place.
     usual = squared.sum(axis=(1, 2)) / np.maximum(inner.sum(axis=(1, 2)), 1)
     floor = (_SOFT**2 * usual + 1e-12)[:, None, None].astype(np.float32)
     return np.asarray(gradient**2 / (squared + floor), dtype=np.complex64)
@@ -58,7 +58,7 @@ def orientation(chips: NDArray[np.float32]) -> Field:
 def surfaces(scene: Field, target: Field) -> NDArray[np.float32]:
     """Return the correlation ``(n, 2r + 1, 2r + 1)`` of chips ``(n, s, s)`` with targets ``(n, s + 2r, s + 2r)``.
 
-    The value at row i and column j belongs to a shift of (j - r, i - r); -1 to 1, and 0 where too little is valid.
+    The value at row i and column j belongs to the shift (j - r, i - r). It is -1 to 1, and 0 if too little is valid.
     """
     size, large = scene.shape[1], target.shape[1]
     shape = (fft.next_fast_len(large), fft.next_fast_len(large))
@@ -75,8 +75,8 @@ def surfaces(scene: Field, target: Field) -> NDArray[np.float32]:
     known = [(field != 0).astype(np.float32) for field in (scene, target)]
     of_scene = correlated(transformed(energy[0]), transformed(known[1]))
     of_target = correlated(transformed(known[0]), transformed(energy[1]))
-    whole = energy[0].sum(axis=(1, 2))[:, None, None]
-    enough = (of_scene > _LEAST_OVERLAP * whole) & (whole > 0)
+    total = energy[0].sum(axis=(1, 2))[:, None, None]
+    enough = (of_scene > _LEAST_OVERLAP * total) & (total > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         value = cross / np.sqrt(np.maximum(of_scene, 1e-6) * np.maximum(of_target, 1e-6))
     return np.where(enough, value, 0.0).astype(np.float32)
@@ -84,18 +84,18 @@ def surfaces(scene: Field, target: Field) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """The highest place of each correlation surface.
+    """The peak of each correlation surface.
 
     Parameters
     ----------
     shift : (n, 2)
-        Column and row, chip px, from a parabola through the neighbours.
+        Column and row (chip px), from a parabola through the neighbours.
     score : (n,)
         The correlation there.
     ratio : (n,)
-        The second highest, away from the peak, over the highest: near 1 it is not unique.
+        The second peak over the first; near 1 the peak is not unique.
     inside : (n,)
-        Whether it lies within the surface and not on its rim.
+        Whether the peak is inside the surface and not on its edge.
     """
 
     shift: Array
@@ -110,7 +110,7 @@ def peaks(surface: NDArray[np.float32], apart: int = 3) -> Peaks:
     Parameters
     ----------
     apart : int
-        A second peak is more than so many chip px away from the first in column or row.
+        A second peak is at least this far (chip px) from the first in column or row.
     """
     count, rows, columns = surface.shape
     flat = surface.reshape(count, -1)
@@ -138,7 +138,7 @@ def peaks(surface: NDArray[np.float32], apart: int = 3) -> Peaks:
 
 
 def _vertex(before: Array, here: Array, after: Array) -> Array:
-    """Return where between -1/2 and 1/2 a parabola through three values has its highest place."""
+    """Return the position, -1/2 to 1/2, of the maximum of a parabola through three values."""
     bend = before + after - 2 * here
     with np.errstate(invalid="ignore", divide="ignore"):
         place = 0.5 * (before - after) / bend

@@ -1,18 +1,18 @@
 r"""Least-squares matching: the sub-pixel shift between two chips, with its covariance.
 
-The chip of the scene is the target's but for a shift, a gain and an offset, :math:`T(p) = a R(p + d) + b + e`; the gain
-may be negative. Where intensities do not follow such a rule (other seasons, other bands) the orientation of gradients
-takes their place, whose gain is positive and whose offset is none. The normal equations are those of the scene's
-gradients: :math:`\sum \nabla T (T - a R(d)) = 0` is where the covariance of both chips is largest. With the target's
-gradients it would also be where the energy of the target's chip is least, and interpolation makes that less the farther
-from whole pixels it is: shifts would be pushed away from them, the more the noisier the images are, by all of their
-length and more. With a mean of both gradients, as is often done, chips that differ by more than noise are drawn away
-from the shift of the best likeness. What is finer than a pixel can show is blurred away before, because interpolation
-moves it.
+The chips of scene and target differ by a shift, a gain and an offset, :math:`T(p) = a R(p + d) + b + e`; the gain may
+be negative. If intensities do not follow this rule (other seasons, other bands), the orientation of gradients replaces
+them, with a positive gain and no offset.
+
+The normal equations use the gradients of the scene: :math:`\sum \nabla T (T - a R(d)) = 0` is the maximum of the
+covariance of both chips. The target's gradients would also minimise the energy of the target's chip. Interpolation
+reduces this energy between whole pixels, so noise would push shifts away from whole pixels, by their full length and
+more. The mean of both gradients, which is common, biases chips that differ by more than noise. Detail finer than a
+pixel is blurred first, because interpolation would move it.
 
 With the normal matrix :math:`N = a \sum \nabla T \nabla R^T` the covariance is
-:math:`\sigma^2 N^{-1} (\sum \nabla T \nabla T^T) N^{-T}`. Neighbouring residuals are alike, so it is too small by a
-factor that only the scatter of many matches tells (`weights`).
+:math:`\sigma^2 N^{-1} (\sum \nabla T \nabla T^T) N^{-T}`. Neighbouring residuals are correlated, so it is too small by
+a factor that `weights` estimates from the scatter of many matches.
 
 Source: Gruen 1985, Adaptive least squares correlation.
 """
@@ -32,17 +32,17 @@ from ortho_pipeline.models.base import Array
 _STEPS = 8
 #: A step below this (chip px) is the last.
 _SMALL = 0.003
-#: Chips that differ by more than a shift of so many px from where the search put them do not belong together.
+#: Largest difference (chip px) from the result of the search.
 _FARTHEST = 1.5
-#: A sigma (chip px) above which a shift is none: no farther is the likeness of chips a parabola.
+#: Largest sigma (chip px) of a shift; farther away the correlation of chips is no parabola.
 _VAGUE = 0.5
-#: Residual correlation of intensities above which they follow gain and offset.
+#: Correlation of intensities above which they follow gain and offset.
 _ALIKE = 0.4
-#: Standard deviation (chip px) of the blur that is taken away: shadows, haze and seasons differ in what is broad.
+#: Standard deviation (chip px) of the blur to subtract, because shadows, haze and seasons change broad structure.
 _BROAD = 2.5
-#: The same of the blur that takes away noise and what is too fine for interpolation.
+#: Standard deviation (chip px) of the blur that removes noise and detail too fine for interpolation.
 _FINE = 0.7
-#: Rim (chip px) that is left out: interpolation and gradients reach over it.
+#: Border (chip px) to skip, because interpolation and gradients need neighbours.
 RIM = 3
 
 
@@ -53,13 +53,13 @@ class Measured:
     Parameters
     ----------
     shift : (n, 2)
-        Column and row, chip px; NaN where it did not converge, or is not known to half a pixel.
+        Column and row (chip px); NaN if it did not converge, or is uncertain by more than half a pixel.
     covariance : (n, 2, 2)
         chip px², up to a common factor.
     correlation : (n,)
-        Of the chips at that shift, -1 to 1.
+        Correlation of the chips at that shift, -1 to 1.
     by_orientation : (n,)
-        Whether it was measured in orientations instead of intensities.
+        Whether orientations were used instead of intensities.
     """
 
     shift: Array
@@ -69,21 +69,21 @@ class Measured:
 
 
 def measure(scene: NDArray[np.float32], target: NDArray[np.float32], start: Array) -> Measured:
-    """Measure the shifts of chips ``(n, s, s)`` in targets ``(n, s + 2r, s + 2r)``, from a start ``(n, 2)`` on."""
+    """Measure the shifts of chips ``(n, s, s)`` in targets ``(n, s + 2r, s + 2r)``, from start values ``(n, 2)``."""
     detail = [_detail(chips) for chips in (scene, target)]
-    found = _shifts(detail[0][:, None], detail[1][:, None], start, offset=True)
-    alike = np.abs(found.correlation) >= _ALIKE
+    measured = _shifts(detail[0][:, None], detail[1][:, None], start, offset=True)
+    alike = np.abs(measured.correlation) >= _ALIKE
     other = np.flatnonzero(~alike)
     if not len(other):
-        return found
+        return measured
     again = _shifts(_layers(scene[other]), _layers(target[other]), start[other], offset=False)
-    found.shift[other], found.covariance[other] = again.shift, again.covariance
-    found.correlation[other] = again.correlation
-    return Measured(found.shift, found.covariance, found.correlation, ~alike)
+    measured.shift[other], measured.covariance[other] = again.shift, again.covariance
+    measured.correlation[other] = again.correlation
+    return Measured(measured.shift, measured.covariance, measured.correlation, ~alike)
 
 
 def _detail(chips: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return chips without what is broad, as shadows and seasons make it, nor too fine; NaN where they are."""
+    """Return chips without broad structure (shadows, seasons) and without too fine detail; NaN stays NaN."""
     valid = np.isfinite(chips)
     weight, filled = valid.astype(np.float32), np.where(valid, chips, 0.0).astype(np.float32)
 
@@ -96,7 +96,7 @@ def _detail(chips: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _layers(chips: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return orientations of chips ``(n, h, w)`` as two layers ``(n, 2, h, w)``; NaN where they are not known."""
+    """Return orientations of chips ``(n, h, w)`` as two layers ``(n, 2, h, w)``; NaN where unknown."""
     field = orientation(chips)
     layers = np.stack([field.real, field.imag], axis=1)
     layers[np.broadcast_to((field == 0)[:, None], layers.shape)] = np.nan

@@ -1,4 +1,4 @@
-"""Control points without hands: a scene is matched with targets, and the matches become points with covariances."""
+"""Automatic control points: match a scene with targets, and make points with covariances of the matches."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ from ortho_pipeline.surface.rays import meet_surface
 
 #: Radius (chip px) of the search about the corrected model.
 _RADIUS = 4
-#: A match within so many chip px of the correction that most agree on belongs to them.
+#: Matches within this distance (chip px) of the correction of the majority agree with it.
 _NEAR = 2.5
-#: Rounds of rendering and measuring; the last is the one whose correction moves by less than this (px).
+#: Rounds of rendering and measuring, and the change (px) of the correction that ends them.
 _ROUNDS, _STANDS = 3, 0.02
-#: Where fewer than this part of the chips agree, and scatter (chip px) by more than this, nothing is found.
+#: Matching fails if fewer than this part of the chips agree, and their scatter (chip px) is larger than this.
 _MOSTLY, _VAGUE = 0.5, 0.5
-#: Rounds of judging.
+#: Rounds of the test of matches against each other.
 _JUDGED = 6
-#: Of the `SAMPLES` x `SAMPLES` points of a scene so many have to be shown.
+#: Least number of the `SAMPLES` x `SAMPLES` points of a scene that targets must show.
 _SAMPLES_SHOWN = 4
-#: Why a match was not kept, in words.
+#: Why a match was rejected, in words.
 REASONS = {
     "hidden": "the target shows too little of the chip",
     "weak": "the chips are too different",
@@ -74,23 +74,23 @@ REASONS = {
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """Choices of a user.
+    """Options of matching.
 
     Parameters
     ----------
     search : float
-        How far (m on the ground) the model may be off.
+        Largest error (m on the ground) of the model.
     points : int
-        About how many are wanted.
+        Approximate number of matches to try.
     dem_sigma : float
         Standard deviation (m) of the DEM's heights.
     reference_sigma : float
-        Standard deviation (m) per axis of the place of the reference as a whole.
+        Standard deviation (m) per axis of the position of the whole reference.
     threads : int
     memory : int
-        Bytes that are meant for all of the work, of which GDAL's cache has a part.
+        Bytes for all of the work, including GDAL's cache.
     rotation_deg : float
-        How far the model may be turned.
+        Largest rotation of the model.
     """
 
     search: float
@@ -104,37 +104,35 @@ class MatchSettings:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """All that was tried, in image order.
+    """All tried matches, in image order, and the points made of them.
 
     Parameters
     ----------
     image : (n, 2)
-        Centre of the scene's chip, px.
+        Centre of the scene's chip (px).
     offset : (n, 2)
-        Where the model as delivered puts the same ground, minus `image`; NaN where nothing was measured.
+        Projection of the same ground by the delivered model, minus `image`; NaN if not measured.
     score : (n,)
         Correlation of the chips after matching, -1 to 1.
     reason : (n,) of str
-        Why it was not kept, a key of `REASONS`; empty if it was.
+        Why it was rejected, a key of `REASONS`; empty if it was kept.
     cell : (n,)
-        The cell of the scene that it lies in.
+        Its cell of the scene.
     scene, target : (n, s, s)
-        The chips as they were compared.
+        The compared chips.
     found : (n, 2)
-        Where the target's chip shows what the scene's has in its centre, chip px from the centre; NaN where nothing
-        was measured.
+        Position of the scene chip's centre in the target's chip, chip px from its centre; NaN if not measured.
     factor : int
         Pixels of the scene in a chip pixel.
     levels : tuple of Level
-        How the search went.
     components : Components
-        What the covariances are made of.
+        The parts of the covariances.
     points : Points
-        The matches that were kept, with covariances and groups.
+        The kept matches, with covariances and groups.
     coverage : float
         Share of the scene that the targets cover.
     bands : tuple of BandShift
-        What single bands of the references say, where there are several.
+        Shifts of single bands of the references.
     """
 
     image: Array
@@ -159,13 +157,13 @@ def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -
     Raises
     ------
     InputError
-        If there is no overlap, no place stands out, or what was found could be an accident; with the reason.
+        If there is no overlap, no clear best position, or the agreement can be chance. The message has the reason.
     """
     reach = settings.search / metres_per_pixel(view)
     targets = near(view, targets, reach)
-    # Left alone, GDAL keeps blocks in a share of the machine's memory; chips lie beside each other and need few.
-    seen = [view.intensity, *(target.intensity for target in targets)]
-    threads = limit_cache(settings.memory, settings.threads, *(one.source.block for one in seen))
+    # By default GDAL's cache takes a share of the machine's memory; neighbouring chips need few blocks.
+    images = [view.intensity, *(target.intensity for target in targets)]
+    threads = limit_cache(settings.memory, settings.threads, *(image.source.block for image in images))
     shown = _shown(view, targets)
     base = chip_factor(view, targets, shown)
     reach = max(reach, 2.0 * base)
@@ -176,7 +174,7 @@ def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -
         displaced = displacement(view, shown, settings.dem_sigma, base)
         correction, levels = placed_along_sight(view, targets, (base, reach), region, displaced, threads, error)
     extent = region[2] - region[0], region[3] - region[1]
-    # The targets may show a part of that rectangle only.
+    # The targets may show only a part of that rectangle.
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
     grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
     corrected = SceneView(view.intensity, correction, view.surface)
@@ -188,18 +186,18 @@ def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -
     else:
         correction = tried.settled(correction, reach, orientations(settings.rotation_deg))
     tried.judge()
-    found, bands = tried.matches(settings, tuple(levels)), tried.bands(correction)
-    points = replace(found.points, sigma_alike=np.full(len(found.points), spread(bands)))
-    return replace(found, coverage=len(shown) / SAMPLES**2, bands=bands, points=points)
+    matches, bands = tried.matches(settings, tuple(levels)), tried.bands(correction)
+    points = replace(matches.points, sigma_alike=np.full(len(matches.points), spread(bands)))
+    return replace(matches, coverage=len(shown) / SAMPLES**2, bands=bands, points=points)
 
 
 def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
-    """Return those of points ``(n, 2)`` spread over the scene that a target shows, as the model has it.
+    """Return the points ``(n, 2)``, of many spread over the scene, that a target shows by the model.
 
     Raises
     ------
     InputError
-        If there are none.
+        If there are too few.
     """
     image = spread_over(view)
     inside = _inside(view, targets, image)
@@ -222,9 +220,9 @@ def _region(view: SceneView, shown: Array) -> tuple[int, int, int, int]:
 
 
 def _inside(view: SceneView, targets: Sequence[Target], image: Array) -> NDArray[np.bool_]:
-    """Tell which image points ``(n,)`` fall into a target."""
+    """Return which image points ``(n,)`` are inside a target."""
     ground = meet_surface(view.model, image, view.surface)
-    # Where the model is off, the surface may end too soon: its reference height stands in.
+    # If the model is off, the surface may end too early; then use the model's reference height.
     lost = np.isnan(ground).any(axis=1)
     ground[lost] = view.model.image_to_ground(image[lost], view.model.reference_height)
     return shown_by(targets, ground, view.model.crs)
@@ -233,7 +231,7 @@ def _inside(view: SceneView, targets: Sequence[Target], image: Array) -> NDArray
 def _cells_shown(
     view: SceneView, targets: Sequence[Target], region: tuple[int, int, int, int], grid: tuple[int, int]
 ) -> NDArray[np.bool_]:
-    """Return the cells ``(rows, columns)`` of a region whose centre a target shows."""
+    """Return which cells ``(rows, columns)`` of a region have a centre that a target shows."""
     steps = [
         region[axis] + (np.arange(grid[axis]) + 0.5) / grid[axis] * (region[axis + 2] - region[axis]) for axis in (0, 1)
     ]
@@ -242,7 +240,7 @@ def _cells_shown(
 
 
 class _Tried:
-    """The chips that are tried, and how far each has come."""
+    """The tried chips, and the state of each."""
 
     def __init__(
         self,
@@ -255,7 +253,7 @@ class _Tried:
         displaced: float,
     ) -> None:
         self.view, self.targets, self.origins, self.cells, self.factor = view, targets, origins, cells, factor
-        # Where heights displace chips by more than they bear (px), each is sought by itself.
+        # If heights displace chips too much (px), each chip is searched separately.
         self.threads, self.displaced = threads, displaced
         count = len(origins)
         self.centres = np.asarray(origins + SIDE * factor / 2, dtype=np.float64)
@@ -263,14 +261,14 @@ class _Tried:
         self.target = np.full_like(self.scene, np.nan)
         self.reason = np.full(count, "hidden", dtype="<U12")
         self.score = np.zeros(count)
-        self.offset = np.full((count, 2), np.nan)  # px, against the correction of the last step
-        self.whole = np.zeros((count, 2), dtype=int)  # px, where targets are rendered: near the offset
+        self.offset = np.full((count, 2), np.nan)  # px, relative to the correction of the last step
+        self.whole = np.zeros((count, 2), dtype=int)  # px, integer offset at which targets are rendered
         self.found = np.full((count, 2), np.nan)  # chip px, in the target's chip
         self.covariance = np.full((count, 2, 2), np.nan)
         self.ground = np.full((count, 3), np.nan)
 
     def bands(self, correction: SensorModel) -> tuple[BandShift, ...]:
-        """Return what single bands say of the matches that are kept, measured with the last correction."""
+        """Return the shifts of single bands at the kept matches, measured with the last correction."""
         good = np.flatnonzero(self.reason == "")
         return in_each_band(
             SceneView(self.view.intensity, correction, self.view.surface),
@@ -288,7 +286,7 @@ class _Tried:
         return Renderer(seen, self.targets, origins, SIDE + 2 * radius, self.factor)
 
     def search(self, correction: SensorModel) -> None:
-        """Find each chip to a chip px about where the correction puts it, or along the line of sight."""
+        """Find each chip to a chip px, near its corrected position or along the line of sight."""
         if self.displaced:
             seen, reach = SceneView(self.view.intensity, correction, self.view.surface), 2 * HEIGHTS * self.displaced
             chips = Chips(
@@ -305,20 +303,19 @@ class _Tried:
             around = scene_chips(
                 self.view, self.origins[index] - _RADIUS * self.factor, SIDE + 2 * _RADIUS, self.factor
             )
-            found = found_again(self.scene[index], wide, _RADIUS)
-            self.score[index], self.offset[index] = found.score, found.shift * self.factor
-            self.reason[index] = doubts(found, wide, around, _RADIUS)
+            peak = found_again(self.scene[index], wide, _RADIUS)
+            self.score[index], self.offset[index] = peak.score, peak.shift * self.factor
+            self.reason[index] = doubts(peak, wide, around, _RADIUS)
 
         in_batches(work, np.arange(len(self.origins)), self.threads)
 
     def agreed(self, correction: ImageCorrection, searched: float | None, turns: int) -> ImageCorrection:
-        """Return the correction that most offsets agree on; the others are of no use any more.
+        """Return the correction that most offsets agree on; reject the others.
 
         Raises
         ------
         InputError
-            If as many could as well agree by chance, at any place of a search `searched` (px) wide and any of so
-            many `turns` of it.
+            If as many could agree by chance, at any position within `searched` (px) and in any of `turns` orientations.
         """
         good = np.flatnonzero(self.reason == "")
         if len(good) < FEWEST:
@@ -338,7 +335,7 @@ class _Tried:
         return correction.image_to_ground(self.centres[index], self.view.model.reference_height)
 
     def measure(self, correction: SensorModel) -> None:
-        """Measure each chip that is still of use to a part of a pixel, rendered anew where the correction puts it."""
+        """Measure the remaining chips to a fraction of a pixel, rendered again at their corrected positions."""
 
         radius, good = MEASURED, np.flatnonzero(self.reason == "")
         renderer = self._renderer(correction, good, radius)
@@ -347,13 +344,13 @@ class _Tried:
             index, wide = good[batch], renderer.render(batch)
             start = np.nan_to_num((self.offset[index] - self.whole[index]) / self.factor)
             start = np.where(np.abs(start) < radius - 2, start, 0.0)
-            found = measure(self.scene[index], wide, start)
+            measured = measure(self.scene[index], wide, start)
             self.target[index] = wide[:, radius:-radius, radius:-radius]
-            self.found[index] = found.shift
-            self.offset[index] = self.whole[index] + found.shift * self.factor
-            self.covariance[index] = found.covariance * self.factor**2
-            self.score[index] = found.correlation
-            bad = ~np.isfinite(found.shift).all(axis=1)
+            self.found[index] = measured.shift
+            self.offset[index] = self.whole[index] + measured.shift * self.factor
+            self.covariance[index] = measured.covariance * self.factor**2
+            self.score[index] = measured.correlation
+            bad = ~np.isfinite(measured.shift).all(axis=1)
             self.reason[index[bad]] = "not measured"
 
         in_batches(work, np.arange(len(good)), self.threads)
@@ -362,7 +359,7 @@ class _Tried:
         self.reason[good[np.isnan(self.ground[good]).any(axis=1)]] = "hidden"
 
     def settled(self, correction: ImageCorrection, searched: float, turns: int) -> ImageCorrection:
-        """Return the correction on which measured chips agree, round by round; see `agreed`."""
+        """Return the correction on which measured chips agree, after some rounds; see `agreed`."""
         for turn in range(_ROUNDS):
             correction = self.agreed(correction, None if turn else searched, turns)
             self.measure(correction)
@@ -372,13 +369,13 @@ class _Tried:
         return correction
 
     def judge(self) -> None:
-        """Estimate what the covariances are made of, and leave out what contradicts the others by its own."""
+        """Estimate the parts of the covariances, and reject matches that contradict the others."""
         origin = np.array(self.view.size) / 2
         for _ in range(_JUDGED):
             good = np.flatnonzero(self.reason == "")
             if len(good) < FEWEST:
                 raise self._too_few()
-            # Of the model as it was delivered: what the user's own correction has to explain.
+            # Relative to the delivered model: this is what the user's correction has to explain.
             delivered = self.view.model.ground_to_image(self.ground[good])
             off = delivered - self.centres[good]
             design = np.column_stack([np.ones(len(good)), (self.centres[good] - origin) / origin.max()])
@@ -398,9 +395,9 @@ class _Tried:
         self._refuse_vague(residuals)
 
     def _refuse_vague(self, residuals: Array) -> None:
-        """Raise an error where ground that looks alike elsewhere (furrows, rows of trees) explains all that was found.
+        """Raise an error if similar ground elsewhere (furrows, rows of trees) explains all matches.
 
-        Wrong heights scatter matches of the right place, and clouds make them few; they do not do both.
+        Wrong heights scatter correct matches, and clouds reduce their number; neither does both.
         """
         seen = int((self.reason != "hidden").sum())
         scatter = float(np.sqrt((residuals**2).mean()))
@@ -428,10 +425,10 @@ class _Tried:
         )
 
     def matches(self, settings: MatchSettings, levels: tuple[Level, ...]) -> Matches:
-        """Return all that was tried, and the points."""
+        """Return all tried matches, and the points."""
         good = np.flatnonzero(self.reason == "")
         partials = self.view.model.ground_partials(self.ground[good])
-        # Of the heights' errors the residuals show what differs from place to place; a stated sigma is the least.
+        # Residuals show only height errors that differ from place to place, so a stated sigma is the minimum.
         parts = replace(self.components, height=max(self.components.height, settings.dem_sigma))
         covariance = parts.covariance(self.covariance[good], partials[:, :, 2])
         groups, roles = held_out(self.centres[good])
@@ -469,23 +466,23 @@ class _Tried:
 
 
 def _robust(design: Array, values: Array) -> Array:
-    """Return the coefficients ``(k, 2)`` of a fit that large residuals count little in (Huber's weights)."""
+    """Return the coefficients ``(k, 2)`` of a robust fit (Huber's weights)."""
     weight = np.ones(len(values))
-    found: Array = np.zeros((design.shape[1], 2))
+    coefficients: Array = np.zeros((design.shape[1], 2))
     for _ in range(15):
         root = np.sqrt(weight)[:, None]
-        found = np.asarray(np.linalg.lstsq(root * design, root * values, rcond=None)[0], dtype=np.float64)
-        length = np.hypot(*(values - design @ found).T)
+        coefficients = np.asarray(np.linalg.lstsq(root * design, root * values, rcond=None)[0], dtype=np.float64)
+        length = np.hypot(*(values - design @ coefficients).T)
         scale = max(1.2 * float(np.median(length)), 1e-9)
         weight = np.minimum(1.0, scale / np.maximum(length, 1e-12))
-    return found
+    return coefficients
 
 
 def held_out(image: Array) -> tuple[NDArray[np.int_], NDArray[np.str_]]:
-    """Return the groups ``(n,)`` that points share errors within, and their roles: every fifth cell checks.
+    """Return the groups ``(n,)`` of points that share errors, and their roles: every fifth cell checks.
 
-    Cells hold some ten points each, so that check points are not the neighbours of control points. Those that check
-    lie a knight's move apart: five of them in any five by five.
+    Cells have about ten points each, so that check points are not neighbours of control points. Checking cells are a
+    knight's move apart: five in any five by five.
     """
     low, extent = image.min(axis=0), np.maximum(np.ptp(image, axis=0), 1.0)
     columns, rows = cells_of(float(extent[0]), float(extent[1]), int(np.clip(len(image) / 10, 10, 100)))

@@ -1,15 +1,15 @@
-"""The search: how far a model is off, coarse to fine, and whether what was found can be believed.
+"""The search for the error of a model, coarse to fine, and tests of the result.
 
-Coarse chips all over the scene are compared with wide windows of the target. A model is off by much the same
-everywhere, so the mean of all correlation surfaces has a peak far above what any single chip shows. Its highest places
-are hypotheses: under each the target is rendered anew and compared again, because relief lies where it belongs only
-where the model is right. The best of them is believed if
+Coarse chips all over the scene are compared with wide windows of the target. The error of a model is nearly constant
+over a scene, so the mean of all correlation surfaces has a much clearer peak than a single chip. Its highest positions
+are hypotheses. For each the target is rendered again and compared, because relief is in the right place only with the
+right model. The best hypothesis is accepted if
 
-- it is *unique*: its mean correlation is clearly higher than that of any other (`_CLEARLY`), and over the chips so by a
-  paired t-test, which stripes, chessboards and rows of equal roofs do not pass;
-- its chips *agree* on a smooth correction, at each finer level better than chance would have it (binomial test);
-- it is *no accident*: as many of the chips of the last search, which is the matcher's, would agree by chance at any of
-  all places searched once in a million times.
+- it is *unique*: its mean correlation is clearly higher than that of any other (`_CLEARLY`), also by a paired t-test
+  over the chips; stripes, chessboards and rows of equal roofs fail this test;
+- its chips *agree* on a smooth correction, at each finer level better than by chance (binomial test);
+- it is *no accident*: the probability that as many chips of the last search (the matcher's) agree by chance, at any
+  searched position, is less than one in a million.
 
 Source: Moisan and Stival 2004 (a-contrario consensus).
 """
@@ -37,31 +37,32 @@ from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Left, top, right and bottom, px.
 Region = tuple[int, int, int, int]
-#: Side of a coarse chip (chip px), and the least that is worth a try.
+#: Usual and least side of a coarse chip (chip px).
 _SIDE, _LEAST_SIDE = 48, 24
-#: Coarse chips per side of the scene, at most; and at least so many in all.
+#: Largest number of coarse chips per side of the scene, and least number in all.
 _PER_SIDE, _FEWEST = 6, 5
 #: Radii of the coarsest search (chip px).
 _COMFORTABLE, _LARGEST_RADIUS = 100, 160
 #: Radius (chip px) of the searches after the first.
 _NEXT = 4
-#: The mean surface is blurred by so much (chip px): corrections are not the same everywhere.
+#: Blur (chip px) of the mean surface, because corrections are not the same everywhere.
 _SMEAR = 1.5
-#: So many places are rendered anew, if their mean correlation is this part of the highest one.
+#: Largest number of hypotheses, and their least part of the highest mean correlation.
 _HYPOTHESES, _WORTH = 5, 0.4
-#: Places nearer than this (chip px) are the same peak.
+#: Positions nearer than this (chip px) are the same peak.
 _APART = 6
-#: Steps in which a place that is turned settles; the last one is shorter than this (chip px).
+#: Largest number of steps to refine a rotated hypothesis, and the step (chip px) that ends them.
 _SETTLING, _STANDS = 4, 0.3
-#: Chance at which the best place passes for better than the second best one, and chips for agreeing by accident.
+#: Significance levels: of the best position over the second best, and of agreement over chance.
 _UNIQUE, _ACCIDENT = 1e-3, 1e-6
-#: Part of the highest mean correlation that the second highest may have. Where a pattern repeats itself it has nearly
-#: all of it, and which one is higher is decided by how places fall between pixels.
+#: Largest ratio of the second to the first mean correlation. In a repetitive pattern it is nearly 1, and sub-pixel
+#: positions decide which one is higher.
 _CLEARLY = 0.8
-#: Chips agree within this (chip px).
+#: Chips agree within this distance (chip px).
 _AGREE = 1.5
-#: A chip fits one of two places alone if its correlation there is this, and at the other one less than half of it. If
-#: so many of all chips do, and so many of them each place, the target is inconsistent: parts of it are displaced.
+#: A chip fits only one of two positions if its correlation there is at least the first number, and less than half of it
+#: at the other. If the second part of all chips do, and each position has the third part of them, at least the fourth
+#: number, the target is inconsistent: parts of it are displaced.
 _FITS, _DIVIDED, _PART, _FEWEST_PART = 0.15, 0.75, 0.1, 4
 
 
@@ -74,11 +75,11 @@ class Level:
     factor : int
         Pixels of the scene in one of its chips.
     radius : int
-        Of the search, chip px.
+        Radius of the search (chip px).
     chips, agreeing : int
-        Chips that were compared, and those that agree with the correction.
+        Numbers of compared chips, and of chips that agree with the correction.
     shift : (float, float)
-        Column and row (px of the scene) by which the model was off in the mean.
+        Mean error of the model: column and row (px of the scene).
     """
 
     factor: int
@@ -91,23 +92,23 @@ class Level:
 def place(
     view: SceneView, targets: Sequence[Target], reach: float, base: int, region: Region, rotation_deg: float = 0.0
 ) -> tuple[ImageCorrection, list[Level]]:
-    """Return the model of a view with the correction under which the targets agree with it, to a few chip px.
+    """Return the model of a view with the correction for which the targets agree with it, to a few chip px.
 
     Parameters
     ----------
     reach : float
-        How far (px of the scene) the model may be off.
+        Largest error of the model (px of the scene).
     base : int
         Pixels of the scene in a chip pixel at the finest level.
     region : (left, top, right, bottom)
         The part of the scene (px) that the targets show.
     rotation_deg : float
-        How far the model may be turned. Where no shift alone is found, rotations and scales are searched too.
+        Largest rotation of the model. If no shift alone fits, rotations and scales are also searched.
 
     Raises
     ------
     InputError
-        If no place within reach stands out, with the reason.
+        If there is no clear best position within reach. The message has the reason.
     """
     middle = (region[0] + region[2]) / 2, (region[1] + region[3]) / 2
     start = ImageCorrection.identity(view.model, "affine", middle)
@@ -120,8 +121,9 @@ def place(
     except InputError as error:
         if rotation_deg:
             turned = _turned(view, targets, region, start, (factor, radius), rotation_deg)
-            corrections = _distinct((_settled(view, targets, region, one, factor) for one in turned), region, factor)
-            # What stands out has to do so among shifts alone too: of a pattern that repeats itself no turn is unique.
+            refined = (_settled(view, targets, region, correction, factor) for correction in turned)
+            corrections = _distinct(refined, region, factor)
+            # The best one must also be clear among shifts alone: in a repetitive pattern no rotation is unique.
             corrections = _distinct([*corrections, *alone], region, factor)
             with contextlib.suppress(InputError):
                 return _refined(view, targets, reach, base, region, (factor, radius), corrections)
@@ -136,22 +138,22 @@ def _turned(
     level: tuple[int, int],
     rotation_deg: float,
 ) -> list[ImageCorrection]:
-    """Return the corrections of the highest places over shifts, rotations and scales, the highest first."""
+    """Return the corrections of the highest peaks over shifts, rotations and scales, the highest first."""
     factor, radius = level
     side = _chip_side(region, factor, 3)
     origin = np.array(start.origin)
     wide = radius + margin((_spread(region, side, factor) + side * factor / 2 - origin) / factor)
-    found: list[Turn] = []
+    turns: list[Turn] = []
     for matrix in renderings(rotation_deg):
         model = followed_by(start, affine_step(matrix, np.zeros(2)))
         shown = _correlated(replace(view, model=model), targets, region, side, factor, wide)
         if len(shown.centres) >= _FEWEST:
-            found += votes(shown.smooth(), (shown.centres - origin) / factor, radius, matrix, factor)
-    found.sort(key=lambda one: -one.value)
+            turns += votes(shown.smooth(), (shown.centres - origin) / factor, radius, matrix, factor)
+    turns.sort(key=lambda turn: -turn.value)
     likely = (
         followed_by(start, affine_step(turn.matrix, turn.shift))
-        for turn in found
-        if turn.value > _WORTH * found[0].value
+        for turn in turns
+        if turn.value > _WORTH * turns[0].value
     )
     return _distinct(likely, region, factor)
 
@@ -159,42 +161,42 @@ def _turned(
 def _settled(
     view: SceneView, targets: Sequence[Target], region: Region, correction: ImageCorrection, factor: int
 ) -> ImageCorrection:
-    """Return what a correction leads to where its chips agree on a better one, step by step.
+    """Return a correction refined step by step, as its chips agree on a better one.
 
-    Rotation and scale are known to their steps alone, and an oblique image that is turned is sheared as well. So
-    several places beside each other may lead to one correction.
+    Rotation and scale are only known to their steps, and a rotated oblique image is also sheared. So several
+    neighbouring positions may lead to one correction.
     """
-    # Small chips: there have to be many for slopes to be fitted.
+    # Small chips, because a fit of slopes needs many.
     side = min(_LEAST_SIDE, _chip_side(region, factor, 3))
     for _ in range(_SETTLING):
         shown = _correlated(replace(view, model=correction), targets, region, side, factor, _NEXT)
         if len(shown.centres) < _FEWEST:
             break
-        found = peaks(shown.surface, 2)
+        peak = peaks(shown.surface, 2)
         before = correction
-        correction, _ = agreed(correction, shown.centres, found.shift * factor, found.score, _AGREE * factor)
+        correction, _ = agreed(correction, shown.centres, peak.shift * factor, peak.score, _AGREE * factor)
         if _apart(before, correction, region) < _STANDS * factor:
             break
     return correction
 
 
 def _distinct(corrections: Iterable[ImageCorrection], region: Region, factor: int) -> list[ImageCorrection]:
-    """Return the first corrections that are not the same as one before."""
-    found: list[ImageCorrection] = []
-    for one in corrections:
-        if all(_apart(one, other, region) > _APART * factor for other in found):
-            found.append(one)
-        if len(found) == _HYPOTHESES:
+    """Return the first corrections that differ from all earlier ones."""
+    distinct: list[ImageCorrection] = []
+    for correction in corrections:
+        if all(_apart(correction, other, region) > _APART * factor for other in distinct):
+            distinct.append(correction)
+        if len(distinct) == _HYPOTHESES:
             break
-    return found
+    return distinct
 
 
-def _apart(one: ImageCorrection, other: ImageCorrection, region: Region) -> float:
-    """Return the mean distance (px) of what two corrections of one model put over a region."""
+def _apart(first: ImageCorrection, second: ImageCorrection, region: Region) -> float:
+    """Return the mean distance (px) over a region between two corrections of one model."""
     across, down = (np.linspace(-extent / 2, extent / 2, 4) for extent in _extent(region))
     places = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-    shift = (one.coefficients - other.coefficients)[[0, 3]]
-    return float(np.hypot(*(places @ (one.matrix - other.matrix).T + shift).T).mean())
+    shift = (first.coefficients - second.coefficients)[[0, 3]]
+    return float(np.hypot(*(places @ (first.matrix - second.matrix).T + shift).T).mean())
 
 
 def _refined(
@@ -206,23 +208,23 @@ def _refined(
     level: tuple[int, int],
     corrections: Sequence[ImageCorrection],
 ) -> tuple[ImageCorrection, list[Level]]:
-    """Return the correction that stands out among hypotheses, refined level by level.
+    """Return the clear best correction among hypotheses, refined level by level.
 
     Raises
     ------
     InputError
-        If none does, or its chips agree no better than by accident.
+        If none is clearly best, or its chips agree no better than by chance.
     """
     factor, radius = level
     side = _chip_side(region, factor, 3)
-    compared = [_correlated(replace(view, model=one), targets, region, side, factor, _NEXT) for one in corrections]
+    compared = [_correlated(replace(view, model=model), targets, region, side, factor, _NEXT) for model in corrections]
     best = _standing_out(compared, corrections, targets, reach, metres_per_pixel(view))
     correction, shown = corrections[best], compared[best]
     levels: list[Level] = []
     while True:
-        found = peaks(shown.surface, 2)
-        correction, agreeing = agreed(correction, shown.centres, found.shift * factor, found.score, _AGREE * factor)
-        # That it is the right place among all is for the many chips of the last search to say.
+        peak = peaks(shown.surface, 2)
+        correction, agreeing = agreed(correction, shown.centres, peak.shift * factor, peak.score, _AGREE * factor)
+        # The many chips of the last search test later whether it is the right position among all.
         refuse_accident(int(agreeing.sum()), len(agreeing), _AGREE, 1.0, targets, reach)
         mean = correction.coefficients[[0, 3]]
         levels.append(Level(factor, radius, len(agreeing), int(agreeing.sum()), (float(mean[0]), float(mean[1]))))
@@ -237,13 +239,13 @@ def _refined(
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """Correlation surfaces ``(n, k, k)`` of chips about `centres` ``(n, 2)``, px of the scene."""
+    """Correlation surfaces ``(n, k, k)`` of chips with `centres` ``(n, 2)`` (px of the scene)."""
 
     centres: Array
     surface: NDArray[np.float32]
 
     def smooth(self) -> NDArray[np.float32]:
-        """Return the surfaces blurred by what the shift differs over a scene."""
+        """Return the surfaces, blurred by the variation of the shift over a scene."""
         return np.asarray(ndimage.gaussian_filter(self.surface, (0, _SMEAR, _SMEAR), mode="nearest"))
 
 
@@ -252,9 +254,9 @@ def _extent(region: Region) -> tuple[int, int]:
 
 
 def _chip_side(region: Region, factor: int, beside: int) -> int:
-    """Return the side (chip px) of chips of which so many lie beside each other, if they are not too small then."""
-    whole = min(_extent(region)) // factor
-    return min(max(_LEAST_SIDE, min(_SIDE, whole // beside)), whole)
+    """Return the side (chip px) of chips so that `beside` of them fit side by side, if they are not too small."""
+    shortest = min(_extent(region)) // factor
+    return min(max(_LEAST_SIDE, min(_SIDE, shortest // beside)), shortest)
 
 
 def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
@@ -278,7 +280,7 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
 
 
 def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
-    """Return first pixels ``(n, 2)`` of chips that are spread over a region and do not overlap."""
+    """Return first pixels ``(n, 2)`` of chips, spread over a region without overlap."""
     places = []
     for first, extent in zip(region, _extent(region), strict=False):
         count = max(1, min(_PER_SIDE, extent // (side * factor)))
@@ -291,7 +293,7 @@ def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
 def _correlated(
     view: SceneView, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int
 ) -> _Shown:
-    """Correlate chips spread over a region with the targets, each with the first that shows enough there."""
+    """Correlate chips, spread over a region, with the first target that shows enough of each."""
     origins = _spread(region, side, factor)
     wide = side + 2 * radius
     scene = scene_chips(view, origins, side, factor)
@@ -303,22 +305,22 @@ def _correlated(
 
 
 def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
-    """Return the shifts (chip px) of the highest places of the mean of all surfaces, the highest first."""
+    """Return the shifts (chip px) of the highest peaks of the mean surface, the highest first."""
     if len(shown.centres) < _FEWEST:
         raise _no_overlap(targets, len(shown.centres))
     mean = shown.smooth().mean(axis=0)
     radius = (mean.shape[0] - 1) // 2
     highest = float(mean.max())
-    found: list[Array] = []
+    shifts: list[Array] = []
     left = mean.copy()
     rows, columns = np.indices(mean.shape)
-    while len(found) < _HYPOTHESES:
+    while len(shifts) < _HYPOTHESES:
         row, column = np.unravel_index(int(left.argmax()), left.shape)
-        if found and not left[row, column] > _WORTH * highest:
+        if shifts and not left[row, column] > _WORTH * highest:
             break
-        found.append(np.array([column - radius, row - radius], dtype=float))
+        shifts.append(np.array([column - radius, row - radius], dtype=float))
         left[np.maximum(np.abs(rows - row), np.abs(columns - column)) <= _APART] = -2.0
-    return found
+    return shifts
 
 
 def _standing_out(
@@ -328,7 +330,7 @@ def _standing_out(
     reach: float,
     pixel: float,
 ) -> int:
-    """Return the number of the hypothesis that is clearly better than the others.
+    """Return the index of the hypothesis that is clearly better than the others.
 
     Raises
     ------
@@ -343,7 +345,7 @@ def _standing_out(
         smooth = shown.smooth()
         row, column = np.unravel_index(int(smooth.mean(axis=0).argmax()), smooth.shape[1:])
         values.append({tuple(c): float(v) for c, v in zip(shown.centres, smooth[:, row, column], strict=True)})
-    means = [float(np.mean(list(one.values()))) if one else -1.0 for one in values]
+    means = [float(np.mean(list(scores.values()))) if scores else -1.0 for scores in values]
     order = np.argsort(means)[::-1]
     best = int(order[0])
     for other in order[1:].tolist():
@@ -382,16 +384,16 @@ def _standing_out(
     return best
 
 
-def _divided(one: Mapping[tuple[float, ...], float], other: Mapping[tuple[float, ...], float], far: float) -> str:
-    """Return how chips are divided among two places `far` (m) from each other, by their correlations at both.
+def _divided(best: Mapping[tuple[float, ...], float], other: Mapping[tuple[float, ...], float], far: float) -> str:
+    """Return how two positions, `far` (m) apart, divide the chips, by the correlations of each chip at both.
 
     Returns
     -------
     str
-        Empty where they are not, as in ground that repeats itself, where chips fit both.
+        Empty if they do not, as on repetitive ground, where chips fit both.
     """
-    centres = np.array([centre for centre in one if centre in other]).reshape(-1, 2)
-    both = np.array([(one[tuple(c)], other[tuple(c)]) for c in centres.tolist()]).reshape(-1, 2)
+    centres = np.array([centre for centre in best if centre in other]).reshape(-1, 2)
+    both = np.array([(best[tuple(c)], other[tuple(c)]) for c in centres.tolist()]).reshape(-1, 2)
     fits = (both.max(axis=1) > _FITS) & (both.min(axis=1) < both.max(axis=1) / 2)
     second = fits & (both[:, 1] > both[:, 0])
     first = fits & ~second
@@ -411,19 +413,19 @@ def _divided(one: Mapping[tuple[float, ...], float], other: Mapping[tuple[float,
 def refuse_accident(
     agreeing: int, chips: int, tolerance: float, places: float, targets: Sequence[Target], reach: float
 ) -> None:
-    """Raise an error if as many chips could as well agree by chance.
+    """Raise an error if as many chips could agree by chance.
 
     Parameters
     ----------
     tolerance : float
-        Chips that agree lie so near to each other (chip px), in searches `_NEXT` chip px wide.
+        Distance (chip px) within which chips agree, in searches with the radius `_NEXT`.
     places : float
-        So many other corrections could have been found instead.
+        Number of other corrections that could have been the result.
 
     Raises
     ------
     InputError
-        If that has a chance of more than one in a million.
+        If the probability is more than one in a million.
     """
     share = min(1.0, math.pi * tolerance**2 / (2 * _NEXT + 1) ** 2)
     if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:

@@ -1,7 +1,7 @@
-"""Chips that are searched along the line of sight, each by itself, because heights are wrong from place to place.
+"""Separate search of each chip along the line of sight, for heights whose errors differ from place to place.
 
-A height that is wrong moves a match along one direction of the image, the line of sight (of two scenes the epipolar
-one). Where that is farther than chips are large, no shift of the whole stands out: chips agree across it alone.
+A wrong height moves a match in one direction of the image, along the line of sight (for two scenes, the epipolar line).
+If it moves by more than the size of a chip, no common shift is clear: chips agree only across the line of sight.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Text
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Chips bear heights that displace them by so many chip px (standard deviation).
+#: Largest displacement by heights (chip px, standard deviation) for a common search of chips.
 BLURRED = 1.5
-#: Heights are searched and believed within so many of their sigmas.
+#: Heights are searched and accepted within this many sigmas.
 HEIGHTS = 3.0
-#: Radii (chip px) of the search of a chip: of the coarsest level at least, and of those after it.
+#: Radii (chip px) of the search of a chip: least at the coarsest level, and at the following levels.
 _FIRST, _NEXT = 6, 4
-#: Places that are asked.
+#: Number of chips to search.
 _ASKED = 100
-#: Part of a chip that is seen at least where it is searched coarsely.
+#: Least visible part of a chip in a coarse search.
 _GLIMPSED = 0.3
-#: Chips that agree lie within so many chip px across the line of sight; the chance that so many do by accident.
+#: Distance (chip px) across the line of sight within which chips agree, and the significance level of their number.
 _ACROSS, _ACCIDENT = 1.5, 1e-6
 
 
 class Chips:
-    """Chips of a scene, and how far each has come; offsets in its pixels, NaN for what is lost.
+    """Chips of a scene, and the state of each; offsets in pixels of the scene, NaN for lost chips.
 
     Parameters
     ----------
     view : SceneView
-        With the model as it is corrected.
+        With the corrected model.
     centres : (n, 2) of int
     factor : int
         Pixels of the scene in a chip pixel.
     reach : float
-        How far (px) each is searched.
+        Search radius (px) of each chip.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class Chips:
         self.offset = np.zeros((count, 2))
         self.covariance = np.full((count, 2, 2), np.nan)
         self.score = np.zeros(count)
-        #: Why it is lost, keys of `matcher.REASONS`.
+        #: Why a chip is lost, keys of `matcher.REASONS`.
         self.reason: NDArray[Any] = np.full(count, "", dtype="<U12")
 
     def search(self) -> None:
-        """Find each chip to a chip px, coarse to fine, each by itself: heights are wrong from place to place."""
+        """Find each chip separately to a chip px, coarse to fine."""
         factor = self.factor
         while self.reach / factor > _FIRST and SIDE * factor * 4 <= min(self.view.size):
             factor *= 2
@@ -92,11 +92,11 @@ class Chips:
             origins = self.centres[index] - SIDE // 2 * factor
             start = np.round(self.offset[index]).astype(int)
             wide = self._rendered(origins + start - 2 * radius * factor, SIDE + 4 * radius, factor)
-            found = found_again(scene_chips(self.view, origins, SIDE, factor), wide, radius)
-            self.offset[index], self.score[index] = start + found.shift * factor, found.score
+            peak = found_again(scene_chips(self.view, origins, SIDE, factor), wide, radius)
+            self.offset[index], self.score[index] = start + peak.shift * factor, peak.score
             if finest:
                 around = scene_chips(self.view, origins - radius * factor, SIDE + 2 * radius, factor)
-                self.reason[index] = doubts(found, wide, around, radius)
+                self.reason[index] = doubts(peak, wide, around, radius)
             else:
                 self.reason[index[seen(wide, radius) <= _GLIMPSED]] = "hidden"
             self.offset[index[self.reason[index] != ""]] = np.nan
@@ -104,7 +104,7 @@ class Chips:
         return work
 
     def measure(self) -> None:
-        """Measure each chip that was found to a part of a pixel."""
+        """Measure each found chip to a fraction of a pixel."""
         factor = self.factor
 
         def work(index: NDArray[np.int_]) -> None:
@@ -112,10 +112,10 @@ class Chips:
             start = np.round(self.offset[index]).astype(int)
             wide = self._rendered(origins + start - MEASURED * factor, SIDE + 2 * MEASURED, factor)
             scene = scene_chips(self.view, origins, SIDE, factor)
-            found = measure(scene, wide, (self.offset[index] - start) / factor)
-            self.offset[index] = start + found.shift * factor
-            self.covariance[index] = found.covariance * factor**2
-            self.score[index] = found.correlation
+            measured = measure(scene, wide, (self.offset[index] - start) / factor)
+            self.offset[index] = start + measured.shift * factor
+            self.covariance[index] = measured.covariance * factor**2
+            self.score[index] = measured.correlation
 
         self._in_batches(work)
 
@@ -135,22 +135,22 @@ def along_sight(
     displaced: float,
     threads: int,
 ) -> tuple[ImageCorrection, int, int] | None:
-    """Return the shift of the model on which most chips agree across the line of sight, each found by itself.
+    """Return the shift of the model on which most chips, each found separately, agree across the line of sight.
 
-    That is how a scene is placed where heights are wrong by more than chips are large, from chip to chip.
+    This places a scene if height errors displace chips by more than their size.
 
     Parameters
     ----------
     search : float
-        How far (px) the model may be off.
+        Largest error of the model (px).
     displaced : float
-        Standard deviation (px) of what wrong heights displace chips by.
+        Standard deviation (px) of the displacement by wrong heights.
 
     Returns
     -------
     correction : ImageCorrection
     chips, agreeing : int
-        Or None, where so many could as well agree by accident.
+        None if as many could agree by chance.
     """
     start = ImageCorrection.identity(view.model, "affine", ((window[0] + window[2]) / 2, (window[1] + window[3]) / 2))
     columns, rows = cells_of(window[2] - window[0], window[3] - window[1], _ASKED)
@@ -174,7 +174,7 @@ def along_sight(
 
 
 def displacement(view: SceneView, shown: Array, dem_sigma: float, factor: int) -> float:
-    """Return the standard deviation (px) of what wrong heights displace matches by; 0 where chips bear it."""
+    """Return the standard deviation (px) of the displacement by wrong heights; 0 if a common search can bear it."""
     ground = meet_surface(view.model, shown, view.surface)
     along = view.model.ground_partials(ground[np.isfinite(ground).all(axis=1)])[:, :, 2]
     displaced = dem_sigma * float(np.median(np.hypot(*along.T))) if len(along) else 0.0
@@ -190,18 +190,18 @@ def placed_along_sight(
     threads: int,
     refused: InputError,
 ) -> tuple[ImageCorrection, list[Level]]:
-    """Return the correction on which chips agree across the line of sight, where heights may be the cause of a refusal.
+    """Return the correction on which chips agree across the line of sight, if heights may have caused a refusal.
 
     Raises
     ------
     InputError
-        If they do not agree, or heights are no cause.
+        If they do not agree, or heights are not the cause.
     """
     factor, reach = level
     if not displaced:
         raise refused
-    found = along_sight(view, targets, factor, reach, region, displaced, threads)
-    if found is None:
+    fit = along_sight(view, targets, factor, reach, region, displaced, threads)
+    if fit is None:
         raise InputError(
             f"{refused.message}. Wrong heights (up to {displaced:.0f} px along the line of sight) do not explain this: "
             "chips also disagree across it",
@@ -209,37 +209,37 @@ def placed_along_sight(
             field=refused.field,
             remedy=Text("give a better DEM, or ", refused.remedy or ""),
         ) from None
-    correction, chips, agreeing = found
+    correction, chips, agreeing = fit
     shift = correction.coefficients[[0, 3]]
     radius = math.ceil((reach + HEIGHTS * displaced) / factor)
     return correction, [Level(factor, radius, chips, agreeing, (float(shift[0]), float(shift[1])))]
 
 
 def _agreeing(offset: Array, along: Array, displaced: float, chips: Chips) -> NDArray[np.bool_]:
-    """Return the most of offsets ``(n, 2)`` (px) that agree across the line of sight; none if it may be an accident.
+    """Return the majority of offsets ``(n, 2)`` (px) that agrees across the line of sight; none if it may be chance.
 
     Parameters
     ----------
     along : (n, 2)
         The line of sight at each.
     displaced : float
-        Standard deviation (px) of what wrong heights displace them by.
+        Standard deviation (px) of the displacement by wrong heights.
     chips : Chips
-        As they were searched.
+        The searched chips.
     """
     unit = _unit(np.median(along, axis=0))
     place = offset @ np.stack([unit, (-unit[1], unit[0])], axis=1)
     wide = max(2 * HEIGHTS * displaced, 2 * _ACROSS * chips.factor), _ACROSS * chips.factor
     near = (np.abs(place[:, None] - place) <= wide).all(axis=2)
     most = near[int(near.sum(axis=1).argmax())]
-    chance = min(1.0, float(np.prod([one / chips.reach for one in np.minimum(wide, chips.reach)])))
+    chance = min(1.0, float(np.prod([half / chips.reach for half in np.minimum(wide, chips.reach)])))
     count = len(offset)
     accident = stats.binom.sf(int(most.sum()) - 2, count - 1, chance) * count > _ACCIDENT
     return np.zeros(count, dtype=bool) if accident else most
 
 
 def across(residuals: Array, along: Array) -> Array:
-    """Return what residuals ``(n, 2)`` are across a line of sight ``(2,)``."""
+    """Return the parts of residuals ``(n, 2)`` across a line of sight ``(2,)``."""
     unit = _unit(along)
     return residuals - np.outer(residuals @ unit, unit)
 
@@ -249,23 +249,23 @@ def _unit(vector: Array) -> Array:
 
 
 def displacements(view: SceneView, target: Target, partials: Array, ground: Array) -> tuple[Array, Array]:
-    """Return how a metre of height displaces matches ``(n, 2)``, and d(target)/d(image) ``(n, 2, 2)``.
+    """Return the displacement of matches by a metre of height ``(n, 2)``, and d(target)/d(image) ``(n, 2, 2)``.
 
     Parameters
     ----------
     partials : (n, 2, 3)
-        Of the model of the view.
+        d(image)/d(ground) of the model of the view.
     """
     per_metre = map_from_enu(parse_crs(view.model.crs), ground)
     second = np.stack(
         [
-            (target.project(ground + one, view.model.crs) - target.project(ground - one, view.model.crs)) / 2
-            for one in np.moveaxis(per_metre, 2, 0)
+            (target.project(ground + step, view.model.crs) - target.project(ground - step, view.model.crs)) / 2
+            for step in np.moveaxis(per_metre, 2, 0)
         ],
         axis=-1,
     )
     first = partials @ per_metre
-    # Along a ray of another scene plan follows height; in an orthoimage it does not.
+    # Along a ray of another scene the horizontal position changes with height; in an orthoimage it does not.
     with np.errstate(invalid="ignore"):
         plan = -solved(second[:, :, :2], second[:, :, 2:])
         along = (first[:, :, 2:] + first[:, :, :2] @ plan)[:, :, 0]
@@ -274,9 +274,9 @@ def displacements(view: SceneView, target: Target, partials: Array, ground: Arra
 
 
 def solved(matrix: Array, right: Array) -> Array:
-    """Solve stacks of linear systems; NaN where they are not known or singular."""
-    found = np.full(right.shape, np.nan)
+    """Solve stacks of linear systems; NaN where unknown or singular."""
+    solution = np.full(right.shape, np.nan)
     known = np.flatnonzero(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2)))
     good = known[np.linalg.det(matrix[known]) != 0]
-    found[good] = np.linalg.solve(matrix[good], right[good])
-    return found
+    solution[good] = np.linalg.solve(matrix[good], right[good])
+    return solution

@@ -1,4 +1,4 @@
-"""A scene, the images that it is matched with (reference orthoimages, or another scene), and what they show of it."""
+"""A scene, its targets (reference orthoimages, or another scene), and the part of the scene that they show."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface
 
-#: Points per side of a scene at which it is asked what targets show of it.
+#: Sample points per side of a scene, to find what targets show of it.
 SAMPLES = 32
-#: Pixels of a chip are smaller by this than those of a coarser target.
+#: Pixels of a chip are smaller by this factor than those of a coarser target.
 _FINER = 1.5
 #: Resolutions of scene and target differ by at most this factor.
 _RATIO = 8.0
@@ -31,7 +31,7 @@ _RATIO = 8.0
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """A scene as a matcher sees it.
+    """A scene for matching.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ class Target(Protocol):
 
     @property
     def called(self) -> str:
-        """What errors call it."""
+        """Its name in errors."""
         ...
 
     @property
     def field(self) -> str:
-        """The option that it was given by."""
+        """The option that named it."""
         ...
 
     def project(self, ground: Array, crs: str) -> Array:
@@ -125,7 +125,7 @@ class Reference:
         Parameters
         ----------
         bands : sequence of int
-            Numbers from 1 of the bands that are compared; those with the most content without.
+            Numbers, from 1, of the bands to compare. Default: those with the most content.
 
         Raises
         ------
@@ -159,7 +159,7 @@ class Reference:
             sound = abs(np.linalg.det(forward)) > 0
             inverse = np.linalg.inv(forward) if sound else np.full((2, 2), np.nan)
             offset = -inverse @ np.array([transform[0], transform[3]])
-            # Beyond that many pixels from the origin a number does not tell one pixel from the next.
+            # Farther from the origin, floating-point numbers cannot distinguish neighbouring pixels.
             sound = bool(np.isfinite(inverse).all() and np.abs(offset).max() < 2**52)
         if not sound:
             raise CrsError(
@@ -170,7 +170,7 @@ class Reference:
             )
         with completed(source.path):
             crs = horizontal(parse_crs(text))
-            # A system of no known datum is refused here, by the name of its file.
+            # Refuse a CRS without a known datum here, so that the error names the file.
             ground_transform("EPSG:4979", crs)
         return cls(Intensity(source, bands), crs, np.column_stack([inverse, offset]))
 
@@ -196,7 +196,7 @@ class Reference:
         return (pixels - self.pixel_from_map[:, 2]) @ np.linalg.inv(self.pixel_from_map[:, :2]).T
 
     def project(self, ground: Array, crs: str) -> Array:
-        """Put ground into the map, and the map into pixels."""
+        """Convert ground to the map, and the map to pixels."""
         plan = ground_transform(crs, self.crs)(ground)[:, :2]
         return plan @ self.pixel_from_map[:, :2].T + self.pixel_from_map[:, 2]
 
@@ -204,12 +204,12 @@ class Reference:
 def open_references(
     paths: Sequence[str | os.PathLike[str]], bands: Sequence[int] = (), **access: Any
 ) -> tuple[Reference, ...]:
-    """Open reference orthoimages; where several show the same ground, the first that does is taken.
+    """Open reference orthoimages; where several show the same ground, the first one is used.
 
     Parameters
     ----------
     bands : sequence of int
-        Of each, as `Reference.open` takes them.
+        Bands of each; see `Reference.open`.
 
     Raises
     ------
@@ -229,15 +229,15 @@ def spread_over(view: SceneView) -> Array:
 
 
 def near(view: SceneView, targets: Sequence[Target], reach: float) -> Sequence[Target]:
-    """Return the targets that may show something of a scene whose model is off by `reach` px; all, if none may.
+    """Return the targets that may overlap a scene whose model is off by up to `reach` px; all, if none may.
 
-    Of a country's many orthoimages a scene needs few, and each of the others would be asked for every chip.
+    A scene needs few of the many orthoimages of a country, and each other one would be tried for every chip.
     """
     image = spread_over(view)
     ground = view.model.image_to_ground(image, view.model.reference_height)
-    # A quarter of the scene besides, for relief and the curves of the projection.
+    # Plus a quarter of the scene, for relief and the curvature of the projection.
     share = 0.25 + reach / min(view.size)
-    found = []
+    overlapping = []
     for target in targets:
         places = target.project(ground, view.model.crs)
         places = places[np.isfinite(places).all(axis=1)]
@@ -246,27 +246,27 @@ def near(view: SceneView, targets: Sequence[Target], reach: float) -> Sequence[T
             margin, size = share * (high - low).max(), (target.intensity.width, target.intensity.height)
             if ((low - margin > size) | (high + margin < 0)).any():
                 continue
-        found.append(target)
-    return found or targets
+        overlapping.append(target)
+    return overlapping or targets
 
 
 def shown_by(targets: Sequence[Target], ground: Array, crs: str) -> NDArray[np.bool_]:
-    """Tell which ground ``(n, 3)`` lies in one of the targets at least."""
-    found = np.zeros(len(ground), dtype=bool)
+    """Return which ground points ``(n, 3)`` are in at least one of the targets."""
+    shown = np.zeros(len(ground), dtype=bool)
     for target in targets:
         places = target.project(ground, crs)
         with np.errstate(invalid="ignore"):
-            found |= ((places >= 0) & (places <= (target.intensity.width, target.intensity.height))).all(axis=1)
-    return found
+            shown |= ((places >= 0) & (places <= (target.intensity.width, target.intensity.height))).all(axis=1)
+    return shown
 
 
 def chip_factor(view: SceneView, targets: Sequence[Target], shown: Array) -> int:
-    """Return how many pixels of a scene make one of a chip, where targets show points ``(n, 2)`` of it; at least 1.
+    """Return the number (at least 1) of pixels of a scene in a chip pixel, if targets show points ``(n, 2)`` of it.
 
     Raises
     ------
     InputError
-        If the resolutions are too different to be compared.
+        If the resolutions are too different.
     """
     ratio = float(np.nanmedian(np.concatenate([_resolution_ratio(view, target, shown) for target in targets])))
     if not 1 / _RATIO <= ratio <= _RATIO:
@@ -277,8 +277,8 @@ def chip_factor(view: SceneView, targets: Sequence[Target], shown: Array) -> int
             field=first.field,
             remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
         )
-    # Averaged to the pixels of a target half as fine, a real scene was found half a pixel off; in its own, a twentieth.
-    # Of a scene that was enlarged, two by two are its own: single ones show its noise as if it were structure.
+    # Averaged to the pixels of a target half as fine, a real scene was off by half a pixel; in its own pixels by a
+    # twentieth. An enlarged scene needs two by two: its single pixels would show noise as structure.
     return max(2 if view.intensity.enlarged else 1, round(1 / ratio / _FINER))
 
 
@@ -298,6 +298,6 @@ def metres_per_pixel(view: SceneView) -> float:
     middle = np.array(view.size) / 2
     image = middle + np.array([(0.0, 0.0), (8.0, 0.0), (0.0, 8.0)])
     ground = view.model.image_to_ground(image, view.model.reference_height)
-    placed = ground_transform(view.model.crs, "EPSG:4978")(ground)
-    across, down = placed[1] - placed[0], placed[2] - placed[0]
+    ecef = ground_transform(view.model.crs, "EPSG:4978")(ground)
+    across, down = ecef[1] - ecef[0], ecef[2] - ecef[0]
     return math.sqrt(float(np.linalg.norm(np.cross(across, down)))) / 8

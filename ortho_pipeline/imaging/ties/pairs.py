@@ -1,11 +1,11 @@
-r"""Two scenes: where chips of one are in the other one, whatever the heights of the DEM.
+r"""Two scenes: positions of chips of one scene in the other, independent of the heights of the DEM.
 
-A chip of the first scene is compared with the second one, rendered into its geometry through the DEM. A match d of the
-chip about p says that the second scene shows at :math:`B(G(p + d))` what the first one shows at p, G being where the
-ray of the (corrected) first model meets the DEM. That is true whatever the DEM's height there, because the same G has
-rendered the chip: a height that is wrong by :math:`\delta` moves d by :math:`\delta\,u` along the epipolar direction
-:math:`u = A_h - A_{xy} B_{xy}^{-1} B_h` (px per metre), and the tie not at all. So matches are searched as far along it
-as heights may be wrong, and judged against each other across it.
+A chip of the first scene is compared with the second scene, rendered into its geometry through the DEM. A match d of
+the chip at p means that the second scene shows at :math:`B(G(p + d))` what the first one shows at p. G is where the ray
+of the (corrected) first model meets the DEM. This is true for any height of the DEM, because the same G rendered the
+chip: a height error :math:`\delta` moves d by :math:`\delta\,u` along the epipolar direction
+:math:`u = A_h - A_{xy} B_{xy}^{-1} B_h` (px per metre), but does not move the tie point. So matches are searched along
+it as far as heights may be wrong, and tested against each other across it.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Rounds of judging.
+#: Rounds of the test of matches against each other.
 _JUDGED = 8
-#: Chip pixels that the heights displace by more than this are too fine for the first search.
+#: Largest displacement by heights (chip px, standard deviation) in the first search; else its pixels are too fine.
 _BLURRED = 1.5
-#: Standard deviation (px) that any match has at least.
+#: Least standard deviation (px) of a match.
 _FLOOR = 0.02
 
 
 @dataclass(frozen=True)
 class TieSettings:
-    """Choices of a user.
+    """Options of the search for tie points.
 
     Parameters
     ----------
     search : float
-        How far (m on the ground) the models may be off against each other.
+        Largest relative error (m on the ground) of the models.
     points : int
-        About how many ties are wanted of a pair.
+        Approximate number of tie points of a pair.
     dem_sigma : float
         Standard deviation (m) of the DEM's heights.
     threads : int
     memory : int
-        Bytes that are meant for all of the work, of which GDAL's cache has a part.
+        Bytes for all of the work, including GDAL's cache.
     """
 
     search: float
@@ -68,11 +68,11 @@ class PairSummary:
     images : (int, int)
     ties, tried : int
     shift : (float, float)
-        Column and row (px of the first scene) by which its model was off against the second one's.
+        Mean error of the first model relative to the second: column and row (px of the first scene).
     components : Components or None
-        What the residuals are made of.
+        The parts of the residuals.
     reason : str
-        Why there are no ties; empty if there are.
+        Why there are no tie points; empty if there are.
     """
 
     images: tuple[int, int]
@@ -85,16 +85,16 @@ class PairSummary:
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Places of one scene found in the other one; NaN where nothing was found.
+    """Positions of points of one scene in the other one; NaN if not found.
 
     Parameters
     ----------
     first, second : (n, 2)
         Pixel positions in both scenes.
     first_covariance, second_covariance : (n, 2, 2)
-        px²; the error of a match is that of both chips, half and half.
+        px²; each chip has half the error of a match.
     height, height_sigma : (n,)
-        How much higher (m) than the DEM the match puts the ground, up to what a correction of the model takes up.
+        Height (m) of the match above the DEM, without the part that a correction of the model absorbs.
     score : (n,)
         Correlation of the chips.
     """
@@ -110,13 +110,13 @@ class PairMatches:
 
     @property
     def good(self) -> NDArray[np.bool_]:
-        """Which were found."""
+        """Which positions were found."""
         return np.isfinite(self.second[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A scene, another one, and the correction of the first model under which they agree.
+    """A scene, another one, and the correction of the first model for which they agree.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class Pair:
     factor : int
         Pixels of the first scene in a chip pixel.
     reach : float
-        How far (px) heights may displace a match.
+        Largest displacement (px) of a match by heights.
     settings : TieSettings
     """
 
@@ -139,19 +139,19 @@ class Pair:
 
     @classmethod
     def place(cls, view: SceneView, target: OtherScene, shown: Array, search: float, settings: TieSettings) -> Pair:
-        """Find the correction, by what both show.
+        """Find the correction from the common area of both scenes.
 
         Parameters
         ----------
         shown : (n, 2)
             Points of the first scene that the second one shows.
         search : float
-            How far (px) the model may be off.
+            Largest error of the model (px).
 
         Raises
         ------
         InputError
-            If resolutions are too different, or no place stands out.
+            If resolutions are too different, or there is no clear best position.
         """
         base = chip_factor(view, [target], shown)
         ground = meet_surface(view.model, shown, view.surface)
@@ -167,27 +167,27 @@ class Pair:
             try:
                 correction, _ = place(view, [target], max(search, 2.0 * finest), finest, window)
             except InputError:
-                # The heights may be better than stated, and some grounds show nothing in large pixels.
+                # Heights may be better than stated, and some ground has no structure in large pixels.
                 if finest > base:
                     finest = max(base, finest // 2)
                     continue
-                found = along_sight(view, [target], base, search, window, sigma, settings.threads)
-                if found is None:
+                fit = along_sight(view, [target], base, search, window, sigma, settings.threads)
+                if fit is None:
                     raise
-                return cls(view, target, found[0], base, 2 * HEIGHTS * sigma + 2 * base, settings)
+                return cls(view, target, fit[0], base, 2 * HEIGHTS * sigma + 2 * base, settings)
             else:
                 return cls(view, target, correction, base, HEIGHTS * sigma + 2 * finest, settings)
 
     @property
     def shift(self) -> tuple[float, float]:
-        """Column and row (px) by which the model was off in the mean."""
+        """Mean error of the model: column and row (px)."""
         shift = self.correction.coefficients[[0, 3]]
         return float(shift[0]), float(shift[1])
 
     def match(self, places: Array) -> PairMatches:
-        """Find places ``(n, 2)`` of the first scene in the second one.
+        """Find positions ``(n, 2)`` of the first scene in the second one.
 
-        Chips are of whole pixels: what the chip about the nearest of their corners says is taken for the place itself.
+        Chips have whole pixels: the result for the nearest pixel corner is used for the position itself.
         """
         chips = self._chips(np.round(places).astype(int))
         chips.search()
@@ -199,7 +199,7 @@ class Pair:
         return Chips(seen, [self.target], centres, self.factor, self.reach, self.settings.threads)
 
     def _judged(self, places: Array, chips: Chips) -> PairMatches:
-        """Leave out what contradicts the others across the epipolar direction, or heights by more than they may."""
+        """Reject matches that contradict the others across the epipolar direction, or the heights by too much."""
         count = len(places)
         ground = np.full((count, 3), np.nan)
         good = np.isfinite(chips.offset).all(axis=1)
@@ -245,18 +245,18 @@ class Pair:
 
 
 def shared(view: SceneView, target: OtherScene) -> Array:
-    """Return those of points ``(n, 2)`` spread over a scene that another one shows, as the models have it."""
+    """Return the points ``(n, 2)``, of many spread over a scene, that another scene shows by the models."""
     image = spread_over(view)
     return image[shows(view, target, image)]
 
 
 def shows(view: SceneView, target: OtherScene, image: Array) -> NDArray[np.bool_]:
-    """Tell which image points ``(n,)`` of a scene another one shows, as the models have it."""
+    """Return which image points ``(n,)`` of a scene another scene shows, by the models."""
     return shown_by([target], meet_surface(view.model, image, view.surface), view.model.crs)
 
 
 def _fitted(design: Array, offset: Array, matched: Array, along: Array) -> tuple[Array, Components]:
-    """Return what an affine correction leaves of the offsets ``(n, 2)``, weighted by what the parts are found to be."""
+    """Return the residuals of offsets ``(n, 2)`` after a weighted affine correction, and the parts of their errors."""
     residuals = offset - np.median(offset, axis=0)
     parts = components(residuals, matched, along)
     for _ in range(3):
@@ -272,7 +272,7 @@ def _fitted(design: Array, offset: Array, matched: Array, along: Array) -> tuple
 
 
 def _heights(residuals: Array, covariance: Array, along: Array) -> tuple[Array, Array]:
-    """Return the heights ``(n,)`` in metres that residuals are, and their sigmas."""
+    """Return the heights ``(n,)`` (m) that correspond to residuals, and their sigmas."""
     weighted = solved(covariance, along[:, :, None])[:, :, 0]
     square = np.einsum("ni,ni->n", weighted, along)
     with np.errstate(invalid="ignore", divide="ignore"):

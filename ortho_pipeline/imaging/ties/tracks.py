@@ -1,7 +1,7 @@
-"""Tracks: the same place in two scenes or more, each scene once.
+"""Tracks: the same point in two or more scenes, once in each scene.
 
-The same chip of one scene, its home, is measured in all later scenes that show it. What a later scene shows of a track,
-and the track's home did not see in scenes further on, is measured there in turn: so tracks go on through a block.
+A chip of one scene, its home, is measured in all later scenes that show it. Each later scene of a track then searches
+the scenes that the home did not overlap, so tracks continue through a block.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 
-#: Cells of a scene are at most so many times those wanted of its smallest overlap.
+#: Largest ratio of the number of cells of a scene to the number of points wanted in its smallest overlap.
 _MOST = 10
-#: Heights that two pairs say of one place differ by at most so many sigmas.
+#: Largest difference (in sigmas) between the heights of one point from two pairs.
 _SIGMAS = 3.5
 
 
 @dataclass(frozen=True, eq=False)
 class Ties:
-    """Tracks, one row for each place in each scene.
+    """Tracks, with one row for each point in each scene.
 
     Parameters
     ----------
@@ -64,10 +64,10 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
     Raises
     ------
     InputError
-        If no two of them show the same ground, or none that do could be matched; with the reason.
+        If no two scenes overlap, or none could be matched. The message has the reason.
     """
     blocks = sorted(view.intensity.source.block for view in views)
-    # A thread looks at two scenes.
+    # A thread reads two scenes.
     settings = replace(settings, threads=limit_cache(settings.memory, settings.threads, *blocks[-2:]))
     targets = [OtherScene(view.intensity, view.model) for view in views]
     overlaps = _overlaps(views, targets)
@@ -104,21 +104,21 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
 
 
 def _overlaps(views: Sequence[SceneView], targets: Sequence[OtherScene]) -> dict[tuple[int, int], Array]:
-    """Return the pairs of scenes that show the same ground, and points ``(n, 2)`` of the first that the second does."""
-    found = {}
+    """Return the overlapping pairs of scenes, with points ``(n, 2)`` of the first one that the second one shows."""
+    overlaps = {}
     for first, second in itertools.combinations(range(len(views)), 2):
         shown = shared(views[first], targets[second])
         if len(shown) >= FEWEST:
-            found[first, second] = shown
-    return found
+            overlaps[first, second] = shown
+    return overlaps
 
 
 @dataclass(eq=False)
 class _Track:
-    """Where a place is in each scene, its covariance there, and the scenes that were looked at."""
+    """The position of a point in each scene, its covariance there, and the scenes that were searched."""
 
     places: dict[int, tuple[Array, Array]] = field(default_factory=dict)
-    asked: set[int] = field(default_factory=set)
+    searched: set[int] = field(default_factory=set)
 
 
 class _Block:
@@ -136,25 +136,25 @@ class _Block:
             return
         grown = [track for track in self.tracks if home in track.places]
         begun, cells = self._begun(home, view, placed, partners, grown)
-        asking = [*grown, *begun]
+        tracks = [*grown, *begun]
 
         def wanted(k: int, other: int) -> bool:
-            return other not in asking[k].places and (k < len(grown) or other in cells[k - len(grown)])
+            return other not in tracks[k].places and (k < len(grown) or other in cells[k - len(grown)])
 
-        found = {}
+        matches = {}
         for other, pair in placed.items():
-            asked = [k for k, track in enumerate(asking) if other not in track.asked and wanted(k, other)]
-            places = np.array([asking[k].places[home][0] for k in asked]).reshape(-1, 2)
+            due = [k for k, track in enumerate(tracks) if other not in track.searched and wanted(k, other)]
+            places = np.array([tracks[k].places[home][0] for k in due]).reshape(-1, 2)
             seen = shows(view, self.targets[other], places) if len(places) else np.zeros(0, dtype=bool)
-            index = np.array(asked, dtype=int)[seen]
+            index = np.array(due, dtype=int)[seen]
             if len(index):
-                found[other] = index, pair.match(places[seen])
-        _drop_contradicting(found)
-        self._take(home, asking, found, placed)
+                matches[other] = index, pair.match(places[seen])
+        _drop_contradicting(matches)
+        self._take(home, tracks, matches, placed)
         self.tracks += [track for track in begun if len(track.places) > 1]
 
     def _placed(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> dict[int, Pair]:
-        """Return the pairs of a home whose relative position was found; the others are said."""
+        """Return the pairs of a home with a known relative position; record the others with their reason."""
         placed = {}
         search = self.settings.search / metres_per_pixel(view)
         for other, shown in partners.items():
@@ -172,7 +172,7 @@ class _Block:
         partners: Mapping[int, Array],
         grown: Sequence[_Track],
     ) -> tuple[list[_Track], list[set[int]]]:
-        """Return new tracks, one in each cell that lacks a tie with a scene after it, and these scenes of each."""
+        """Return new tracks, one in each cell without a tie to a later scene, and these scenes for each."""
         share = min(len(partners[other]) for other in placed) / SAMPLES**2
         columns, rows = cells_of(*view.size, min(round(self.settings.points / share), _MOST * self.settings.points))
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
@@ -194,17 +194,17 @@ class _Block:
     def _take(
         self,
         home: int,
-        asking: Sequence[_Track],
-        found: Mapping[int, tuple[NDArray[np.int_], PairMatches]],
+        tracks: Sequence[_Track],
+        matches: Mapping[int, tuple[NDArray[np.int_], PairMatches]],
         placed: Mapping[int, Pair],
     ) -> None:
-        """Add what was found to the tracks."""
+        """Add matches to the tracks."""
         own: dict[int, list[Array]] = {}
-        for other, (index, matched) in found.items():
+        for other, (index, matched) in matches.items():
             for row, k in enumerate(index.tolist()):
-                asking[k].asked.add(other)
+                tracks[k].searched.add(other)
                 if matched.good[row]:
-                    asking[k].places[other] = matched.second[row], matched.second_covariance[row]
+                    tracks[k].places[other] = matched.second[row], matched.second_covariance[row]
                     own.setdefault(k, []).append(matched.first_covariance[row])
             count = int(matched.good.sum())
             reason = "" if count else f"none of {counted(len(index), 'place')} matched"
@@ -212,9 +212,9 @@ class _Block:
                 PairSummary((home, other), count, len(index), placed[other].shift, matched.components, reason)
             )
         for k, parts in own.items():
-            place, covariance = asking[k].places[home]
+            place, covariance = tracks[k].places[home]
             if np.isnan(covariance).any():
-                asking[k].places[home] = place, np.mean(parts, axis=0)
+                tracks[k].places[home] = place, np.mean(parts, axis=0)
 
     def ties(self) -> Ties:
         """Return all tracks."""
@@ -232,9 +232,9 @@ class _Block:
         )
 
 
-def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], PairMatches]]) -> None:
-    """Take the worse of two matches of one chip away that put the ground at different heights."""
-    for (first_index, first), (second_index, second) in itertools.combinations(found.values(), 2):
+def _drop_contradicting(matches: Mapping[int, tuple[NDArray[np.int_], PairMatches]]) -> None:
+    """Drop the worse of two matches of one chip that give different heights of the ground."""
+    for (first_index, first), (second_index, second) in itertools.combinations(matches.values(), 2):
         _, rows, others = np.intersect1d(first_index, second_index, return_indices=True)
         both = first.good[rows] & second.good[others]
         rows, others = rows[both], others[both]
@@ -243,7 +243,7 @@ def _drop_contradicting(found: Mapping[int, tuple[NDArray[np.int_], PairMatches]
             continue
         apart = apart - np.median(apart)
         sigma = np.hypot(first.height_sigma[rows], second.height_sigma[others])
-        # Corrections of both pairs take up a trend of the heights each in its own way.
+        # The correction of each pair absorbs a different trend of the heights.
         sigma = np.maximum(sigma, 1.4826 * float(np.median(np.abs(apart))))
         bad = np.abs(apart) > _SIGMAS * sigma
         worse = first.score[rows] < second.score[others]

@@ -161,6 +161,13 @@ class FrameCamera(SensorModel):
 
         The platform's axes are forward, right, down. Yaw is the heading clockwise from true north, positive pitch lifts
         the nose, positive roll lowers the right wing. At zero the camera looks straight down, image top forward.
+
+        Examples
+        --------
+        >>> interior = Interior(4000, 3000, focal_length=0.05, pitch_x=5e-6, pitch_y=5e-6)
+        >>> camera = FrameCamera.from_roll_pitch_yaw(interior, [33.0, 37.0, 2000.0], 0.0, 0.0, 0.0)
+        >>> camera.image_to_ground([[2000.0, 1500.0]], 500.0).round(6).tolist()
+        [[33.0, 37.0, 500.0]]
         """
         return cls.from_geocentric(interior, *geocentric_of_platform(position, roll, pitch, yaw), **others)
 

@@ -85,9 +85,9 @@ def _series(terms, xi):
 
 @inlined
 def _in_camera(px, py, pz, t, ends, origins, pieces, mount, lever, up, bend, slowness):
-    """Vector along which a point is seen in camera axes at time t, and its rate; (px, py, pz) is in orbital axes.
+    """Vector in camera axes along which a point is seen at time t, and its rate; (px, py, pz) is in orbital axes.
 
-    How the way of the light changes with time is left out of the rate: Newton's steps are shorter by a part of 1e-5.
+    The rate omits the change of the light path with time, which changes Newton's steps by a part of 1e-5.
     """
     i, above = 0, ends.shape[0]
     while i < above:
@@ -155,13 +155,13 @@ def project(ground: Any, trajectory: Trajectory, camera: Camera, limits: Any, im
         gx, gy = level * math.cos(lon), level * math.sin(lon)
         gz = (normal * (1.0 - e2) + ground[k, 2]) * sin_lat
         x, y, z = gx - centre[0], gy - centre[1], gz - centre[2]
-        # Seen from below the horizon there is only the far side of the Earth.
+        # Below the horizon, the Earth hides the point.
         if not gx * x + gy * y + gz * z < 0.0:
             continue
         px, py, pz = _in_orbit(orbit, x, y, z)
         up = _in_orbit(orbit, cos_lat * math.cos(lon), cos_lat * math.sin(lon), sin_lat)
         lifting = bend * math.exp(-ground[k, 2] / SCALE_HEIGHT)
-        # The scan is so nearly linear in time that from the middle Newton's method needs four steps.
+        # The scan is nearly linear in time: from the middle, Newton's method needs four steps.
         t = 0.5 * (limits[1, 0] + limits[1, 1])
         col, miss, w = half, np.inf, 0.0
         for _ in range(20):
@@ -185,7 +185,7 @@ def project(ground: Any, trajectory: Trajectory, camera: Camera, limits: Any, im
             miss = max(abs(step / period), abs(shift))
             if not miss > verified:
                 break
-        # The last step was a correction of `miss`: what is left is its square.
+        # The last correction was `miss`, so the remaining error is its square.
         good = miss <= verified and w > 0.0
         if good and limits[0, 0] <= col <= limits[0, 1] and limits[1, 0] <= t <= limits[1, 1]:
             image[k, 0] = col

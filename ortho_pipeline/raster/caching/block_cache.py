@@ -8,19 +8,19 @@ from contextlib import contextmanager
 
 from osgeo import gdal
 
-#: What GDAL's cache has to hold beside large blocks of an image (bytes).
+#: Bytes that GDAL's cache needs in addition to large blocks of an image.
 _OTHER_BLOCKS = 64_000_000
 
 
 def limit_cache(memory: int, threads: int, *blocks: int) -> int:
-    """Limit GDAL's block cache to a quarter of `memory` (at least 16 MB), or to what holds the blocks of each thread.
+    """Limit GDAL's block cache to a quarter of `memory` (at least 16 MB), or to the size of the blocks of each thread.
 
-    Beside its cache GDAL has room for the block that each thread decodes, which counts for that quarter.
+    GDAL also needs memory for the block that each thread decodes, which counts for that quarter.
 
     Returns
     -------
     int
-        How many threads that allows, at most `threads`: each decodes blocks (of `blocks` bytes) of its own.
+        Number of threads that this allows, at most `threads`; each decodes its own blocks (of `blocks` bytes).
     """
     held = sum(blocks)
     threads = max(1, min(threads, memory // max(held, 1)))
@@ -30,7 +30,7 @@ def limit_cache(memory: int, threads: int, *blocks: int) -> int:
 
 
 def keep_blocks(size: int) -> None:
-    """Raise GDAL's block cache to what holds blocks of `size` bytes beside those of the output."""
+    """Raise GDAL's block cache so that it holds blocks of `size` bytes and those of the output."""
     if size > gdal.GetCacheMax() // 2:
         gdal.SetCacheMax(max(gdal.GetCacheMax(), size + _OTHER_BLOCKS))
 

@@ -1,7 +1,7 @@
-"""Pixels of rasters that lie far away, read before they are needed: several windows at a time, and each block once.
+"""Pixels of remote rasters, read before they are needed: several windows at a time, and each block once.
 
-A request to a store takes as long as the way there and back, however few bytes it brings. Who knows which windows come
-next (`ReadAhead.expect`) does not wait for each of them.
+A request to a store takes a full round trip, even for few bytes. A caller that states the next windows
+(`ReadAhead.expect`) does not wait for each of them.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ AHEAD = 6
 
 @contextlib.contextmanager
 def read_ahead(source: RasterSource, memory: int) -> Iterator[RasterSource]:
-    """Yield what reads the windows of a source that lies far away ahead; of one on this machine, the source itself.
+    """Yield a reader that reads windows of a remote source ahead; for a local source, the source itself.
 
     Parameters
     ----------
     memory : int
-        Bytes for pixels that were read and may be needed again.
+        Bytes of cached pixels.
     """
     if not any(Location(path).is_far for path in source.paths):
         yield source
@@ -49,7 +49,7 @@ def read_ahead(source: RasterSource, memory: int) -> Iterator[RasterSource]:
 
 @dataclass(eq=False)
 class _Part:
-    """Pixels of a rectangle of blocks, and which are valid, as they come; `used` once somebody took of them."""
+    """Pixels of a rectangle of blocks, and which are valid; `used` if they were read from here."""
 
     left: int
     top: int
@@ -61,15 +61,15 @@ class _Part:
 
 
 class ReadAhead(RasterSource):
-    """The rasters of a source, whose blocks are read once for all windows that lie on them, and ahead where expected.
+    """The rasters of a source; each block is read once for all its windows, and ahead if it is expected.
 
     Parameters
     ----------
     source : RasterSource
     memory : int
-        Bytes of pixels that are kept.
+        Bytes of cached pixels.
     pool : ThreadPoolExecutor
-        Reads; each of its threads has handles of its own.
+        Threads that read, each with its own handles.
     """
 
     def __init__(self, source: RasterSource, memory: int, pool: ThreadPoolExecutor) -> None:
@@ -83,7 +83,7 @@ class ReadAhead(RasterSource):
         self._bytes = 0
 
     def expect(self, left: int, top: int, right: int, bottom: int) -> None:
-        """Begin to read a window, unless so much waits to be used already that it would have to be read again."""
+        """Begin to read a window, unless so much is waiting that it would have to be read again."""
         with self._lock:
             if sum(part.size for part in self._parts if not part.used) < self._memory // 2:
                 self._asked(left, top, right, bottom)
@@ -164,7 +164,7 @@ def _shared(part: _Part, left: int, top: int, width: int, height: int) -> tuple[
 def _rectangles(places: set[tuple[int, int]]) -> list[tuple[int, int, int, int]]:
     """Return rectangles (first row, last row + 1, first column, last column + 1) that are these places together."""
     open_runs: dict[tuple[int, int], int] = {}
-    found = []
+    rectangles = []
     rows = sorted({row for row, _ in places})
     for row in rows:
         columns = sorted(column for one, column in places if one == row)
@@ -172,8 +172,8 @@ def _rectangles(places: set[tuple[int, int]]) -> list[tuple[int, int, int, int]]
         starts = [0, *(k + 1 for k in ends[:-1])]
         runs = {(columns[a], columns[b] + 1) for a, b in zip(starts, ends, strict=True)}
         for run in [run for run in open_runs if run not in runs or row - 1 not in rows]:
-            found.append((open_runs.pop(run), row, *run))
+            rectangles.append((open_runs.pop(run), row, *run))
         for run in runs:
             open_runs.setdefault(run, row)
-    found += [(first, rows[-1] + 1, *run) for run, first in open_runs.items()]
-    return found
+    rectangles += [(first, rows[-1] + 1, *run) for run, first in open_runs.items()]
+    return rectangles

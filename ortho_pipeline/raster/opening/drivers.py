@@ -14,7 +14,7 @@ from ortho_pipeline.files.locations import network_is_closed
 
 gdal.UseExceptions()
 
-#: Raster drivers that only read pixels out of the file they are given (and its side-cars).
+#: Raster drivers that only read pixels from their file (and its sidecars).
 PLAIN = (
     "GTiff",
     "COG",

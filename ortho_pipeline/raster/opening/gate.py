@@ -1,12 +1,12 @@
-"""The gate before GDAL: a raster is opened once every file that it leads to has been seen.
+"""The gate before GDAL: a raster is opened only after every file that it refers to has been checked.
 
-GDAL follows what headers and side-cars say of other files, with every driver that is registered and some of it while it
-opens. So each file is looked at before GDAL is: what it is (by GDAL's own test, among all drivers), which files its
-header names (read by GDAL's own XML parser) and which side-cars GDAL takes up as rasters. Those are seen to in the same
-way, down to the last one. A name that leads out of the allowed folders, or a driver that is not on the list, ends it.
-What GDAL alone can tell (`GetFileList`, overviews in metadata) is asked of the open dataset before a pixel is read.
+GDAL follows references of headers and sidecars to other files, with any registered driver, and partly while it opens.
+So each file is checked before GDAL opens it: its driver (by GDAL's own test, among all drivers), the files that its
+header names (read by GDAL's own XML parser), and the sidecars that GDAL uses as rasters. These are checked in the same
+way, recursively. A name outside the allowed folders, or a driver that is not on the list, is an error. References that
+only GDAL knows (`GetFileList`, overviews in metadata) are checked on the open dataset, before a pixel is read.
 
-`locations.close_network` says what a process of the command line adds.
+`locations.close_network` has the further limits of a command-line process.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ gdal.UseExceptions()
 
 #: Side-cars that GDAL opens as rasters, by their ending after the whole name of an image or after its stem.
 _RASTER_SIDE_CAR = re.compile(r"\.(ovr|msk|aux|rrd|r[0-9])$")
-#: Side-cars that say in which coordinate system a raster is.
+#: Sidecars that state the CRS of a raster.
 _CRS_SIDE_CARS = (".aux.xml", ".prj", ".hdr")
 #: Side-cars with text that GDAL reads while it opens an image.
 _TEXT_SIDE_CAR = re.compile(r"\.(rpb|imd|eph|att|geo|tab|wld|\w{1,3}w)|[_.]?rpc\.(txt|xml)|_metadata\.txt")
@@ -59,7 +59,7 @@ def _together(path: Any) -> str:
 def open_seen(
     path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], siblings: bool
 ) -> tuple[gdal.Dataset, DecodedUnit]:
-    """Open a raster for reading if all files that it leads to lie in its own folder or in `roots`.
+    """Open a raster for reading if all files that it refers to are in its own folder or in `roots`.
 
     Parameters
     ----------
@@ -69,15 +69,16 @@ def open_seen(
         Those of `DRIVERS` that may read it.
     siblings : bool
         Whether GDAL may read sidecar files.
+
     Returns
     -------
     gdal.Dataset, DecodedUnit
-        The raster, and the largest block of it and of all that it leads to.
+        The raster, and the largest block of it and of all files that it refers to.
 
     Raises
     ------
     InputError
-        If a file would be read that lies elsewhere, or by another driver; naming it and who names it.
+        If it refers to a file elsewhere, or of another driver. The error names this file and the reference.
     RuntimeError
         If GDAL cannot open the file.
     """
@@ -98,13 +99,13 @@ class DecodedUnit:
 
 
 class _Gate:
-    """The files of one raster that have been seen, and the folders in which they may lie."""
+    """The checked files of one raster, and the folders in which its files may be."""
 
     def __init__(self, path: AnyPath, roots: Sequence[AnyPath]) -> None:
         if isinstance(path, VsiPath):
             self._roots: list[AnyPath] = [path.parent]
         else:
-            # A link's own side-cars may lie where it lies or where it leads.
+            # The sidecars of a link may be beside the link or beside its target.
             here = Path(path)
             folders = [here, here.resolve()] if here.is_dir() else [here.parent, here.resolve().parent]
             self._roots = [folder.resolve() for folder in (*folders, *map(Path, roots))]
@@ -193,14 +194,14 @@ class _Gate:
         volumes = [name for name in names if re.fullmatch(r"vol_.*\.xml", name.lower())]
         if len(volumes) == 1:
             return self._product_of(folder / volumes[0])
-        found = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
-        if len(found) > 1:
+        products = [name for name in names if re.fullmatch(r"dim_.*\.xml", name.lower())]
+        if len(products) > 1:
             raise InputError(
-                f"this folder has several products: {', '.join(sorted(found)[:6])}",
+                f"this folder has several products: {', '.join(sorted(products)[:6])}",
                 file=folder,
                 remedy="give the DIM_*.XML of one of them, or an image",
             )
-        return folder / found[0] if found == names and found else None
+        return folder / products[0] if products == names and products else None
 
     def _product_of(self, volume: Any) -> Any:
         """Return the metadata of the one product of a DIMAP volume; None where the file is no volume."""
@@ -325,7 +326,7 @@ class _Gate:
     # -- what GDAL tells ---------------------------------------------------------------------------------------------
 
     def _see_open(self, dataset: gdal.Dataset, path: Any) -> None:
-        """See to the files that an open dataset goes on to read, before it does."""
+        """Check the files that an open dataset will read, before it does."""
         for key, value in (dataset.GetMetadata(_OVERVIEWS) or {}).items():
             if key.upper() == "OVERVIEW_FILE":
                 named = Named(str(value).removeprefix(":::BASE:::"), "OVERVIEW_FILE")
@@ -350,7 +351,7 @@ class _Gate:
 
 
 def _beside(path: Any) -> list[str]:
-    """Return the names beside a file that begin as its own; behind a URL, those of the side-cars that are there."""
+    """Return the names beside a file that begin with its own name; behind a URL, those of its existing sidecars."""
     folder = path.parent
     if isinstance(folder, VsiPath) and not (Location(str(folder)).in_archive and folder.is_dir()):
         names = (path.name + ending for ending in (".ovr", ".msk", ".aux", ".aux.xml"))
@@ -359,7 +360,7 @@ def _beside(path: Any) -> list[str]:
 
 
 def _see_crs(texts: Iterable[str], path: Any) -> None:
-    """Refuse coordinate systems that lead PROJ to files, before GDAL or anybody else asks PROJ for them."""
+    """Refuse coordinate systems that make PROJ open files, before PROJ reads them."""
     with completed(path):
         for text in texts:
             refuse_files(text)
@@ -377,14 +378,14 @@ def _decoded_at_once(dataset: gdal.Dataset) -> int:
         masked = band.GetMaskFlags() & gdal.GMF_PER_DATASET
         return max(size, math.prod(band.GetMaskBand().GetBlockSize()) if masked else 0)
     except RuntimeError:
-        # Who needs the mask is told by its reader.
+        # The reader of the mask reports it to those who need it.
         return size
 
 
 def _is_sequential(dataset: gdal.Dataset, band: gdal.Band) -> bool:
-    """Tell whether a row is found by decoding all rows before it, whatever GDAL says of blocks.
+    """Return whether a row needs all rows before it to be decoded, whatever GDAL states about blocks.
 
-    So it is with PNG and JPEG, and with a compressed TIFF that is one strip, which GDAL gives row by row.
+    This applies to PNG, JPEG, and a compressed TIFF with one strip, which GDAL returns row by row.
     """
     kind = dataset.GetDriver().ShortName
     if kind != "GTiff":
@@ -405,6 +406,6 @@ def _listed(dataset: gdal.Dataset) -> list[str]:
 
 
 def _is_below(path: VsiPath, folder: AnyPath) -> bool:
-    """Tell whether a path lies in a folder by its text, in which dots lead nowhere."""
+    """Return whether a path is in a folder, by its text without dots."""
     rest = str(path).removeprefix(f"{os.fspath(folder)}/")
     return rest != str(path) and not {"", ".", ".."} & set(rest.split("/"))

@@ -20,7 +20,7 @@ from ortho_pipeline.files.shell import converted
 
 #: Headers beyond this are not read.
 _MAX_HEADER = 5_000_000
-#: What a plain VRT consists of, attributes and elements alike, in lower case as GDAL compares them.
+#: Allowed attributes and elements of a plain VRT, in lower case, as GDAL compares them.
 _VRT_NAMES = frozenset(
     re.findall(
         r"\S+",
@@ -48,7 +48,7 @@ _VRT_TEXTS = frozenset(
         "description",
     }
 )
-#: What holds the text of a coordinate system in VRTs, side-cars of GDAL and of Esri, and DIMAP, in lower case.
+#: Elements with a coordinate system in VRTs, sidecars of GDAL and Esri, and DIMAP, in lower case.
 _CRS_NAMES = frozenset({"srs", "projection", "wkt", "horizontal_cs_code", "horizontal_cs_name"})
 _VRT_CLASSES = frozenset({"vrtdataset", "vrtrasterband", "vrtsourcedrasterband", "vrtrawrasterband"})
 
@@ -141,12 +141,12 @@ def _source(node: Any, path: Any, band: str) -> Named:
 
 
 def crs_texts(path: Any, kind: str) -> Iterator[str]:
-    """Yield the texts in a header or side-car that GDAL makes a coordinate system of while it opens the raster.
+    """Yield the texts in a header or sidecar that GDAL converts to a coordinate system while it opens the raster.
 
     Parameters
     ----------
     kind : str
-        A driver, or the ending of a side-car: those of XML, ``.prj`` and ``.hdr``; others yield nothing.
+        A driver, or the ending of a sidecar: those of XML, ``.prj`` and ``.hdr``; others yield nothing.
     """
     if kind == ".prj":
         yield _header(path)
@@ -197,7 +197,7 @@ def products_of_volume(path: Any) -> list[str]:
 
 
 def _inner(node: Any, name: str) -> list[Any]:
-    return [child for found, child in _parts(node) if found == name]
+    return [child for key, child in _parts(node) if key == name]
 
 
 def _names_of_ers(path: Any) -> Iterator[Named]:
@@ -233,7 +233,7 @@ def _names_of_isis3(path: Any) -> Iterator[Named]:
 
 
 def _names_of_pcidsk(path: Any) -> Iterator[Named]:
-    """Refuse a PCIDSK file whose channels lie in other files, which GDAL does not list; yield nothing."""
+    """Refuse a PCIDSK file with channels in other files, which GDAL does not list; yield nothing."""
     start = _beginning(path, 512)
     try:
         headers, count = (int(start[336:352]) - 1) * 512, int(start[376:384])

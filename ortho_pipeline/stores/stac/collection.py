@@ -1,4 +1,4 @@
-"""STAC collections: the items at a place, of an API that is asked for it, or of a static collection that names them."""
+"""STAC collections: the items at a place, from an API or from a static collection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ortho_pipeline.stores.stac.item import Item, item_of, read_item
 from ortho_pipeline.stores.stac.places import Box, any_meet, extent_boxes, questions
 
 _REMEDY = "give a STAC collection: its JSON file, or its address in an API (…/collections/NAME)"
-#: Items that are asked for at a time, and pages that are followed.
+#: Items of a page, and largest number of pages.
 _LIMIT, _PAGES = 100, 50
 #: Documents of a static collection that are read, and how many at a time; catalogs within each other.
 _MOST_DOCUMENTS, _AT_ONCE, _DEEPEST = 30_000, 16, 8
@@ -23,18 +23,18 @@ _FEWER = "give a smaller collection, or a FeatureCollection file of the items th
 
 
 class Collection:
-    """A collection that is read, or asked, for items at a place.
+    """A collection, static or of an API, with items at a place.
 
     Parameters
     ----------
     address : path or address
     roots : sequence of path
-        Folders on this machine that its files may lie in, besides its own.
+        Further folders on this machine in which its files may be.
 
     Raises
     ------
     InputError
-        If it is no collection.
+        If it is not a collection.
     """
 
     def __init__(self, address: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> None:
@@ -48,48 +48,48 @@ class Collection:
         Parameters
         ----------
         box : (west, south, east, north)
-            Degrees, of an API.
+            Degrees, for an API.
         name : str
-            What addresses of items contain, of a static collection, which says nothing of their places.
+            Part of the addresses of items, for a static collection, which does not state their positions.
         """
         yield from self._listed()
-        asked = next((link["href"] for link in self._links if link["rel"] == "items"), None)
-        if asked is not None:
-            yield from self._of_api(target(asked, self.address), box)
+        api = next((link["href"] for link in self._links if link["rel"] == "items"), None)
+        if api is not None:
+            yield from self._of_api(target(api, self.address), box)
             return
         for link in self._links:
             if link["rel"] == "item" and name in link["href"]:
                 yield read_item(target(link["href"], self.address), allow_network=self._allow_network)
 
     def under(self, boxes: Sequence[Box]) -> tuple[list[Item], list[str]]:
-        """Return the items that have a point in common with one of some boxes, and the documents that lead to them.
+        """Return the items that overlap one of some boxes, and the documents that lead to them.
 
-        An API is asked; the items of a static collection are all read, but for those in catalogs that say to lie
-        elsewhere. Items are in the order of their dates, then of their ids.
+        An API searches them. The items of a static collection are all read, except those in catalogs that state another
+        extent. Items are in the order of their dates, then of their ids.
 
         Raises
         ------
         InputError
-            If an item does not say where it lies, and where there are too many.
+            If an item does not state its position, or there are too many.
         """
         documents = [self.address]
-        asked = next((link["href"] for link in self._links if link["rel"] == "items"), None)
+        api = next((link["href"] for link in self._links if link["rel"] == "items"), None)
         items: Iterable[Item] = self._listed()
-        if asked is not None:
-            address = target(asked, self.address, self._roots)
+        if api is not None:
+            address = target(api, self.address, self._roots)
             items = [*items, *(item for box in questions(boxes) for item in self._of_api(address, box))]
         else:
             items = [*items, *self._below(boxes, documents)]
-        found = {}
+        by_place = {}
         for item in items:
             if not item.boxes:
                 raise InputError(
                     f"the item {item.id!r} does not state its position", file=item.address, field="bbox", remedy=_REMEDY
                 )
             if any_meet(item.boxes, boxes):
-                found[item.id, tuple(asset.href for asset in item.assets)] = item
-        documents += [item.address for item in found.values() if asked is None]
-        return sorted(found.values(), key=lambda item: (item.date, item.id)), list(dict.fromkeys(documents))
+                by_place[item.id, tuple(asset.href for asset in item.assets)] = item
+        documents += [item.address for item in by_place.values() if api is None]
+        return sorted(by_place.values(), key=lambda item: (item.date, item.id)), list(dict.fromkeys(documents))
 
     def _listed(self) -> Iterator[Item]:
         for feature in self._document.get("features") or ():
@@ -98,9 +98,9 @@ class Collection:
     def _below(self, boxes: Sequence[Box], documents: list[str]) -> Iterator[Item]:
         """Yield the items that links of a static collection and of catalogs below it lead to."""
         seen: set[str] = {Location(self.address).url}
-        wanted = self._named(self._links, self.address, seen)
+        places = self._named(self._links, self.address, seen)
         for _ in range(_DEEPEST):
-            if not wanted:
+            if not places:
                 return
             if len(seen) > _MOST_DOCUMENTS:
                 raise InputError(
@@ -108,30 +108,30 @@ class Collection:
                 )
             below = []
             with thread_pool(_AT_ONCE, "stac") as pool:
-                for place, read in zip(wanted, pool.map(self._read, wanted), strict=True):
+                for place, read in zip(places, pool.map(self._read, places), strict=True):
                     if isinstance(read, Item):
                         yield read
                     elif self._may_hold(read, place, boxes):
                         documents.append(place)
                         below += self._named(_links(read), place, seen)
-            wanted = below
-        if wanted:
+            places = below
+        if places:
             raise InputError(f"more than {_DEEPEST} nested catalogs", file=self.address, remedy=_FEWER)
 
     def _named(self, links: list[dict[str, Any]], base: str, seen: set[str]) -> list[str]:
-        """Return the places that links to items and catalogs name, of which none was seen before."""
-        named = [target(one["href"], base, self._roots) for one in links if one["rel"] in ("item", "child")]
+        """Return the targets of links to items and catalogs that are not yet known."""
+        named = [target(link["href"], base, self._roots) for link in links if link["rel"] in ("item", "child")]
         new = [place for place in dict.fromkeys(named) if place not in seen]
         seen.update(new)
         return new
 
     def _read(self, place: str) -> Item | dict[str, Any]:
-        """Return the item that lies at a place, or the catalog."""
+        """Return the item or the catalog at a place."""
         document = read_document(place, allow_network=self._allow_network)
         return item_of(document, place, self._roots) if document.get("type") == "Feature" else document
 
     def _may_hold(self, document: dict[str, Any], place: str, boxes: Sequence[Box]) -> bool:
-        """Tell whether a catalog below the collection may hold items in some boxes."""
+        """Return whether a catalog below the collection may have items in some boxes."""
         _require_collection(document, place)
         if document["type"] == "Collection" and self._document["type"] == "Catalog":
             raise InputError(
@@ -149,11 +149,11 @@ class Collection:
         for _ in range(_PAGES):
             if page is None:
                 return
-            found = read_document(page, allow_network=self._allow_network, paged=True)
-            _require_lists(found, page)
-            for feature in found.get("features") or ():
+            document = read_document(page, allow_network=self._allow_network, paged=True)
+            _require_lists(document, page)
+            for feature in document.get("features") or ():
                 yield item_of(_object(feature, page), page)
-            following = [link for link in _links(found) if link["rel"] == "next"]
+            following = [link for link in _links(document) if link["rel"] == "next"]
             ours = [link for link in following if str(link.get("method", "GET")).upper() == "GET"]
             if following and not ours:
                 raise InputError(
@@ -166,9 +166,9 @@ class Collection:
 @reads(_REMEDY)
 def read_collection(address: AnyPath, *, allow_network: bool = False) -> dict[str, Any]:
     """Return the document of a collection, or of a list of items."""
-    found = read_document(address, allow_network=allow_network)
-    _require_collection(found, address)
-    return found
+    document = read_document(address, allow_network=allow_network)
+    _require_collection(document, address)
+    return document
 
 
 def _require_collection(document: Mapping[str, Any], address: AnyPath) -> None:
@@ -194,5 +194,5 @@ def _is_link(link: object) -> bool:
 def _object(feature: Any, address: str) -> Mapping[str, Any]:
     if not isinstance(feature, dict):
         raise InputError("an item must be a JSON object", file=address, field="features", remedy=_REMEDY)
-    # An API leaves out of its answer what stands in it once.
+    # An API omits the version from each item of its answer.
     return {"stac_version": "1.0.0", **feature} if Location(address).is_address else feature

@@ -1,4 +1,4 @@
-"""STAC documents, wherever they lie, and what they say of other places."""
+"""STAC documents, local or remote, and their references to other places."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def read_document(address: AnyPath, *, allow_network: bool, paged: bool = False)
     text = Location(address).url
     if text.is_on_web:
         require_network(text, allow_network, paged=paged)
-        found = parse_json(_answer(text), text, REMEDY)
+        document = parse_json(_answer(text), text, REMEDY)
     elif text.is_address:
         folder, _, name = text.rpartition("/")
         try:
-            found = parse_json(Objects(folder, allow_network=allow_network).read(name, _MAX_BYTES)[0], text, REMEDY)
+            document = parse_json(Objects(folder, allow_network=allow_network).read(name, _MAX_BYTES)[0], text, REMEDY)
         except FileNotFoundError as error:
             raise InputError("there is no such object", file=text, remedy="check the address") from error
     else:
-        found = read_json(text, _MAX_BYTES, REMEDY)
-    if not isinstance(found, dict):
+        document = read_json(text, _MAX_BYTES, REMEDY)
+    if not isinstance(document, dict):
         raise InputError("this is not a JSON object", file=text, remedy=REMEDY)
-    return found
+    return document
 
 
 def _answer(url: str) -> bytes:

@@ -36,9 +36,9 @@ _SYSTEM_CHARS = 50_000
 
 @dataclass(frozen=True)
 class Asset:
-    """A file of an item: its key there, where it lies, its roles, its media type (empty where none is said).
+    """A file of an item: its key, address, roles, and media type (empty if not stated).
 
-    `systems` are the coordinate systems that the item says it to be in, as `geodesy.parse_crs` takes them.
+    `systems` are the coordinate systems that the item states, as `geodesy.parse_crs` reads them.
     """
 
     key: str
@@ -72,7 +72,7 @@ class Asset:
 
 @dataclass(frozen=True)
 class Item:
-    """A STAC item: its address, its id and its assets; the boxes it lies in, and its date (s since 1970; 0: none)."""
+    """A STAC item: its address, id and assets, its bounding boxes, and its date (s since 1970; 0: none)."""
 
     address: str
     id: str
@@ -118,35 +118,35 @@ class Item:
         InputError
             If there are several, and not one that has the name of the image.
         """
-        found = [asset for asset in self.assets if asset.is_rpc]
-        if len(found) > 1:
+        candidates = [asset for asset in self.assets if asset.is_rpc]
+        if len(candidates) > 1:
             stem = PurePosixPath(image.name).stem
-            named = [asset for asset in found if asset.name.startswith(stem)]
+            named = [asset for asset in candidates if asset.name.startswith(stem)]
             if len(named) != 1:
                 raise InputError(
-                    f"several assets could be the RPC of {image.key!r}: {self._keys(named or found)}",
+                    f"several assets could be the RPC of {image.key!r}: {self._keys(named or candidates)}",
                     file=self.address,
                     field="assets",
                     remedy=Text("choose one with ", Setting("scene.rpc"), ", or give the address of the image itself"),
                 )
-            found = named
-        if not found:
+            candidates = named
+        if not candidates:
             return None
-        beside = found[0].href.rpartition("/")[0] == image.href.rpartition("/")[0]
+        beside = candidates[0].href.rpartition("/")[0] == image.href.rpartition("/")[0]
         ours = {f"{PurePosixPath(image.name).stem}{end}".lower() for end in ("_rpc.txt", ".rpb", ".rpc")}
-        return None if beside and found[0].name.lower() in ours else found[0]
+        return None if beside and candidates[0].name.lower() in ours else candidates[0]
 
     def _chosen(self, key: str, groups: Iterable[list[Asset]], what: str) -> Asset:
         if key:
-            found = [asset for asset in self.assets if asset.key == key]
-            found = found or [asset for asset in self.assets if fnmatch.fnmatchcase(asset.key, key)]
-            if len(found) == 1:
-                return found[0]
+            assets = [asset for asset in self.assets if asset.key == key]
+            assets = assets or [asset for asset in self.assets if fnmatch.fnmatchcase(asset.key, key)]
+            if len(assets) == 1:
+                return assets[0]
             raise InputError(
-                f"{'several assets are' if found else 'there is no asset'} {key!r}",
+                f"{'several assets are' if assets else 'there is no asset'} {key!r}",
                 file=self.address,
                 field="assets",
-                remedy=f"one of {self._keys(found or None)}",
+                remedy=f"one of {self._keys(assets or None)}",
             )
         several: list[Asset] = []
         for group in groups:
@@ -179,19 +179,19 @@ def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPat
     ----------
     path : path or address
     roots : sequence of path
-        Folders on this machine that its assets may lie in, besides its own.
+        Further folders on this machine in which its assets may be.
 
     Raises
     ------
     InputError
-        If it is none, or names files elsewhere on this machine.
+        If it is not a STAC item, or names files elsewhere on this machine.
     """
     return item_of(read_document(path, allow_network=allow_network), path, roots)
 
 
 @reads(REMEDY)
 def item_at(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> Item | None:
-    """Read a STAC item as `read_item` does; None where a collection lies there."""
+    """Read a STAC item as `read_item` does; None if it is a collection."""
     document = read_document(path, allow_network=allow_network)
     return None if document.get("type") in COLLECTIONS else item_of(document, path, roots)
 
@@ -216,17 +216,17 @@ def item_of(document: Mapping[str, Any], address: AnyPath, roots: tuple[AnyPath,
         ),
         place,
     )
-    found = []
+    listed = []
     for key, asset in assets.items():
         if not isinstance(asset, dict) or not isinstance(asset.get("href"), str):
             raise InputError("this asset has no href", file=address, field=f"assets.{key[:60]}", remedy=REMEDY)
         roles = tuple(role for role in _list(asset.get("roles")) if isinstance(role, str))
         kind = asset.get("type") if isinstance(asset.get("type"), str) else ""
         systems = tuple(_systems(asset, document.get("properties")))
-        found.append(Asset(key, target(asset["href"], own, roots), roles, kind or "", systems))
+        listed.append(Asset(key, target(asset["href"], own, roots), roles, kind or "", systems))
     properties = document.get("properties")
     date = _date(properties) if isinstance(properties, dict) else 0.0
-    return Item(place, str(document.get("id", "")), tuple(found), boxes_of(document), date)
+    return Item(place, str(document.get("id", "")), tuple(listed), boxes_of(document), date)
 
 
 def _systems(*places: Any) -> Iterator[str]:
@@ -243,11 +243,11 @@ def _systems(*places: Any) -> Iterator[str]:
 
 
 def _date(properties: Mapping[str, Any]) -> float:
-    """Return the time of an item in seconds since 1970: the end of a span of time; 0 where it says none."""
+    """Return the time of an item in seconds since 1970: the end of its time range; 0 if it states none."""
     for name in ("datetime", "end_datetime", "start_datetime"):
         try:
-            given = datetime.fromisoformat(str(properties.get(name)))
-            return (given if given.tzinfo else given.replace(tzinfo=UTC)).timestamp()
+            time = datetime.fromisoformat(str(properties.get(name)))
+            return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
         except (ValueError, OverflowError):
             continue
     return 0.0

@@ -1,4 +1,4 @@
-"""Where STAC items lie: boxes of degrees, which may run over the antimeridian."""
+"""Positions of STAC items: boxes in degrees, which may cross the antimeridian."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def boxes_of(document: Mapping[str, Any]) -> tuple[Box, ...]:
     Polygons come first: items are cut at the antimeridian (RFC 7946), and their own box may then go round the world.
     """
     geometry = document.get("geometry")
-    found = tuple(_of_rings(geometry)) if isinstance(geometry, Mapping) else ()
+    boxes = tuple(_of_rings(geometry)) if isinstance(geometry, Mapping) else ()
     own = _box(document.get("bbox"))
-    return found or (() if own is None else (own,))
+    return boxes or (() if own is None else (own,))
 
 
 def extent_boxes(document: Mapping[str, Any]) -> tuple[Box, ...]:
@@ -28,24 +28,24 @@ def extent_boxes(document: Mapping[str, Any]) -> tuple[Box, ...]:
     place: Any = document.get("extent")
     for key in ("spatial", "bbox"):
         place = place.get(key) if isinstance(place, Mapping) else None
-    found = [_box(values) for values in place] if isinstance(place, list) else []
-    return tuple(box for box in found if box is not None) if None not in found else ()
+    boxes = [_box(values) for values in place] if isinstance(place, list) else []
+    return tuple(box for box in boxes if box is not None) if None not in boxes else ()
 
 
-def meet(one: Box, other: Box) -> bool:
-    """Tell whether two boxes have a point in common, whatever turn their longitudes are counted in."""
-    if one[1] > other[3] or other[1] > one[3]:
+def meet(first: Box, other: Box) -> bool:
+    """Return whether two boxes have a common point, also if longitudes differ by full turns."""
+    if first[1] > other[3] or other[1] > first[3]:
         return False
-    return any(one[0] + turn <= other[2] and other[0] <= one[2] + turn for turn in _TURNS)
+    return any(first[0] + turn <= other[2] and other[0] <= first[2] + turn for turn in _TURNS)
 
 
 def any_meet(some: Iterable[Box], others: Sequence[Box]) -> bool:
-    """Tell whether a box of some has a point in common with one of the others."""
-    return any(meet(one, other) for one in some for other in others)
+    """Return whether any box of `some` has a common point with any of `others`."""
+    return any(meet(box, other) for box in some for other in others)
 
 
 def questions(boxes: Iterable[Box]) -> list[Box]:
-    """Return the boxes that an API is asked for: one where several overlap, and two for one over the antimeridian."""
+    """Return the boxes for requests to an API: one for overlapping boxes, two for a box across the antimeridian."""
     joined: list[Box] = []
     for box in boxes:
         whole = box
@@ -57,8 +57,8 @@ def questions(boxes: Iterable[Box]) -> list[Box]:
     return [half for box in joined for half in _halves(box)]
 
 
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] <= other[2] and other[0] <= one[2] and one[1] <= other[3] and other[1] <= one[3]
+def _overlap(first: Box, other: Box) -> bool:
+    return first[0] <= other[2] and other[0] <= first[2] and first[1] <= other[3] and other[1] <= first[3]
 
 
 def _halves(box: Box) -> Iterator[Box]:
@@ -90,15 +90,15 @@ def _of_rings(geometry: Mapping[str, Any]) -> Iterator[Box]:
     polygons = shapes.get(str(geometry.get("type")))
     if not isinstance(polygons, list) or len(polygons) > _MOST_RINGS:
         return
-    found = []
+    boxes = []
     for polygon in polygons:
         ring = polygon[0] if isinstance(polygon, list) and polygon else None
         places = [place[:2] for place in ring if isinstance(place, list)] if isinstance(ring, list) else []
         if not places or len(places) != len(ring or ()) or not all(map(_is_place, places)):
             return
         lon, lat = [place[0] for place in places], [place[1] for place in places]
-        found.append((float(min(lon)), float(min(lat)), float(max(lon)), float(max(lat))))
-    yield from found
+        boxes.append((float(min(lon)), float(min(lat)), float(max(lon)), float(max(lat))))
+    yield from boxes
 
 
 def _is_place(place: list[Any]) -> bool:

@@ -41,7 +41,7 @@ class SeaCell:
 
     @property
     def unit(self) -> str:
-        """Metres, which the files do not say either."""
+        """Metres; the files do not state it."""
         return ""
 
     @property
@@ -50,7 +50,7 @@ class SeaCell:
         return ()
 
     def place(self) -> tuple[pyproj.CRS, SampleGrid]:
-        """Return the CRS and where the samples lie."""
+        """Return the CRS and the grid of the samples."""
         return crs_of_cells()[0], self.cell.grid
 
     def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> Array:
@@ -74,18 +74,18 @@ def open_cells(
     Parameters
     ----------
     vertical : Vertical or str, optional
-        A geoid grid file of EGM2008, where that of PROJ is not installed; another datum only with `override`.
+        A geoid grid file of EGM2008, if PROJ's is not installed; another datum only with `override`.
     fill : 'error', 'mask', 'nearest' or float
-        As for `open_dem`; with anything but 'error', land whose cell is missing is a void.
+        As for `open_dem`. Except with 'error', land without a cell is a void.
 
     Raises
     ------
     CoverageError
         If land under the extents has no cell, or it is unknown whether there is land.
     DatumError
-        If a cell says to be above another datum than EGM2008, or the geoid grid is not installed.
+        If a cell states another datum than EGM2008, or the geoid grid is not installed.
     InputError
-        If a cell is not what its name says.
+        If the content of a cell does not match its name.
     """
     extents = list(extents)
     wanted = _ordered(cell for extent in extents for cell in extent.cells())
@@ -106,10 +106,10 @@ def open_cells(
             field="surface.dem",
             remedy="give a DEM of this place",
         )
-    mosaic = laid_out(source.address, sorted(placed, key=lambda one: one[0].path))
-    made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
+    mosaic = laid_out(source.address, sorted(placed, key=lambda part: part[0].path))
+    surface = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
     cells = {"cells": [cell.name for cell in sorted(there)], "sea_cells": [cell.name for cell in sorted(sea)]}
-    return replace(made, record={**made.record, **cells})
+    return replace(surface, record={**surface.record, **cells})
 
 
 def _ordered(cells: Iterable[Cell]) -> list[Cell]:
@@ -117,7 +117,7 @@ def _ordered(cells: Iterable[Cell]) -> list[Cell]:
 
 
 def _file_of(cell: Cell, path: str) -> tuple[Samples, pyproj.CRS, SampleGrid, str]:
-    """Return the file of a cell, where it lies, and its unit; its heights are above EGM2008, which it need not say."""
+    """Return the file of a cell, its grid and its unit; its heights are above EGM2008, which it need not state."""
     access: dict[str, Any] = {}
     file = DemFile(path, access)
     crs, grid = file.place()

@@ -1,4 +1,4 @@
-"""The DEM that the items of a STAC collection make at a place: which count where several lie, and its datum."""
+"""A DEM from the items of a STAC collection: which item is used where several overlap, and its height datum."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ def open_collected(
 ) -> DemSurface:
     """Return the items of a collection under some extents as a DEM.
 
-    Where several have a height, that of the finest columns counts, of them the one with the latest date.
+    Where several have a height, the one with the finest columns is used, then the one with the latest date.
 
     Parameters
     ----------
     address : path or address
-        With the key of the asset, or a pattern of it, after a ``#``, where its role does not tell.
+        With the key of the asset, or a pattern of it, after a ``#``, if its role does not identify it.
     vertical, override, fill, memory
         As for `open_dem`.
     access : mapping
@@ -61,11 +61,11 @@ def open_collected(
     Raises
     ------
     CoverageError
-        If no item lies there.
+        If no item covers the extents.
     DatumError
-        If the items state different height datums, or none is stated.
+        If the items state different height datums, or no datum.
     InputError
-        If it is no collection, an item has no raster of heights, or there are too many items.
+        If it is not a collection, an item has no raster of heights, or there are too many items.
     """
     access = access or {}
     network, roots = bool(access.get("allow_network")), tuple(access.get("roots", ()))
@@ -87,19 +87,19 @@ def open_collected(
         mosaic = laid_out(name, [placed for placed, _ in opened])
     except (CrsError, DatumError) as error:
         raise type(error)(error.message, file=error.file, field=error.field, remedy=_CHOOSE) from error
-    made = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
+    surface = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
     ids = {placed[0].path: item.id for item, (placed, _) in zip(items, opened, strict=True)}
-    found = {
-        "warnings": [*made.record["warnings"], *_same_ground(mosaic, ids)],
+    details = {
+        "warnings": [*surface.record["warnings"], *_same_ground(mosaic, ids)],
         "items": [item.id for item in items],
         "documents": documents,
-        "declared_in": None if made.record["declared_vertical"] is None else ("items" if opened[0][1] else "files"),
+        "declared_in": None if surface.record["declared_vertical"] is None else ("items" if opened[0][1] else "files"),
     }
-    return replace(made, record={**made.record, **found})
+    return replace(surface, record={**surface.record, **details})
 
 
 def _placed(asset: Asset, access: Mapping[str, Any], override: bool) -> tuple[Placed, bool]:
-    """Return the file of an asset, where it lies and its unit; and whether its datum is what the item says of it."""
+    """Return the file of an asset, its grid and its unit; and whether its datum comes from the item."""
     file = DemFile(asset.href, access)
     crs, grid = file.place()
     unit = file.unit
@@ -173,8 +173,8 @@ def _neighbours(places: Sequence[tuple[Any, ...]]) -> Iterable[tuple[Any, Any]]:
             yield places[min(index, other)], places[max(index, other)]
 
 
-def _shared(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
-    wide = min(one[3], other[3]) - max(one[1], other[1])
-    high = min(one[4], other[4]) - max(one[2], other[2])
-    least = min((place[3] - place[1]) * (place[4] - place[2]) for place in (one, other))
+def _shared(first: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    wide = min(first[3], other[3]) - max(first[1], other[1])
+    high = min(first[4], other[4]) - max(first[2], other[2])
+    least = min((place[3] - place[1]) * (place[4] - place[2]) for place in (first, other))
     return wide > 0 and high > 0 and wide * high > _SAME_GROUND * least

@@ -1,8 +1,8 @@
-"""The cells of the Copernicus DEM GLO-30: their names, where their samples lie, and which lie under a scene.
+"""The cells of the Copernicus DEM GLO-30: their names, their samples, and which cells are under a scene.
 
-A cell is a degree wide and high. Its first sample lies on its north-west corner; the row on its south and the column on
-its east side belong to its neighbours, so that cells are laid side by side. Heights are metres above EGM2008. Source:
-the description of the public bucket (``readme.html`` in it), and the product handbook of the Copernicus DEM.
+A cell is a degree wide and high. Its first sample is on its north-west corner. The row on its south side and the column
+on its east side belong to its neighbours, so cells fit side by side. Heights are metres above EGM2008. Source: the
+description of the public bucket (``readme.html`` in it), and the product handbook of the Copernicus DEM.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from ortho_pipeline.geodesy.crs import horizontal, parse_crs
 from ortho_pipeline.surface.base import Array
 from ortho_pipeline.surface.dem_file import SampleGrid
 
-#: Where the cells are, unless the user says otherwise.
+#: Default address of the cells.
 PUBLIC = "https://copernicus-dem-30m.s3.amazonaws.com"
 #: The worldwide DEM of 90 m, which has a cell wherever there is land: GLO-30 has not, by decision of its owners.
 PUBLIC_LAND = "https://copernicus-dem-90m.s3.amazonaws.com"
-#: The file beside the cells that lists them all, one name a line.
+#: File beside the cells that lists all of them, one name in each line.
 LIST = "tileList.txt"
 _CRS = "EPSG:4326+3855"
 #: Samples from one degree of latitude to the next.
 ROWS = 3600
-#: From these degrees of latitude on towards a pole, so many columns from one degree of longitude to the next.
+#: Columns per degree of longitude, from these degrees of latitude to the next.
 _COLUMNS = ((85, 360), (80, 720), (70, 1200), (60, 1800), (50, 2400), (0, 3600))
 #: Samples around a scene that interpolation may want.
 _MARGIN = 12
-#: Control may move a scene by so many metres from where its model places it.
+#: Largest shift (m) of a scene by control points.
 _DRIFT = 2_000.0
 _METRES_PER_DEGREE = 111_000.0
 #: No cell is larger (bytes); the largest are about 50 MB.
@@ -48,7 +48,7 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name of its file in the bucket, without ``.tif``; the folder that it lies in is called so too."""
+        """The name of its file in the bucket, without ``.tif``; also the name of its folder."""
         return (
             f"Copernicus_DSM_COG_10_{'S' if self.lat < 0 else 'N'}{abs(self.lat):02}_00_"
             f"{'W' if self.lon < 0 else 'E'}{abs(self.lon):03}_00_DEM"
@@ -61,14 +61,14 @@ class Cell(NamedTuple):
 
     @property
     def grid(self) -> SampleGrid:
-        """Where its samples lie."""
+        """The grid of its samples."""
         columns = self.columns
         place = (float(self.lon), 1.0 / columns, 0.0, self.lat + 1.0, 0.0, -1.0 / ROWS)
         return SampleGrid(crs_of_cells()[1], (ROWS, columns), place)
 
     @property
     def withheld(self) -> bool:
-        """Whether it may be land of Armenia or Azerbaijan, which the public DEM of 30 m leaves out without a word."""
+        """Whether it may be land of Armenia or Azerbaijan, which the public DEM of 30 m silently omits."""
         return 43 <= self.lon <= 50 and 38 <= self.lat <= 41
 
 
@@ -80,18 +80,18 @@ def crs_of_cells() -> tuple[pyproj.CRS, pyproj.CRS]:
 
 
 def columns_at(lat: int) -> int:
-    """Return how many columns a cell has whose south side lies at this latitude: fewer towards the poles."""
+    """Return the number of columns of a cell, from the latitude of its south side; fewer towards the poles."""
     towards_equator = lat if lat >= 0 else -lat - 1
     return next(columns for start, columns in _COLUMNS if towards_equator >= start)
 
 
 def cells_of_list(text: str) -> frozenset[Cell]:
     """Return the cells that a list names, one a line, by their names in the DEM of 30 m or of 90 m."""
-    found = []
+    cells = []
     for match in _NAME.finditer(text):
         lat, lon = int(match[3]), int(match[5])
-        found.append(Cell(-lon if match[4] == "W" else lon, -lat if match[2] == "S" else lat))
-    return frozenset(found)
+        cells.append(Cell(-lon if match[4] == "W" else lon, -lat if match[2] == "S" else lat))
+    return frozenset(cells)
 
 
 class Extent(NamedTuple):

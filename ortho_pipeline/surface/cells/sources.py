@@ -20,10 +20,10 @@ from ortho_pipeline.stores.stac.collection import Collection
 from ortho_pipeline.surface.cells.copernicus import LARGEST, LIST, PUBLIC, PUBLIC_LAND, Cell, cells_of_list
 from ortho_pipeline.surface.dem_file import Affine
 
-#: Environment variable: where cells come from, if no option says it.
+#: Environment variable with the source of cells, if no option states it.
 VARIABLE = "ORTHO_DEM_SOURCE"
 _LIST_BYTES = 20_000_000
-#: Part of a sample by which a file may lie off the grid of its cell.
+#: Largest offset of a file from the grid of its cell, in parts of a sample.
 _OFF_GRID = 0.01
 #: Cells that are fetched at a time.
 _AT_ONCE = 4
@@ -43,7 +43,7 @@ class Source(ABC):
         """Return all existing cells: every other one is sea. None if that is unknown."""
 
 
-def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
+def source_of(chosen: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
     """Return the source that is given, that of the environment variable, or the public bucket.
 
     Raises
@@ -51,7 +51,7 @@ def source_of(given: str | os.PathLike[str] | None, *, allow_network: bool) -> S
     InputError
         If there is no such folder, or the network is not allowed.
     """
-    text = os.fspath(given or os.environ.get(VARIABLE) or PUBLIC)
+    text = os.fspath(chosen or os.environ.get(VARIABLE) or PUBLIC)
     if Location(text).is_collection:
         return _Catalogue(text, allow_network)
     if Location(text).is_address:
@@ -120,7 +120,7 @@ class _Bucket(Source):
 
 
 class _Catalogue(Source):
-    """A STAC collection, whose assets are told by the names that cells have in the public bucket."""
+    """A STAC collection; its assets have the names of cells in the public bucket."""
 
     def __init__(self, address: str, allow_network: bool) -> None:
         self._collection = Collection(address, allow_network=allow_network)
@@ -133,7 +133,7 @@ class _Catalogue(Source):
             return dict(zip(there, pool.map(self._kept, there, [found[cell] for cell in there]), strict=True))
 
     def land(self) -> frozenset[Cell] | None:
-        # A collection may hold some cells only, and says nothing of the others: the list of the public bucket does.
+        # A collection may have only some cells; the list of the public bucket tells which others exist.
         if not Location(self.address).is_address:
             return None
         try:
@@ -186,7 +186,7 @@ def fault_of(cell: Cell, path: Path | str) -> str:
 
 
 def misplaced(cell: Cell, shape: tuple[int, int], place: Affine) -> str:
-    """Return how the samples of a file do not lie where those of a cell do; empty if they do."""
+    """Return how the samples of a file differ from the grid of a cell; empty if they do not."""
     if shape != cell.grid.shape:
         rows, columns = cell.grid.shape
         return f"it has {shape[1]} x {shape[0]} samples instead of {columns} x {rows}"

@@ -1,4 +1,4 @@
-"""Compiled rendering of chips: where the pixels of one image fall in another one, and what is there."""
+"""Compiled rendering of chips: positions of the pixels of one image in another one, and the intensities there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ortho_pipeline.runtime.compiled import compiled
 
-#: Pixels in a row that a value is interpolated from, and how many of them stand before the one at or before its place.
+#: Number of pixels in a row for an interpolation, and how many of them are before the pixel at or before the position.
 TAPS = 8
 BEFORE = TAPS // 2 - 1
 #: One over the product of the distances of each of these pixels from the others.
@@ -17,7 +17,7 @@ _SCALES = np.array([1.0 / math.prod(k - j for j in range(TAPS) if j != k) for k 
 
 @compiled
 def positions(curves, met, out):
-    """Fill `out` ``(rows, columns, 2)`` with the target's coordinates of a chip's pixels; NaN where nothing is seen.
+    """Fill `out` ``(rows, columns, 2)`` with the target coordinates of a chip's pixels; NaN where there is no ground.
 
     `curves` ``(20, rows columns)`` are polynomials in normalised height of the DEM's sample coordinates (u, v) and of
     the target's (column, row), `met` ``(rows columns,)`` the heights at which the rays of the pixels meet the terrain.
@@ -65,8 +65,8 @@ def extent(places, out):
 def sample(pixels, left, top, factor, places, out):
     """Fill `out` ``(rows, columns)`` with intensities at `places` ``(rows, columns, 2)``, interpolated by `weights_at`.
 
-    `pixels` are means of `factor` x `factor` pixels of the target from the pixel (`left`, `top`) on. NaN beside what
-    is not valid: an interpolation from fewer pixels would move an edge.
+    `pixels` are means of `factor` x `factor` pixels of the target from the pixel (`left`, `top`). NaN next to invalid
+    pixels: an interpolation from fewer pixels would move an edge.
     """
     height, width = pixels.shape
     wx, wy, slopes = np.empty(TAPS), np.empty(TAPS), np.empty(TAPS)
@@ -93,8 +93,8 @@ def sample(pixels, left, top, factor, places, out):
 def weights_at(f, weights, slopes):
     """Fill the weights, and their derivatives, of the polynomial through `TAPS` pixels, at the fraction `f` of a pixel.
 
-    Cubic convolution moves waves of 4 px by up to 0.045 px towards the nearest whole pixel, and shifts that are
-    measured with it are wrong by 0.02 px. This moves such waves by 0.004 px.
+    Cubic convolution moves waves of 4 px by up to 0.045 px towards the nearest whole pixel, so shifts measured with it
+    have an error of 0.02 px. This polynomial moves such waves by 0.004 px.
     """
     product, change = 1.0, 0.0
     for k in range(TAPS):

@@ -10,11 +10,11 @@ from ortho_pipeline.runtime.compiled import compiled
 
 @compiled
 def shifts(scene, target, start, offset, rim, limits, shift, covariance, correlation):
-    """Fill `shift` ``(n, 2)``, `covariance` ``(n, 2, 2)`` and `correlation` ``(n,)``; NaN where none was found.
+    """Fill `shift` ``(n, 2)``, `covariance` ``(n, 2, 2)`` and `correlation` ``(n,)``; NaN without a result.
 
     `scene` ``(n, c, s, s)`` and `target` ``(n, c, s + 2r, s + 2r)`` are layers of chips, NaN where not valid. With
-    `offset` there is a gain of either sign and an offset between them, else a positive gain. `limits` are the number of
-    steps, the length of the last one, and how far a shift may lie from the start.
+    `offset` they differ by an offset and a gain of either sign, else by a positive gain. `limits` are the number of
+    steps, the length of the last one, and the largest distance of a shift from the start.
     """
     count, layers, size, _ = scene.shape
     inner = size - 2 * rim
@@ -54,10 +54,10 @@ def shifts(scene, target, start, offset, rim, limits, shift, covariance, correla
 
 @compiled
 def _step(chip, own, moved, slopes, seen, offset, found):
-    """Fill one step of the shift, its covariance (xx, yy, xy) and the correlation; False where there is none.
+    """Fill one step of the shift, its covariance (xx, yy, xy) and the correlation; return False without a result.
 
-    `own` and `slopes` are the derivatives of the scene's chip and of the target's: the normal equations are those of
-    the first, and the second tell how their right-hand side changes with the shift.
+    `own` and `slopes` are the derivatives of the scene's chip and of the target's. The normal equations use the first;
+    the second give the change of their right-hand side with the shift.
     """
     number, a_mean, b_mean, x_mean, y_mean = 0, 0.0, 0.0, 0.0, 0.0
     for m in range(chip.shape[0]):
@@ -69,7 +69,7 @@ def _step(chip, own, moved, slopes, seen, offset, found):
                     b_mean += moved[m, i, j]
                     x_mean += own[0, m, i, j]
                     y_mean += own[1, m, i, j]
-    # The offset is an unknown as well: what the gradients have in common is its.
+    # The offset is also an unknown, so subtract the means.
     share = 1.0 / number if offset else 0.0
     a_mean, b_mean, x_mean, y_mean = a_mean * share, b_mean * share, x_mean * share, y_mean * share
     aa, bb, ab, xa, ya, xb, yb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -90,7 +90,7 @@ def _step(chip, own, moved, slopes, seen, offset, found):
     gain = ab / bb
     xu, xv, yu, yv = gain * xu, gain * xv, gain * yu, gain * yv
     determinant = xu * yv - xv * yu
-    # Where the likeness has its best place both are positive.
+    # Both are positive at the maximum of the correlation.
     if not (xu + yv > 0.0 and determinant > 1e-9 * (xu + yv) ** 2):
         return False
     xr, yr = xa - gain * xb, ya - gain * yb
@@ -105,7 +105,7 @@ def _step(chip, own, moved, slopes, seen, offset, found):
 
 @compiled
 def _inner(scene, rim, chip, own, whole):
-    """Fill the inner part of a chip, its derivatives (columns, rows), and where all of its layers have both."""
+    """Fill the inner part of a chip, its derivatives (columns, rows), and where all of its layers have both values."""
     layers, inner = chip.shape[0], chip.shape[1]
     for i in range(inner):
         for j in range(inner):
@@ -123,7 +123,7 @@ def _inner(scene, rim, chip, own, whole):
 def _moved(target, left, top, weights, derived, whole, lines, moved, slopes, seen):
     """Fill values and derivatives (columns, rows) of a target at a shift, and where they are valid; return how many.
 
-    `lines` ``(2, inner + TAPS - 1, inner)`` is room for what is interpolated along rows alone.
+    `lines` ``(2, inner + TAPS - 1, inner)`` is workspace for the interpolation along rows.
     """
     layers, inner = moved.shape[0], moved.shape[1]
     seen[:, :] = whole
