@@ -112,10 +112,7 @@ def _described(thing: Any) -> list[str]:
     found = [_prose(pieces[0])]
     for heading, body in zip(pieces[1::2], pieces[2::2], strict=True):
         found.append(f"**{heading}**")
-        if heading == "Examples":
-            found.append(f"```python\n{body.strip()}\n```")
-            continue
-        if heading == "Notes":
+        if heading in ("Examples", "Notes"):
             found.append(_prose(body))
             continue
         # After the entries prose may go on: a line at the margin that is no name with a type.
@@ -138,8 +135,9 @@ def _entries(body: str, heading: str) -> tuple[str, str]:
 
 
 def _prose(text: str) -> str:
-    """Return text as Markdown: double backticks are single ones, indented lines are code."""
-    return re.sub(r"``([^`]+)``", r"`\1`", text.strip())
+    """Return text as Markdown: double backticks are single ones, indented lines and examples are code."""
+    text = re.sub(r"^>>> (?:.+\n?)+", lambda found: f"```python\n{found[0].strip()}\n```\n", text, flags=re.MULTILINE)
+    return re.sub(r"(?<!`)``([^`]+)``(?!`)", r"`\1`", text.strip())
 
 
 def _plain(text: str) -> str:

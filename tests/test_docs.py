@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import doctest
-import importlib
 import inspect
 import os
 import re
@@ -34,20 +33,6 @@ WITH_PYTHON = [
 def test_python_examples(page, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     done = doctest.testfile(str(page), module_relative=False, globs={"out": tmp_path}, optionflags=OPTIONS)
-    assert done.attempted
-    assert not done.failed
-
-
-def with_examples() -> list[str]:
-    """Return the modules of the package whose docstrings have examples."""
-    paths = [path.relative_to(ROOT) for path in (ROOT / "ortho_pipeline").rglob("*.py") if ">>> " in path.read_text()]
-    return sorted(".".join(path.with_suffix("").parts) for path in paths)
-
-
-@pytest.mark.parametrize("module", with_examples())
-def test_examples_in_docstrings(module, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    done = doctest.testmod(importlib.import_module(module), optionflags=OPTIONS)
     assert done.attempted
     assert not done.failed
 

@@ -26,12 +26,17 @@ PUBLIC = {name: getattr(op if name in op._HOMES else plugin, name) for name in s
 WITHOUT = {
     "Array": "a type of NumPy",
     "ECCENTRICITY_SQUARED": "a number",
+    "Fit": "`fit` returns it",
     "GEOGRAPHIC": "a text",
     "KINDS": "a table of classes",
     "LOOKS_PAST": "a notice",
     "SEMI_MAJOR": "a number",
+    "Pushbroom": "`pushbroom_of_tables` returns it",
     "TOPOCENTRIC": "a text",
     "hookimpl": "an object of pluggy; docs/plugins.md shows it",
+    # Decorators of click, in the command that docs/plugins.md builds.
+    **dict.fromkeys(("folder_option", "image_argument", "images_argument", "json_option"), "a decorator of click"),
+    **{f"{group}_options": "a decorator of click" for group in ("match", "output", "point", "scene", "surface")},
 }
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")

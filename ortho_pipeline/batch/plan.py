@@ -19,6 +19,7 @@ from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
 from ortho_pipeline.commands.stac.given import heights_given, resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import Location, VsiPath, located, place
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.options import (
     MatchOptions,
     MosaicOptions,
@@ -126,7 +127,7 @@ class Plan:
                     f"there is no scene {name!r}",
                     file=self.path,
                     field="only",
-                    remedy="see the names with 'ortho run FILE --list'",
+                    remedy=f"see the names with `ortho run {typed(self.path)} --list`",
                 )
         jobs = tuple(known[name] for name in dict.fromkeys(only)) if only else self.jobs
         if shard is None:

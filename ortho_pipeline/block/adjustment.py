@@ -191,10 +191,10 @@ def _refuse_many_outside(solved: Solved, whole: Selection) -> None:
         low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
         raise DegeneratePoints(
             f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their models "
-            f"(heights {low:.0f} to {high:.0f} m): without control the heights are as right as the images lie to each "
-            "other, and that is not enough here",
+            f"(heights {low:.0f} to {high:.0f} m). Without control points, heights depend on the models of the images, "
+            "which are not accurate enough here",
             file=problem.points.source or None,
-            remedy="give control points: one that is seen in two images says how high the block lies",
+            remedy="give control points: one that is measured in two images gives the height of the block",
         )
 
 

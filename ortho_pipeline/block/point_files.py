@@ -25,7 +25,7 @@ from ortho_pipeline.points.image_errors import (
 from ortho_pipeline.points.rows import OF_GROUND, PointRow, Table, origin_shift
 
 
-@reads("see docs/formats.md for what stands in a file of points")
+@reads("see docs/formats.md for the columns of a file of points")
 def read_block_points(
     path: str | os.PathLike[str],
     *,

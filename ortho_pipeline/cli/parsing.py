@@ -32,17 +32,17 @@ HINTS: Mapping[str, str] = {
     "-s_srs": "leave it out; the sensor model gives the position of the image",
     "-rpc": "leave it out; the RPC of the image is used by default, and '--rpc FILE' chooses another",
     "-tps": "use '--fit-model NAME' to fit a model to points ('ortho models' lists them)",
-    "-order": "use '--fit-model poly2d2' for a polynomial of second order ('ortho models' lists all)",
-    "-geoloc": "geolocation arrays are not read; 'ortho sensors' lists the supported products",
+    "-order": "use '--fit-model poly2' for a polynomial of second order ('ortho models' lists all)",
+    "-geoloc": "use '--sensor geolocation' for an image with geolocation arrays ('ortho sensors' lists all)",
     "-to": "use '--dem FILE' and '--dem-vertical DATUM' for RPC_DEM, '--height M' for RPC_HEIGHT",
     "-et": "use '--tolerance PX' to limit the geometric error",
     "-ts": "use '-tr X Y' for the pixel size and '-te' for the extent",
     "-multi": "leave it out; all processors are used by default, and '--threads N' limits them",
     "-wo": "use '--threads N' and '--memory MB'",
-    "-srcnodata": "set it in the image: gdal_translate -a_nodata VALUE",
+    "-srcnodata": "set it in the image: `gdal_translate -a_nodata VALUE IN OUT`",
     "-dstalpha": "leave it out; nodata, a mask or the image's own alpha band marks the valid pixels",
-    "-cutline": "cut the finished ortho: gdalwarp -cutline",
-    "-crop_to_cutline": "cut the finished ortho: gdalwarp -cutline",
+    "-cutline": "cut the finished ortho: `gdalwarp -cutline AREA ORTHO OUT`",
+    "-crop_to_cutline": "cut the finished ortho: `gdalwarp -cutline AREA -crop_to_cutline ORTHO OUT`",
     "-ovr": "leave it out; pixels are always read at full resolution; for a coarser ortho use '-r average'",
 }
 
@@ -54,6 +54,15 @@ class Command(click.Command):
     ----------
     one : str, optional
         Hint of the error for several files, if the command takes one.
+
+    Examples
+    --------
+    >>> import click
+    >>> @click.command(cls=Command)
+    ... def coverage() -> None:
+    ...     click.echo("83 %")
+    >>> sorted(option.name for option in coverage.params)
+    ['debug', 'quiet', 'verbose']
     """
 
     def __init__(self, *given: Any, one: str | None = None, **named: Any) -> None:
@@ -112,7 +121,13 @@ class Command(click.Command):
 
 
 class Group(click.Group):
-    """A group whose commands are of that kind, with their examples in their help."""
+    """A group whose commands are of that kind, with their examples in their help.
+
+    Examples
+    --------
+    >>> Group("dem", commands={"check": Command("check")}).list_commands(None)
+    ['check']
+    """
 
     command_class = Command
 

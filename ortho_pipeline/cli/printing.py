@@ -30,12 +30,25 @@ _PRINTED, _WORST = 60, 20
 
 
 def print_json(document: Any) -> None:
-    """Print a document for programs."""
+    """Print a document for programs.
+
+    Examples
+    --------
+    >>> print_json({"count": 2})
+    {
+     "count": 2
+    }
+    """
     click.echo(printable_json(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)))
 
 
 def print_warnings(warnings: Any) -> None:
-    """Print warnings on stderr."""
+    """Print warnings on stderr.
+
+    Examples
+    --------
+    >>> print_warnings(["the DEM covers 83 % of the scene"])
+    """
     for warning in warnings:
         say(f"Warning: {as_typed(warning)}", err=True)
 

@@ -163,7 +163,7 @@ def _refuse_options_of_fit(points: PointOptions) -> None:
         raise InputError(
             "ortho compare always fits all parameters of a model",
             field="points.params" if points.params else "points.prune",
-            remedy="use ortho fit",
+            remedy="use `ortho fit`",
         )
 
 

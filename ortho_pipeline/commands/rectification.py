@@ -95,6 +95,13 @@ def rectify(
     InputError
         If an input or an option is wrong: no heights, a DEM that does not cover the scene, a file that is both input
         and output, or an old sidecar that would attach to the ortho.
+
+    Examples
+    --------
+    >>> flat, coarse = op.SurfaceOptions(height=900.0), op.OutputOptions(resolution=50.0)
+    >>> done = op.rectify("sample_data/scene.tif", out, surface=flat, output=coarse)
+    >>> done.files["ortho"].name
+    'scene_ortho.tif'
     """
     assert isinstance(points, PointOptions), "with_items makes options of points"
     stem, before, stage = Path(image).stem, bytes_read(), progress or _unwatched

@@ -23,6 +23,11 @@ class Setting:
         The value, or a word in its place (FILE).
     key : str, optional
         Of an option that holds several: which of them.
+
+    Examples
+    --------
+    >>> str(Setting("surface.dem", "FILE"))
+    '`surface.dem=FILE`'
     """
 
     name: str
@@ -45,6 +50,11 @@ class Text(str):
     """A text for people that knows the options in it, made of strings, other texts and settings.
 
     A string for all that need no more, also in JSON.
+
+    Examples
+    --------
+    >>> Text("give ", Setting("surface.dem", "FILE"), " too")
+    'give `surface.dem=FILE` too'
     """
 
     __slots__ = ("parts",)
@@ -83,5 +93,10 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
     ----------
     plural : str, optional
         Where it is not formed with an s, or a verb follows: ``counted(n, "point does", "points do")``.
+
+    Examples
+    --------
+    >>> counted(1, "point"), counted(2, "point")
+    ('1 point', '2 points')
     """
     return f"{number} {what if number == 1 else plural or f'{what}s'}"

@@ -290,12 +290,23 @@ def fit(
     exclude : mapping of id to reason, optional
         Control points to leave out.
 
+    Returns
+    -------
+    Fit
+        The adjusted model with its covariance, residuals of all points, tests and warnings.
+
     Raises
     ------
     TooFewPoints, DegeneratePoints
         If the points do not determine the parameters, or too many contradict the others.
     InputError
         If the model projects no point.
+
+    Examples
+    --------
+    >>> model, points = op.read_rpc("sample_data/scene_RPC.TXT"), op.read_points("sample_data/gcps.geojson")
+    >>> op.fit(op.ImageCorrection.identity(model, "shift", (500, 500)), points).values.round(2).tolist()
+    [6.31, -4.14]
     """
     if not isinstance(model, SensorModel):
         raise InputError(

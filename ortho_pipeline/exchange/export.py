@@ -69,6 +69,12 @@ class Export:
         The user accepts a file that differs from the model by more than 0.1 px.
     document : dict
         Facts about the files as JSON values; the host writes it.
+
+    Examples
+    --------
+    >>> points, image = op.read_points("sample_data/gcps.geojson"), open_dataset("sample_data/scene.tif")
+    >>> Export(image, op.open_scene("sample_data/scene.tif").model, (1000, 1000), None, points).rpc.exact
+    True
     """
 
     dataset: gdal.Dataset

@@ -149,6 +149,12 @@ def save_model(
     ------
     PluginError
         If the kind of the model is not registered, so that the file could not be read again.
+
+    Examples
+    --------
+    >>> op.save_model(op.read_rpc("sample_data/scene_RPC.TXT"), out / "scene_model.json")
+    >>> op.load_model(out / "scene_model.json").kind
+    'rpc'
     """
     write_model_file(SavedModel(model, provenance={} if adjustment is None else {"adjustment": dict(adjustment)}), path)
 

@@ -78,7 +78,13 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
 
 
 def has_rpc(dataset: gdal.Dataset) -> bool:
-    """Return whether GDAL finds an RPC for this dataset, in it or beside it, readable or not."""
+    """Return whether GDAL finds an RPC for this dataset, in it or beside it, readable or not.
+
+    Examples
+    --------
+    >>> has_rpc(open_dataset("sample_data/scene.tif")), has_rpc(open_dataset("sample_data/dem.tif"))
+    (True, False)
+    """
     try:
         _refuse_unread_sidecar(dataset)
         return bool(dataset.GetMetadata("RPC"))
@@ -100,6 +106,12 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     ------
     InputError
         If there is no RPC, it is damaged or unreadable, the chosen one is missing, or tag and sidecar disagree.
+
+    Examples
+    --------
+    >>> model, source = rpc_of_dataset(open_dataset("sample_data/scene.tif"))
+    >>> source
+    'sample_data/scene_RPC.TXT'
     """
     name = dataset.GetDescription()
     if choice is not None and str(choice) not in ("tag", "sidecar"):

@@ -90,6 +90,11 @@ def read_rpc_text(path: str | PathLike[str]) -> RPC:
     ------
     InputError
         If the file cannot be read, has no RPC, or a field is missing, not finite, or zero where it must not be.
+
+    Examples
+    --------
+    >>> read_rpc_text("sample_data/scene_RPC.TXT").h_off
+    1000.0
     """
     text = _text_of(path)
     lowered = text[:100_000].lower()
@@ -130,6 +135,11 @@ def rpc_of_fields(fields: Mapping[str, str], file: str | PathLike[str] | None = 
     ------
     InputError
         If a field is missing or wrong.
+
+    Examples
+    --------
+    >>> rpc_of_fields(open_dataset("sample_data/scene.tif").GetMetadata("RPC")).h_off
+    1000.0
     """
     with completed(file, remedy=_REMEDY):
         return _rpc(fields, file, origin)

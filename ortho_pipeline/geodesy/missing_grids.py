@@ -42,7 +42,7 @@ def unavailable_grids(source: Any, target: Any) -> list[str]:
 def warn_of_better(used: Transformer, source: pyproj.CRS, target: pyproj.CRS, sample: NDArray[np.float64]) -> None:
     """Log that a more exact transformation exists whose grid is not installed (``only_best`` lets some of them pass).
 
-    A negative accuracy of `used` says that PROJ chooses among several operations by position.
+    A negative accuracy of `used` means that PROJ chooses among several operations by position.
     """
     lon, lat = Transformer.from_crs(target.to_2d(), 4326, always_xy=True).transform(*sample[:2])
     if not (abs(lon) <= 180 and abs(lat) <= 90):

@@ -27,6 +27,10 @@ def require_view(model: SensorModel) -> None:
     ------
     InputError
         If the domain is not finite, or none of 125 points in it has a finite image.
+
+    Examples
+    --------
+    >>> require_view(op.read_rpc("sample_data/scene_RPC.TXT"))
     """
     centre, half = model.domain
     if not (np.isfinite(centre).all() and np.isfinite(half).all()):

@@ -343,7 +343,13 @@ def checked_names(free: Iterable[str], known: Iterable[str], where: str) -> tupl
 
 
 def ground_of_grid(model: SensorModel, size: tuple[int, int], count: int, heights: tuple[float, float]) -> Array:
-    """Return ground points ``(2 count^2, 3)`` of `count` x `count` image points, edges included, at two heights (m)."""
+    """Return ground points ``(2 count^2, 3)`` of `count` x `count` image points, edges included, at two heights (m).
+
+    Examples
+    --------
+    >>> ground_of_grid(op.read_rpc("sample_data/scene_RPC.TXT"), (1000, 1000), 3, (700.0, 1200.0)).shape
+    (18, 3)
+    """
     fractions = np.stack(np.meshgrid(*[np.linspace(0, 1, count)] * 2), axis=-1).reshape(-1, 2)
     image = fractions * size
     return np.concatenate([model.image_to_ground(image, height) for height in heights])

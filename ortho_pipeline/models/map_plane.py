@@ -58,6 +58,12 @@ class MapPlane(SensorModel):
         Lowest and highest ellipsoidal height (m) of the ground.
     shift : (float, float)
         Displacement (m) of all points in the map.
+
+    Examples
+    --------
+    >>> model = MapPlane("EPSG:32633", (500_000.0, 4_640_000.0), (1.0, 1.0), (900, 800), 100.0, (0.2, 0.0), (0.0, 500))
+    >>> model.ground_to_image([[500_010.0, 4_639_990.0, 150.0]]).round(3).tolist()
+    [[20.0, 10.0]]
     """
 
     kind: ClassVar[str] = "geo"

@@ -187,6 +187,12 @@ def relative_scale(model: SensorModel, other: SensorModel, size: tuple[int, int]
         With the same CRS.
     size : (int, int)
         Columns and rows of the image of `other`.
+
+    Examples
+    --------
+    >>> pan, red = (op.read_rpc(f"sample_data/ikonos/po_39001_{band}_0000000_rpc.txt") for band in ("pan", "red"))
+    >>> round(relative_scale(pan, red, (250, 250)), 3)
+    4.0
     """
     ground = other.image_to_ground([[size[0] / 2, size[1] / 2]], other.reference_height)
     seen, wide, narrow = model.ground_to_image(ground), model.ground_partials(ground), other.ground_partials(ground)

@@ -244,6 +244,12 @@ class Rational(SensorModel):
         Whether the first ground coordinate is a longitude in degrees.
     removed : tuple of str
         Coefficients that are zero and no parameters.
+
+    Examples
+    --------
+    >>> model = fit_family("affine3d", op.read_points("sample_data/gcps.geojson")).model
+    >>> model.family, len(model.params)
+    ('affine3d', 8)
     """
 
     kind: ClassVar[str] = "rational"

@@ -14,7 +14,13 @@ from ortho_pipeline.options.output import OutputOptions
 @documented
 @dataclass(frozen=True)
 class SceneOptions:
-    """How to open the image."""
+    """How to open the image.
+
+    Examples
+    --------
+    >>> op.SceneOptions(rpc="sidecar")
+    SceneOptions(rpc='sidecar')
+    """
 
     sensor: Annotated[
         str | None,
@@ -100,6 +106,11 @@ class PointOptions:
     """Points, and what to adjust to them.
 
     `gcps` may also be a table of points that is already read, in pixels of this image.
+
+    Examples
+    --------
+    >>> op.PointOptions(gcps="gcps.csv", correction="shift")
+    PointOptions(gcps='gcps.csv', correction='shift')
     """
 
     gcps: Annotated[
@@ -178,7 +189,13 @@ class PointOptions:
 @documented
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Where the heights come from: a DEM, or one ellipsoidal height in metres."""
+    """Where the heights come from: a DEM, or one ellipsoidal height in metres.
+
+    Examples
+    --------
+    >>> op.SurfaceOptions(dem="dem.tif", vertical="egm2008")
+    SurfaceOptions(dem='dem.tif', vertical='egm2008')
+    """
 
     dem: Annotated[
         PathLike | None,
@@ -240,7 +257,13 @@ class SurfaceOptions:
 @documented
 @dataclass(frozen=True)
 class MatchOptions:
-    """Automatic control points: the scene is matched with reference orthoimages."""
+    """Automatic control points: the scene is matched with reference orthoimages.
+
+    Examples
+    --------
+    >>> op.MatchOptions(reference=("reference.tif",), search=50.0)
+    MatchOptions(reference=('reference.tif',), search=50.0)
+    """
 
     reference: Annotated[
         Sequence[PathLike],

@@ -44,12 +44,24 @@ PathLike = str | os.PathLike[str]
 
 
 def is_usable(number: float) -> bool:
-    """Return whether a number is 0, or its cube and the cube of its inverse are finite."""
+    """Return whether a number is 0, or its cube and the cube of its inverse are finite.
+
+    Examples
+    --------
+    >>> is_usable(1e30), is_usable(1e300)
+    (True, False)
+    """
     return number == 0 or 1e-100 <= abs(number) <= 1e100
 
 
 def number_of(text: str | float) -> float:
-    """Return the number that a user gave; NaN if it is not a number or not usable (`is_usable`)."""
+    """Return the number that a user gave; NaN if it is not a number or not usable (`is_usable`).
+
+    Examples
+    --------
+    >>> number_of("12.5"), number_of("twelve")
+    (12.5, nan)
+    """
     try:
         number = float(text)
     except (ValueError, OverflowError):
@@ -58,7 +70,13 @@ def number_of(text: str | float) -> float:
 
 
 def numbers_of(text: str) -> list[float]:
-    """Return the numbers of a list with commas, each by `number_of`."""
+    """Return the numbers of a list with commas, each by `number_of`.
+
+    Examples
+    --------
+    >>> numbers_of("10,12.5")
+    [10.0, 12.5]
+    """
     return [number_of(part) for part in text.split(",")]
 
 
@@ -115,7 +133,8 @@ def documented(group: type[_T]) -> type[_T]:
             else inspect.formatannotation(get_args(one.type)[0])
         )
         lines.append(f"{one.name} : {kind}\n    {text}")
-    group.__doc__ = f"{group.__doc__}\n\nParameters\n----------\n" + "\n".join(lines)
+    text, heading, examples = inspect.cleandoc(str(group.__doc__)).partition("\n\nExamples\n")
+    group.__doc__ = f"{text}\n\nParameters\n----------\n" + "\n".join(lines) + heading + examples
     types = {field.name: get_args(field.type)[0] for field in fields(group)}  # type: ignore[arg-type]
     group.__init__.__annotations__ = {**types, "return": None}
     group.__repr__ = _as_called  # type: ignore[method-assign]

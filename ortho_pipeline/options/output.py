@@ -16,6 +16,11 @@ class OutputOptions:
     """Form of the ortho, and how to compute it.
 
     `memory` is in bytes.
+
+    Examples
+    --------
+    >>> op.OutputOptions(crs="EPSG:32636", resolution=5.0)
+    OutputOptions(crs='EPSG:32636', resolution=5.0)
     """
 
     crs: Annotated[

@@ -56,7 +56,7 @@ def ortho_sensors() -> Iterable[Sensor]:
         options={
             "rpc": "which RPC to use: tag, sidecar, or an RPC file; default: the first readable one of the delivery",
             "rpc_origin": "line and sample of the first pixel's centre in the RPC: 0 (default) or 1",
-            "view": "fore or aft, if neither file name nor metadata say it",
+            "view": "fore or aft, if neither file name nor metadata name the view",
             **{
                 option: f"soft constraint of the pushbroom: sigma of the {what}, or none; default:"
                 f" {soft_facts(DEFAULT)[option]:g}"

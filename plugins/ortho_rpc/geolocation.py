@@ -44,7 +44,8 @@ _MOST, _NODES = 100_000_000, 60
 _FOLLOWS = 0.1
 _HEIGHTS = (-500.0, 9000.0)
 _REMEDY = (
-    "write longitudes and latitudes as GeoTIFF (gdal_translate), and give both as sensor options lon=FILE and lat=FILE"
+    "write longitudes and latitudes as GeoTIFF (`gdal_translate IN OUT`), and give both as sensor options lon=FILE and "
+    "lat=FILE"
 )
 
 

@@ -205,7 +205,7 @@ def _map_of(dataset: gdal.Dataset) -> tuple[str, tuple[float, float], tuple[floa
         raise InputError(
             f"this image must be in a map projection with north up, not in {crs.name}",
             file=name,
-            remedy="project it to UTM with gdalwarp -t_srs EPSG:326zz (zz: the zone), which keeps the plane",
+            remedy="project it to its UTM zone, which keeps the plane: `gdalwarp -t_srs EPSG:CODE IN OUT`",
         )
     return crs.to_string(), (steps[0], steps[3]), (steps[1], -steps[5])
 

@@ -130,7 +130,7 @@ class Variances:
         )
         who = f"{counted(number, 'control point')} without a stated sigma"
         if not self.separable:
-            text = f"{who}: their errors cannot be told from errors of measurement here, and count as such; "
+            text = f"{who}: their errors are inseparable from errors of measurement here, and count as such; "
             return [Notice("unstated-sigma", Text(text, remedy), count=number)]
         found = []
         sigmas = self.sigma_xy, self.sigma_h

@@ -47,7 +47,13 @@ def _escaped_in_json(character: str) -> str:
 
 
 def say(text: object = "", *, err: bool = False) -> None:
-    """Print a text for people."""
+    """Print a text for people.
+
+    Examples
+    --------
+    >>> say("83 % of the scene")
+    83 % of the scene
+    """
     click.echo(printable(str(text)), err=err)
 
 

@@ -72,6 +72,12 @@ def ortho_array(
     ------
     InputError
         As `rectify`; for chunks that are no multiple, options that mean further files, and without xarray and dask.
+
+    Examples
+    --------
+    >>> coarse = op.OutputOptions(resolution=50.0)
+    >>> op.ortho_array("sample_data/scene.tif", "sample_data/dem.tif", output=coarse).dims
+    ('band', 'y', 'x')
     """
     assert isinstance(points, PointOptions), "with_items makes options of points"
     side = _side(chunks)

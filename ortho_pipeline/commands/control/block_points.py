@@ -181,7 +181,7 @@ def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
     for name in ("dem_bias", "dem_correlation", "dem_shift_sigma"):
         if getattr(options, name) is not None and not observes(options, surface):
             raise InputError(
-                "this option describes DEM heights used as observations, and there are none",
+                "this option describes DEM heights that are observations, but no heights are observed",
                 field=f"points.{name}",
                 remedy=Text("leave it out, or give ", remedy),
             )

@@ -234,16 +234,19 @@ def match_scene(
 ) -> Matched:
     """Match a scene with the references of the options.
 
+    >>> references = op.MatchOptions(reference=("sample_data/reference.tif",))
+    >>> scene, dem = op.open_scene("sample_data/scene.tif"), op.open_dem("sample_data/dem.tif")
+    >>> len(op.match_scene(scene, references, dem).matches.points) > 20
+    True
+
     Parameters
     ----------
     scene : Scene
         With models that are meant for the surface.
     opened : SceneOptions
         What may be opened.
-    threads : int, optional
-        As many as there are processors without; no result depends on it.
-    memory : int
-        Bytes.
+    threads, memory : int
+        Default: as many threads as processors; memory in bytes. No result depends on them.
 
     Raises
     ------

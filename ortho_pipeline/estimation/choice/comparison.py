@@ -171,6 +171,12 @@ def compare(
         Of the tests of parameters.
     robust : bool
         Find gross errors and leave them out.
+
+    Examples
+    --------
+    >>> points = op.read_points("sample_data/gcps.geojson")
+    >>> op.compare(points, ["affine3d", "dlt"], size=(1000, 1000)).recommended
+    'affine3d'
     """
     known = available_models(own)
     job = _Job(own, dict(priors or {}), size, crs, heights, ridge)

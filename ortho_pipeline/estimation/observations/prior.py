@@ -38,6 +38,12 @@ def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prio
     model : SensorModel
     sigmas : mapping of str to float
         Standard deviations by parameter name; parameters without one get no prior.
+
+    Examples
+    --------
+    >>> model = op.ImageCorrection.identity(op.read_rpc("sample_data/scene_RPC.TXT"), "shift", (500, 500))
+    >>> priors_at(model, {"col_shift": 2.0})
+    {'col_shift': Prior(mean=0.0, sigma=2.0)}
     """
     values = dict(zip(model.param_names, model.params.tolist(), strict=True))
     return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}

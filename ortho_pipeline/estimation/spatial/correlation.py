@@ -200,6 +200,12 @@ def analyse_fit(fit: Fit, *, near: float | None = None) -> Covariances:
     ----------
     near : float, optional
         As for `analyse`.
+
+    Examples
+    --------
+    >>> scene, points = op.open_scene("sample_data/scene.tif"), op.read_points("sample_data/gcps.geojson")
+    >>> analyse_fit(scene.fit(points, "shift")).control.n
+    12
     """
     points = fit.points
     if not len(points):

@@ -203,7 +203,7 @@ def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
     inside = _inside(view, targets, image)
     if inside.sum() < _SAMPLES_SHOWN:
         what = "does not overlap the scene"
-        remedy = "give images of the same place; if they are, check the model of the scene with `ortho info`"
+        remedy = "give images of the same place; if they are, check the model of the scene with `ortho info IMAGE`"
         if inside.any():
             what = f"covers {inside.mean():.1%} of the scene, which is too little to match"
             remedy = "give images that cover more of the scene, or measure points by hand"

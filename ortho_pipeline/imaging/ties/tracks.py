@@ -76,7 +76,7 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
             "no two scenes overlap",
             file=views[0].intensity.source.path,
             field="images",
-            remedy="give scenes that overlap; if they do, check their models with `ortho info`",
+            remedy="give scenes that overlap; if they do, check their models with `ortho info IMAGE`",
         )
     block = _Block(views, targets, settings)
     for home, view in enumerate(views):

@@ -47,6 +47,11 @@ def heights_below(position: ArrayLike, heights: tuple[float, float]) -> tuple[fl
     ------
     InputError
         If the camera is below all of it.
+
+    Examples
+    --------
+    >>> heights_below(geocentric(np.array([[12.5, 41.9, 2500.0]]))[0], (0.0, 3000.0))
+    (0.0, 2250.0)
     """
     low, high = heights
     altitude = float(geodetic(np.asarray(position, dtype=np.float64)[None])[0, 2])
@@ -59,6 +64,12 @@ def geocentric_of_map(crs: str, exterior: Array) -> tuple[Array, Array]:
     """Return position in ECEF ``(3,)`` and rotation to the camera ``(3, 3)`` of an exterior orientation in a map.
 
     The angles are rotated by the meridian convergence at the perspective centre.
+
+    Examples
+    --------
+    >>> position, rotation = geocentric_of_map("EPSG:32631", np.array([500_000.0, 0.0, 2500.0, 0.0, 0.0, 0.0]))
+    >>> geodetic(position[None]).round(3).tolist()
+    [[3.0, 0.0, 2500.0]]
     """
     to_geographic = ground_transform(crs, GEOGRAPHIC)
     steps = np.array([[0, 0], [100.0, 0], [-100.0, 0], [0, 100.0], [0, -100.0]])

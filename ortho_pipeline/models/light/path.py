@@ -37,6 +37,11 @@ class LightPath:
     ----------
     aberration, refraction : bool
         Default: both are in the angles.
+
+    Examples
+    --------
+    >>> LightPath(refraction=True)
+    LightPath(aberration=False, refraction=True)
     """
 
     aberration: bool = False

@@ -64,6 +64,11 @@ class SoftSigmas:
     ------
     InputError
         If one is not positive and finite.
+
+    Examples
+    --------
+    >>> SoftSigmas(attitude=1e-3).attitude
+    0.001
     """
 
     plane: float | None = 10.0
@@ -117,6 +122,13 @@ def pushbroom_of_metadata(
     ------
     InputError
         If the metadata contradict each other.
+
+    Examples
+    --------
+    >>> corners = [[12.0, 42.0], [12.3, 42.0], [12.3, 41.8], [12.0, 41.8]]
+    >>> model = pushbroom_of_metadata(corners, 10_000, 9_000, altitude=618e3, along_deg=26.0)
+    >>> model.ground_to_image([[12.15, 41.9, 500.0]]).round(-2).tolist()
+    [[5000.0, 4500.0]]
     """
     sigmas = sigmas or SoftSigmas()
     points = _corner_points(corners, heights)

@@ -148,7 +148,13 @@ class Spline:
 
 @dataclass(frozen=True)
 class SplineForm:
-    """Degree of the splines of path and attitude, and their numbers of polynomials; None: the table decides."""
+    """Degree of the splines of path and attitude, and their numbers of polynomials; None: the table decides.
+
+    Examples
+    --------
+    >>> SplineForm(degree=3, path=2)
+    SplineForm(degree=3, path=2, attitude=None)
+    """
 
     degree: int
     path: int | None = None

@@ -74,6 +74,22 @@ def pushbroom_of_tables(
     ------
     InputError
         If a table is not in order of time, too short, or does not cover the image.
+
+    Examples
+    --------
+    >>> times = np.linspace(-1.0, 3.0, 17)
+    >>> cos, sin, zero = np.cos(times * 1e-3), np.sin(times * 1e-3), np.zeros(17)
+    >>> positions, velocities = np.stack([cos, zero, sin], axis=1) * 7e6, np.stack([-sin, zero, cos], axis=1) * 7e3
+    >>> axes = [orbital_from_ecef(*pair)[[1, 0, 2]].T * (-1, 1, 1) for pair in zip(positions, velocities, strict=True)]
+    >>> model = pushbroom_of_tables(
+    ...     LineCamera(1000, 2000, 500.0, 0.0, 1e5),
+    ...     line_period=1e-3,
+    ...     first_time=0.0,
+    ...     orbit=(times, positions),
+    ...     attitude=(times, axes),
+    ... )
+    >>> model.image_to_ground([[500.0, 1000.0]], 0.0).round(3).tolist()
+    [[0.0, 0.058, 0.0]]
     """
     degree, last = splines.degree, camera.height * line_period
     needed = (first_time, last, abs(line_period))
@@ -167,6 +183,11 @@ def rotations_of_angles(angles: ArrayLike, positions: ArrayLike, velocities: Arr
     angles : (N, 3)
     positions, velocities : (N, 3)
         In ECEF (m, m/s) at the times of the angles; velocities relative to the rotating Earth.
+
+    Examples
+    --------
+    >>> rotations_of_angles([[0.0, 0.0, 0.0]], [[7e6, 0.0, 0.0]], [[0.0, 0.0, 7500.0]])[0, :, 2].round(6).tolist()
+    [1.0, 0.0, 0.0]
     """
     pairs = zip(np.asarray(positions, dtype=float), np.asarray(velocities, dtype=float), strict=True)
     down = np.array([orbital_from_ecef(position, velocity) for position, velocity in pairs])

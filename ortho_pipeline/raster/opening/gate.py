@@ -51,6 +51,11 @@ _MANY = 10_000
 _OVERVIEWS = "OVERVIEWS"
 
 
+def _together(path: Any) -> str:
+    """Return the rest of the remedy for a file that refers to files elsewhere."""
+    return f", put the files into one folder, or {to_one_file(path)}"
+
+
 def open_seen(
     path: AnyPath, roots: Sequence[AnyPath], drivers: Sequence[str], siblings: bool
 ) -> tuple[gdal.Dataset, DecodedUnit]:
@@ -315,12 +320,7 @@ class _Gate:
             f"this file refers to {name[:200]!r}, which is outside its own folder",
             file=by,
             field=field,
-            remedy=Text(
-                "allow a folder that contains both with ",
-                Setting("scene.roots", root),
-                ", put the files into one folder, or ",
-                to_one_file(by),
-            ),
+            remedy=Text("allow a folder that contains both with ", Setting("scene.roots", root), _together(by)),
         )
 
     # -- what GDAL tells ---------------------------------------------------------------------------------------------
