@@ -113,7 +113,7 @@ def test_the_vendors_model_is_one_and_an_rpc_stands_for_it(reverse):
 
 
 def test_an_impossible_tilt_is_refused():
-    with pytest.raises(InputError, match="off nadir"):
+    with pytest.raises(InputError, match="off-nadir angle"):
         IkonosPass.over_tehran(off_nadir_deg=50)
 
 

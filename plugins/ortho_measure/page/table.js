@@ -8,12 +8,12 @@ const length = (pair) => (pair ? Math.hypot(...pair) : null);
 const ONE = [
   ['Point', (mark) => mark.id, (mark) => mark.id],
   ['Role', (mark) => mark.role, (mark) => (mark.off ? `${mark.role}, off` : mark.role)],
-  ['Column, px', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
+  ['Col., px', (mark) => mark.residual?.[0] ?? null, (mark) => number(mark.residual?.[0])],
   ['Row, px', (mark) => mark.residual?.[1] ?? null, (mark) => number(mark.residual?.[1])],
   ['Ground, m', (mark) => length(mark.residual_m), (mark) => number(length(mark.residual_m))],
   ['Left out, px', (mark) => length(mark.loo), (mark) => number(length(mark.loo))],
   ['w', (mark) => mark.w ?? null, (mark) => number(mark.w, 1)],
-  ['Method', (mark) => mark.how, (mark) => (methods[mark.how] ?? mark.how)],
+  ['How', (mark) => mark.how, (mark) => (methods[mark.how] ?? mark.how)],
 ];
 
 const methods = { matched: 'match', manual: 'click' };
