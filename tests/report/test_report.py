@@ -244,7 +244,7 @@ def test_what_is_left_out_is_not_known_by_these_words(tmp_path):
     point = Notice("left-out", "point G3 was left out: gross error")
     made = document(adjusted(points()), warnings=[Notice("rigorous-left-out", said), point])
     text = report.summary_text(made)
-    assert f"Note: {said}" in text
+    assert f"Note: {said[0].upper()}{said[1:]}" in text
     assert text.count("oint G3 was left out") == 1
 
 

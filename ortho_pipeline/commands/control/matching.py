@@ -191,7 +191,7 @@ class Matched:
 
         record = self.record
         column, row = record.shift_px
-        reasons = ", ".join(f"{count} {REASONS[name]}" for name, count in record.reasons.items())
+        reasons = "; ".join(f"{count}: {REASONS[name]}" for name, count in record.reasons.items())
         levels = "; ".join(
             f"{level.agreeing} of {counted(level.chips, 'chip')} agree at 1/{level.factor} resolution"
             for level in record.levels

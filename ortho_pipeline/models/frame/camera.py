@@ -88,13 +88,6 @@ class FrameCamera(SensorModel):
         Whether the standard atmosphere bends the rays.
     free : tuple of str
         Names of `PARAMETERS` that an adjustment may change; a `Prior` weights them.
-
-    Examples
-    --------
-    >>> interior = Interior(4000, 3000, focal_length=0.05, pitch_x=5e-6, pitch_y=5e-6)
-    >>> camera = FrameCamera.from_roll_pitch_yaw(interior, (12.5, 41.9, 2500.0), 0.0, 0.0, 0.0, heights=(0.0, 300.0))
-    >>> camera.ground_to_image(np.array([[12.5, 41.9, 100.0]])).round(3).tolist()
-    [[2000.0, 1500.0]]
     """
 
     kind: ClassVar[str] = "frame"
