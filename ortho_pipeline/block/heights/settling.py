@@ -15,7 +15,9 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
-from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights, planes_at
+from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
+from ortho_pipeline.block.heights.terrain import Terrain
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.estimation.observations.on_points import Planes
@@ -49,6 +51,10 @@ class Heights:
     source : DemHeights
     of : ndarray (N,) of bool
         Points that take the height of the DEM, if it has one there.
+    images : ndarray (N,)
+        The first image that shows each point.
+    terrain : Terrain
+        The DEM under the points.
     stated : ndarray (N,) or None
         Stated sigmas of the heights, m upwards.
     sigma : float
@@ -65,6 +71,8 @@ class Heights:
 
     source: DemHeights
     of: Mask
+    images: Index
+    terrain: Terrain
     stated: Array | None
     sigma: float
     own: Array
@@ -100,7 +108,11 @@ class Heights:
             loads = np.hstack([loads, more])
         none = np.zeros(count, dtype=bool)
         common = CommonHeights.of(loads, bias, len(rows), problem.size)
-        return cls(source, of, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        images = np.full(count, len(problem.models))
+        np.minimum.at(images, problem.points.point, problem.points.image)
+        each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
+        terrain = Terrain.under(source, _places(problem, local), of, each, images)
+        return cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
 
     @property
     def shift(self) -> float:
@@ -113,20 +125,27 @@ class Heights:
         """Sigmas ``(N,)`` of the heights, m upwards."""
         return np.full(len(self.of), self.sigma) if self.stated is None else self.stated
 
-    def applied(self, problem: BlockProblem, local: Array) -> BlockProblem:
-        """Return the problem with planes under points at `local` ``(N, 3)``."""
-        return problem.with_heights(self._planes(problem, local, self.of & ~self.wrong & ~self.broken)[0])
+    def applied(self, problem: BlockProblem) -> BlockProblem:
+        """Return the problem with planes under its points."""
+        return problem.with_heights(self._planes(problem, self.of & ~self.wrong & ~self.broken))
 
-    def _planes(self, problem: BlockProblem, local: Array, of: Mask) -> tuple[Planes, Array]:
-        """Return the planes under points of a mask ``(N,)``, and their slopes ``(N, 2)``."""
-        return planes_at(self.source, problem, local, of, self.sigmas * np.sqrt(self.own), self.common.offset)
+    def _planes(self, problem: BlockProblem, of: Mask) -> Planes:
+        """Return the planes under points of a mask ``(N,)``."""
+        return self.terrain.planes(problem, of, self.sigmas * np.sqrt(self.own), self.common.offset)
+
+    def _under(self, problem: BlockProblem, local: Array) -> Heights:
+        """Return them with the DEM under points at `local` ``(N, 3)``."""
+        ground = _places(problem, local)
+        return replace(
+            self, terrain=Terrain.under(self.source, ground, self.of, self.sigmas, self.images, self.terrain)
+        )
 
     def settled(self, solved: Solved, selection: Selection, tolerance: float = EXACT) -> tuple[Solved, Heights]:
         """Return the solution with stable heights, from one near it, and these heights."""
         found = self
         for number in range(_ROUNDS):
-            judged = found._judged(solved, number)
-            problem = judged.applied(solved.problem, solved.state.local)
+            judged = found._under(solved.problem, solved.state.local)._judged(solved, number)
+            problem = judged.applied(solved.problem)
             planes, before = problem.heights, solved.problem.heights
             assert planes is not None
             assert before is not None
@@ -143,7 +162,7 @@ class Heights:
 
     def _judged(self, solved: Solved, number: int) -> Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
-        _, slopes = self._planes(solved.problem, solved.state.local, self.of)
+        slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
@@ -166,7 +185,7 @@ class Heights:
         Of one that takes part the residual varies less than the height, of one that does not more.
         """
         problem, local = solved.problem, solved.state.local
-        planes, _ = self._planes(problem, local, self.of)
+        planes = self._planes(problem, self.of)
         rows = np.zeros(len(local), dtype=bool)
         rows[solved.linear.ordering.numbers] = True
         used = rows & self.of & planes.on
@@ -195,12 +214,10 @@ class Heights:
 
     def _breaking(self, solved: Solved) -> Mask:
         """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
-        problem, local = solved.problem, solved.state.local
-        _, slopes = self._planes(problem, local, self.of)
         covariance = solved.ground_covariance(solved.cofactors, 1.0)
         plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
         rows = np.flatnonzero(self.of & np.isfinite(plan))
-        ground, found = problem.frame.geodetic(local), self.broken.copy()
+        ground, slopes, found = self.terrain.ground, np.nan_to_num(self.terrain.slopes), self.broken.copy()
         # The uncertainty is larger while the images are still displaced.
         far = self.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], self.source.surface.sample_size))
         with np.errstate(invalid="ignore"):
@@ -237,6 +254,11 @@ class Heights:
             shift_prior_m=self.shift,
             correlation_m=self.source.correlation,
         )
+
+
+def _places(problem: BlockProblem, local: Array) -> Array:
+    """Return lon, lat, h ``(N, 3)`` where heights of points at `local` ``(N, 3)`` are read."""
+    return np.where(problem.placed[:, None], problem.known, problem.frame.geodetic(local))
 
 
 class HeightsRecord(Record):
