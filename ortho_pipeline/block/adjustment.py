@@ -47,6 +47,8 @@ from ortho_pipeline.surface.base import Surface
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3
+#: Heights of a DEM are renewed so often before the search for gross errors.
+_FIRST_ROUNDS = 1
 #: Part of the points that gross errors of their own may lead out of the models; where it is more, the block is tilted.
 _ASTRAY = 0.05
 #: Part of the points beyond which it is not they that are wrong, but where the images lie.
@@ -150,7 +152,7 @@ def _first(
     _refuse_many_outside(solved if held is None else held, whole)
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
     if dem_heights is not None:
-        solved, dem_heights = dem_heights.settled(solved, inside, tolerance)
+        solved, dem_heights = dem_heights.settled(solved, inside, _FIRST_ROUNDS)
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
     return solved, inside, dem_heights
@@ -302,7 +304,9 @@ def _weighed(
     """Return the solution with the sigmas that the observations have, what is known of these, and common errors."""
     if common is not None:
         solved, common = common.settled(solved, selection)
-    found = posterior(solved)
+    if dem_heights is not None:
+        solved, dem_heights = dem_heights.settled(solved, selection)
+    settled, found = solved, posterior(solved)
     for _ in range(_WEIGHINGS):
         if found.moved <= _MOVED:
             break
@@ -315,7 +319,7 @@ def _weighed(
         before = solved
         solved, common = common.settled(solved, selection)
         found = found if solved is before else posterior(solved)
-    if dem_heights is not None:
+    if dem_heights is not None and solved is not settled:
         before = solved
         solved, dem_heights = dem_heights.settled(solved, selection)
         found = found if solved is before else posterior(solved)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
-from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
+from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
@@ -26,12 +26,13 @@ from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text, counted
 
-#: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma.
-_ROUNDS, _STABLE, _FEW = 10, 0.02, 0.02
+#: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma,
+#: and hardly any (a share) were left out anew or take part again.
+_ROUNDS, _STABLE, _FEW, _HARDLY_ANY = 10, 0.02, 0.02, 1e-3
 #: The estimate of shared errors is stable if it changes by less than this, in standard deviations.
 _SHARED_STABLE = 0.02
-#: A height farther off than so many of its sigmas is left out.
-_WRONG = 4.0
+#: A height farther off than so many of its sigmas is left out; it takes part again if it is nearer than so many.
+_WRONG, _RIGHT = 4.0, 3.5
 #: A height is at a break if the DEM is more sigmas off its plane within the uncertainty of the place.
 _BREAKS = 4.0
 #: A sigma is estimated from so many heights or more, each of at least this redundancy.
@@ -140,23 +141,21 @@ class Heights:
             self, terrain=Terrain.under(self.source, ground, self.of, self.sigmas, self.images, self.terrain)
         )
 
-    def settled(self, solved: Solved, selection: Selection, tolerance: float = EXACT) -> tuple[Solved, Heights]:
-        """Return the solution with stable heights, from one near it, and these heights."""
+    def settled(self, solved: Solved, selection: Selection, rounds: int = _ROUNDS) -> tuple[Solved, Heights]:
+        """Return the solution with stable heights, from one near it, and these heights.
+
+        After fewer `rounds` than they need, it is near that.
+        """
         found = self
-        for number in range(_ROUNDS):
+        for number in range(rounds):
             judged = found._under(solved.problem, solved.state.local)._judged(solved, number)
             problem = judged.applied(solved.problem)
-            planes, before = problem.heights, solved.problem.heights
-            assert planes is not None
-            assert before is not None
-            off = np.abs(planes.above(solved.state.local) - before.above(solved.state.local)) / planes.sigmas
-            same = bool((planes.on == before.on).all()) and judged.sigma == found.sigma
-            same &= np.array_equal(judged.common.value, found.common.value)
-            if same and (off > _STABLE)[planes.on].sum() <= _FEW * planes.on.sum():
-                return solved, judged
+            if _stable(solved, problem, judged.sigma == found.sigma, judged.common, found.common):
+                return solved, replace(judged, wrong=found.wrong, broken=found.broken)
+            tolerance = NEAR if number == 0 or rounds < _ROUNDS else EXACT
             again = attempt(problem, solved.state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
-                return solved, found
+                break
             solved, found = again, judged
         return solved, found
 
@@ -176,8 +175,9 @@ class Heights:
             return found
         sigma = np.sqrt(np.maximum(spread, (0.2 * found.sigmas) ** 2))
         with np.errstate(invalid="ignore"):
-            wrong = np.abs(apart) > _WRONG * sigma
-        return replace(found, wrong=np.asarray(found.of & wrong), broken=found._breaking(solved))
+            wrong = np.abs(apart) > np.where(self.wrong, _RIGHT, _WRONG) * sigma
+        broken = found.broken if number else found._breaking(solved)
+        return replace(found, wrong=np.asarray(found.of & wrong), broken=broken)
 
     def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
@@ -254,6 +254,19 @@ class Heights:
             shift_prior_m=self.shift,
             correlation_m=self.source.correlation,
         )
+
+
+def _stable(
+    solved: Solved, problem: BlockProblem, same_sigma: bool, common: CommonHeights, before: CommonHeights
+) -> bool:
+    """Tell whether a problem has the heights of a solution."""
+    planes, old, local = problem.heights, solved.problem.heights, solved.state.local
+    assert planes is not None
+    assert old is not None
+    if not same_sigma or not np.array_equal(common.value, before.value):
+        return False
+    off, count = np.abs(planes.above(local) - old.above(local)) / planes.sigmas, planes.on.sum()
+    return bool((planes.on != old.on).sum() <= _HARDLY_ANY * count and (off > _STABLE)[planes.on].sum() <= _FEW * count)
 
 
 def _places(problem: BlockProblem, local: Array) -> Array:

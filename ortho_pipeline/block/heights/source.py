@@ -11,6 +11,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, State
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.local_frame import GEODETIC
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
@@ -20,8 +21,9 @@ from ortho_pipeline.surface.dem import DemSurface
 
 #: Sigma (m) of a DEM without a stated accuracy; matching assumes the same.
 DEFAULT_SIGMA = 10.0
-#: Times that a ray is followed to the height of the DEM below it: terrain is less steep than the ray.
-_FOLLOWED = 6
+#: Times that a ray is followed to the height of the DEM below it, and a change (m) that ends this. Terrain is less
+#: steep than the ray.
+_FOLLOWED, _NEAR_ENOUGH = 6, 1.0
 #: The option of each number that describes a DEM.
 _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
 #: The heights for a slope are so many of their sigmas apart, from one to so many samples.
@@ -126,34 +128,49 @@ class DemHeights:
         return np.asarray(1.0 + _SHARED * (counts[which.ravel()] - 1.0))
 
 
-def starts(source: DemHeights, problem: BlockProblem, models: Sequence[SensorModel], rays: Mask, of: Mask) -> Array:
-    """Return where points `of` a mask ``(N,)`` lie ``(N, 3)``: in the middle of where their rays meet the DEM.
+def starts(
+    source: DemHeights, problem: BlockProblem, models: Sequence[SensorModel], near: Array, rays: Mask, of: Mask
+) -> Array:
+    """Return where points `of` a mask ``(N,)`` are ``(N, 3)``: where the first ray of each meets the DEM.
 
-    Nearly parallel rays of models that are a few pixels off meet anywhere; the DEM is right to a few metres.
+    Nearly parallel rays of models that are a few pixels off meet anywhere, even if `near` ``(N, 3)``; the DEM is right
+    to a few metres.
     """
     points, frame = problem.points, problem.frame
-    sums, counts = np.zeros((len(points), 3)), np.zeros(len(points))
-    for model, rays_of in zip(models, points.rays_of_images, strict=True):
-        used = rays_of[rays[rays_of] & of[points.point[rays_of]]]
-        if not len(used):
-            continue
-        heights = np.full(len(used), model.reference_height)
-        to_geodetic = ground_transform(model.crs, GEODETIC)
-        for _ in range(_FOLLOWED):
-            ground = to_geodetic(model.image_to_ground(points.measured[used], heights))
-            below = source.surface.heights(ground[:, :2], GEODETIC)
-            heights = np.where(np.isfinite(below), below, heights)
-        good = np.isfinite(below) & np.isfinite(ground).all(axis=1)
-        local = frame.of_geodetic(np.column_stack([ground[good, :2], heights[good]]))
-        np.add.at(sums, points.point[used[good]], local)
-        np.add.at(counts, points.point[used[good]], 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(sums / counts[:, None])
+    ground = frame.geodetic(near)
+    heights = source.heights(ground)
+    left = np.flatnonzero(_first_rays(points.point, rays & of[points.point]))
+    seen = np.zeros(len(points), dtype=bool)
+    seen[points.point[left]] = True
+    for _ in range(_FOLLOWED):
+        for image in np.unique(points.image[left]):
+            model, used = models[image], left[points.image[left] == image]
+            of_points = points.point[used]
+            at = np.where(np.isfinite(heights[of_points]), heights[of_points], model.reference_height)
+            ground[of_points] = model.image_to_ground(points.measured[used], at)
+            ground[of_points] = ground_transform(model.crs, GEODETIC)(ground[of_points])
+            heights[of_points] = at
+        there = source.heights(ground[points.point[left]])
+        far = np.abs(there - heights[points.point[left]]) > _NEAR_ENOUGH
+        heights[points.point[left]] = there
+        left = left[far]
+        if not len(left):
+            break
+    good = seen & np.isfinite(heights) & np.isfinite(ground).all(axis=1)
+    on_dem = frame.of_geodetic(np.column_stack([ground[:, :2], heights]))
+    return np.where(good[:, None], on_dem, np.nan)
+
+
+def _first_rays(point: Index, used: Mask) -> Mask:
+    """Return of all rays ``(M,)`` the first of each point that is used."""
+    rays, first = np.flatnonzero(used), np.zeros(len(point), dtype=bool)
+    first[rays[np.unique(point[rays], return_index=True)[1]]] = True
+    return first
 
 
 def started(source: DemHeights, problem: BlockProblem, state: State, rays: Mask) -> Array:
     """Return the places ``(N, 3)`` of a state with points on the DEM, as far as all their rays see them there."""
-    found = starts(source, problem, state.models, rays, problem.points.tie & ~problem.placed)
+    found = starts(source, problem, state.models, state.local, rays, problem.points.tie & ~problem.placed)
     seen = np.isfinite(predict(problem.frame, state.models, problem.points, found)).all(axis=1)
     good: Mask = np.array(np.isfinite(found).all(axis=1), dtype=bool)
     good[problem.points.point[rays & ~seen]] = False
