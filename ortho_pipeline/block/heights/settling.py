@@ -6,6 +6,7 @@ if it agrees again. No height is used in a void, beside one, or at a cliff withi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -32,11 +33,13 @@ _ROUNDS, _STABLE, _FEW, _HARDLY_ANY = 10, 0.02, 0.02, 1e-3
 #: The estimate of shared errors is stable if it changes by less than this, in standard deviations.
 _SHARED_STABLE = 0.02
 #: A height farther off than so many of its sigmas is left out; it takes part again if it is nearer than so many.
-_WRONG, _RIGHT = 4.0, 3.5
+_WRONG, _RIGHT = 4.0, 3.0
 #: A height is at a break if the DEM is more sigmas off its plane within the uncertainty of the place.
 _BREAKS = 4.0
 #: A sigma is estimated from so many heights or more, each of at least this redundancy.
 _ENOUGH, _REDUNDANT = 50, 0.2
+#: Stated sigmas count as too small if residuals are larger by so many standard deviations of their mean square.
+_SIGNIFICANT = 2.5
 #: A notice names so many points.
 _NAMED = 10
 #: The sigma of a normal distribution over its median absolute value.
@@ -68,6 +71,8 @@ class Heights:
         Left out: heights that contradict their ties, and heights at breaks of the DEM.
     estimated : bool
         Whether `sigma` was.
+    scale : float
+        How many times larger than stated their errors are, at least 1.
     """
 
     source: DemHeights
@@ -81,6 +86,7 @@ class Heights:
     wrong: Mask
     broken: Mask
     estimated: bool = False
+    scale: float = 1.0
 
     @classmethod
     def under(cls, source: DemHeights, problem: BlockProblem, local: Array) -> Heights:
@@ -124,7 +130,7 @@ class Heights:
     @property
     def sigmas(self) -> Array:
         """Sigmas ``(N,)`` of the heights, m upwards."""
-        return np.full(len(self.of), self.sigma) if self.stated is None else self.stated
+        return np.full(len(self.of), self.sigma) if self.stated is None else self.scale * self.stated
 
     def applied(self, problem: BlockProblem) -> BlockProblem:
         """Return the problem with planes under its points."""
@@ -150,7 +156,7 @@ class Heights:
         for number in range(rounds):
             judged = found._under(solved.problem, solved.state.local)._judged(solved, number)
             problem = judged.applied(solved.problem)
-            if _stable(solved, problem, judged.sigma == found.sigma, judged.common, found.common):
+            if judged._same_errors(found) and _stable(solved, problem):
                 return solved, replace(judged, wrong=found.wrong, broken=found.broken)
             tolerance = NEAR if number == 0 or rounds < _ROUNDS else EXACT
             again = attempt(problem, solved.state, selection, tolerance)
@@ -158,6 +164,11 @@ class Heights:
                 break
             solved, found = again, judged
         return solved, found
+
+    def _same_errors(self, other: Heights) -> bool:
+        """Tell whether their sigmas and shared errors are those of others."""
+        same = (self.sigma, self.scale) == (other.sigma, other.scale)
+        return same and np.array_equal(self.common.value, other.common.value)
 
     def _judged(self, solved: Solved, number: int) -> Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
@@ -170,6 +181,8 @@ class Heights:
         apart, spread, used = found._apart(solved)
         if self.stated is None:
             found = found._estimated(apart, spread, used)
+        elif number:
+            found = found._scaled(apart, spread, used)
         if number > _ROUNDS // 2:
             # Otherwise heights at the limit may be left out and return without end.
             return found
@@ -196,8 +209,13 @@ class Heights:
         normal = planes.axes[:, 2]
         told = np.einsum("nc,ncd,nd->n", normal, covariance, normal)
         upright = np.where(planes.on, planes.sigmas / (self.sigmas * np.sqrt(self.own)), 1.0)
-        whole = np.maximum(planes.sigmas**2, (upright * self.sigmas) ** 2)
-        spread = np.where(taking, whole - told, whole + told)
+        whole, single = planes.sigmas**2, (upright * self.sigmas) ** 2
+        # A height that shares samples with others weighs less than by its own variance.
+        shared = np.maximum(whole - single, 0.0)
+        whole = np.maximum(whole, single)
+        with np.errstate(invalid="ignore"):
+            left = whole - told - shared * (1.0 - told / whole) ** 2
+        spread = np.where(taking, left, whole - shared + told)
         apart = planes.above(local)
         with np.errstate(invalid="ignore"):
             return np.where(used, apart / upright, 0.0), np.where(used, spread / upright**2, np.inf), taking
@@ -212,6 +230,19 @@ class Heights:
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 
+    def _scaled(self, apart: Array, spread: Array, used: Mask) -> Heights:
+        """Return them with larger sigmas where the residuals are significantly larger than stated ones allow.
+
+        Roofs and trees that are too low to be left out one by one do this.
+        """
+        if used.sum() < _ENOUGH:
+            return self
+        square, chance = float(np.mean(apart[used] ** 2 / spread[used])), math.sqrt(2.0 / used.sum())
+        if self.scale == 1.0 and square < 1.0 + _SIGNIFICANT * chance:
+            return self
+        scale = max(self.scale * math.sqrt(square), 1.0)
+        return self if abs(scale / self.scale - 1.0) < 2 * _STABLE else replace(self, scale=scale)
+
     def _breaking(self, solved: Solved) -> Mask:
         """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
         covariance = solved.ground_covariance(solved.cofactors, 1.0)
@@ -223,6 +254,12 @@ class Heights:
         with np.errstate(invalid="ignore"):
             found[rows] = far > _BREAKS * self.sigmas[rows]
         return found
+
+    @property
+    def _sigma_is(self) -> Literal["stated", "enlarged", "estimated", "assumed"]:
+        if self.stated is not None:
+            return "enlarged" if self.scale > 1.0 else "stated"
+        return "estimated" if self.estimated else "assumed"
 
     def record(self, solved: Solved) -> HeightsRecord:
         """Return what is published of them."""
@@ -244,7 +281,7 @@ class Heights:
             at_breaks=int(broken.sum()),
             without=int((active & self.of & ~wrong & ~broken).sum()) - len(used),
             sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else self.sigma,
-            sigma_is="stated" if self.stated is not None else "estimated" if self.estimated else "assumed",
+            sigma_is=self._sigma_is,
             rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
             bias_m=bias,
             bias_sigma_m=bias_sigma,
@@ -256,15 +293,11 @@ class Heights:
         )
 
 
-def _stable(
-    solved: Solved, problem: BlockProblem, same_sigma: bool, common: CommonHeights, before: CommonHeights
-) -> bool:
+def _stable(solved: Solved, problem: BlockProblem) -> bool:
     """Tell whether a problem has the heights of a solution."""
     planes, old, local = problem.heights, solved.problem.heights, solved.state.local
     assert planes is not None
     assert old is not None
-    if not same_sigma or not np.array_equal(common.value, before.value):
-        return False
     off, count = np.abs(planes.above(local) - old.above(local)) / planes.sigmas, planes.on.sum()
     return bool((planes.on != old.on).sum() <= _HARDLY_ANY * count and (off > _STABLE)[planes.on].sum() <= _FEW * count)
 
@@ -278,7 +311,8 @@ class HeightsRecord(Record):
     """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
 
     The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
-    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment.
+    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment. A stated
+    sigma is enlarged if the residuals are significantly larger.
     """
 
     used: Count
@@ -286,7 +320,7 @@ class HeightsRecord(Record):
     at_breaks: Count
     without: Count
     sigma_m: float
-    sigma_is: Literal["stated", "estimated", "assumed"]
+    sigma_is: Literal["stated", "enlarged", "estimated", "assumed"]
     rms_m: float | None
     bias_m: float
     bias_sigma_m: float
@@ -310,6 +344,12 @@ class HeightsRecord(Record):
                 f"accuracy of the heights not given; estimated as {metres(self.sigma_m)} from "
                 f"{counted(self.used, 'height')}. Set it with ",
                 Setting("surface.sigma"),
+            )
+            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
+        elif self.sigma_is == "enlarged":
+            text = Text(
+                f"the DEM and the ties differ more than the stated accuracy of the DEM allows; assuming "
+                f"{metres(self.sigma_m)}, estimated from {counted(self.used, 'height')}. Roofs and trees do this"
             )
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         if self.left_out:
