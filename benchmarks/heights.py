@@ -4,6 +4,7 @@ python benchmarks/heights.py              seven chains of six frames at each con
 python benchmarks/heights.py --seeds 20   more of them
 python benchmarks/heights.py --bound 20   instead: errors beside the least that any estimate can have
 python benchmarks/heights.py --draws 60   instead: found errors over their sigmas, for several errors of the DEM
+python benchmarks/heights.py --blocks 500 instead: blocks of all kinds, pairs that are apart without a warning
 
 The estimate never sees the truth (models, ground, errors of the DEM).
 """
@@ -40,6 +41,10 @@ CONVERGENCE = (1.0, 3.0, 10.0)
 #: Standard deviation (px) of the models, true and stated, where errors are compared with their sigmas.
 HOLD = 5.0
 CELL = 10.0
+#: Sigma (px) of a pair beyond which it is warned of; 95 % of the squares of two normal numbers are less than this.
+LIMIT, CHI_SQUARE = 0.5, 5.99
+#: RMS (px) of the pairs of a block that are determined.
+DETERMINED = 0.2
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=7)
     parser.add_argument("--bound", type=int, default=0, metavar="SEEDS")
     parser.add_argument("--draws", type=int, default=0)
+    parser.add_argument("--blocks", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="first seed of the draws")
     parser.add_argument("--convergence", type=float, action="append", metavar="DEG", help="may be repeated")
     parser.add_argument("--kind", action="append", choices=KINDS, help="may be repeated")
@@ -89,6 +95,8 @@ def main() -> None:
         if options.draws:
             seeds = range(options.first, options.first + options.draws)
             spreads(convergence, options.kind or list(KINDS), seeds, Path(folder))
+        elif options.blocks:
+            silent(range(options.first, options.first + options.blocks), Path(folder))
         elif options.bound:
             bounds(convergence, options.bound, Path(folder))
         else:
@@ -260,6 +268,64 @@ class Normalised:
     def left_out(self) -> float:
         """Share of heights that were left out."""
         return float(np.mean(self.shares))
+
+
+# -- silent cases ------------------------------------------------------------------------------------------------------
+
+
+def silent(seeds: range, folder: Path) -> None:
+    """Print how many pairs of drawn blocks are apart by more than 1 px, or than is claimed, without a warning."""
+    counts = dict.fromkeys(("blocks", "refused", "pairs", "apart", "warned", "silent", "beyond", "close", "false"), 0)
+    for seed in seeds:
+        counts["blocks"] += 1
+        block, heights = any_block(seed, folder / "dem.tif")
+        try:
+            fit = adjust(block.start, block.points, heights=heights, hold=HOLD)
+        except OrthoError as error:
+            counts["refused"] += 1
+            print(f"{seed}: {error}")
+            continue
+        covariances = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+        determined = float(np.sqrt(np.mean(misfits(block, fit) ** 2))) <= DETERMINED
+        for pair in (pair for pair in neighbours(block) if pair in covariances):
+            distance, covariance = apart(block, fit, *pair), covariances[pair]
+            size, square = float(np.hypot(*distance)), float(distance @ np.linalg.solve(covariance, distance))
+            warned = np.linalg.eigvalsh(covariance)[-1] > LIMIT**2
+            counts["pairs"] += 1
+            counts["beyond"] += square > CHI_SQUARE
+            counts["apart"] += size > 1.0
+            counts["warned"] += size > 1.0 and warned
+            counts["silent"] += size > 1.0 and not warned and square > CHI_SQUARE
+            counts["close"] += determined
+            counts["false"] += determined and warned
+            if size > 1.0 and not warned:
+                print(f"{seed}: {pair} {size:.2f} px apart, {np.sqrt(square):.1f} sigma, {block.flown}")
+        if seed % 25 == 24:
+            print(counts, flush=True)
+    share = counts["beyond"] / max(counts["pairs"], 1)
+    print(
+        f"{counts['blocks']} blocks, {counts['refused']} refused; {counts['pairs']} pairs, {100 * share:.1f} % beyond "
+        f"their 95 % ellipses; {counts['apart']} more than 1 px apart, of which {counts['warned']} warned of and "
+        f"{counts['silent']} neither warned of nor within their ellipses; {counts['close']} in blocks "
+        f"with an RMS of at most {DETERMINED} px, of which {counts['false']} warned of"
+    )
+
+
+def any_block(seed: int, path: Path) -> tuple[Block, DemHeights | None]:
+    """Return a block of 3 to 60 images in one or more strips, of any sensor, and with a DEM in seven of ten cases."""
+    random = np.random.default_rng(50_000 + seed)
+    row, strips = int(random.integers(3, 16)), int(random.integers(1, 5))
+    flown = Chain(
+        images=row * strips, strips=strips, convergence_deg=float(random.uniform(0.1, 25.0)),
+        relief=float(random.uniform(5.0, 80.0)), ties=35 * row * strips, normal=True, errors=HOLD,
+        sensor=str(random.choice(["frame", "rpc", "pushbroom"])),
+    )  # fmt: skip
+    block, sigma, bias = fly(flown, seed), float(random.uniform(1.0, 5.0)), float(random.choice([0.0, 5.0]))
+    if random.random() > 0.7:
+        return block, None
+    path.unlink(missing_ok=True)
+    surface = dem(block, path, seed, white=sigma, bias=bias * random.normal(), cell=CELL).with_sigma(sigma)
+    return block, DemHeights(surface, bias=bias, shift=0.0)
 
 
 if __name__ == "__main__":
