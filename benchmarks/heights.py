@@ -4,6 +4,7 @@ python benchmarks/heights.py              seven chains of six frames at each con
 python benchmarks/heights.py --seeds 20   more of them
 python benchmarks/heights.py --bound 20   instead: errors beside the least that any estimate can have
 python benchmarks/heights.py --draws 60   instead: found errors over their sigmas, for several errors of the DEM
+python benchmarks/heights.py --sizes 3    instead: 3 to 60 images of each sensor, without control and with some in one
 python benchmarks/heights.py --blocks 500 instead: blocks of all kinds, pairs that are apart without a warning
 
 The estimate never sees the truth (models, ground, errors of the DEM).
@@ -85,6 +86,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=7)
     parser.add_argument("--bound", type=int, default=0, metavar="SEEDS")
     parser.add_argument("--draws", type=int, default=0)
+    parser.add_argument("--sizes", type=int, default=0, metavar="SEEDS")
     parser.add_argument("--blocks", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="first seed of the draws")
     parser.add_argument("--convergence", type=float, action="append", metavar="DEG", help="may be repeated")
@@ -95,6 +97,8 @@ def main() -> None:
         if options.draws:
             seeds = range(options.first, options.first + options.draws)
             spreads(convergence, options.kind or list(KINDS), seeds, Path(folder))
+        elif options.sizes:
+            sizes(convergence, options.sizes, Path(folder))
         elif options.blocks:
             silent(range(options.first, options.first + options.blocks), Path(folder))
         elif options.bound:
@@ -127,6 +131,32 @@ def compared(convergence: tuple[float, ...], seeds: int, folder: Path) -> None:
             values = np.concatenate([*rows, np.zeros(0)])
             text = f"{values.min():.2f} to {values.max():.2f}, median {np.median(values):.2f}" if len(values) else "-"
             print(f"{angle:4.0f}°  {name:32s} {len(rows):3d} of {seeds} adjusted, apart {text} px", flush=True)
+
+
+def sizes(convergence: tuple[float, ...], seeds: int, folder: Path) -> None:
+    """Print how far neighbours are apart, and how far the last image is off with control in the first only."""
+    for angle in convergence:
+        for sensor in ("frame", "rpc", "pushbroom"):
+            for images, strips in ((3, 1), (6, 1), (20, 1), (20, 4), (60, 1), (60, 4)):
+                greatest, ends = [], []
+                for seed in range(seeds):
+                    flown = Chain(images, strips, angle, ties=35 * images, sensor=sensor)
+                    block = fly(flown, seed)
+                    path = folder / f"{seed}.tif"
+                    path.unlink(missing_ok=True)
+                    surface = dem(block, path, seed, white=2.0).with_sigma(2.0)
+                    greatest.append(misfits(block, adjust(block.start, block.points, heights=surface)).max())
+                    fit = adjust(block.start, with_control(block), heights=surface)
+                    last = block.points.images[-1]
+                    error = fit.models[last].params - block.truth[last].params
+                    ends.append((np.hypot(*error), np.hypot(*fit.sigmas[-2:])))
+                errors, sigmas = np.array(ends).T
+                name = f"{angle:4.0f}°  {sensor:9s} {images:2d} images in {strips}"
+                print(
+                    f"{name}: neighbours up to {max(greatest):.2f} px; control in one: the last is off by up to "
+                    f"{errors.max():.2f} px (sigma {sigmas.max():.2f} px, up to {(errors / sigmas).max():.1f} sigma)",
+                    flush=True,
+                )
 
 
 # -- the least error ---------------------------------------------------------------------------------------------------

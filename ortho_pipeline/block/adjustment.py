@@ -96,7 +96,7 @@ def adjust(
     chosen = models_of(models, points)
     unknown = sorted(set(exclude) - set(points.ids))
     if unknown:
-        raise InputError(f"there is no point {unknown[0]!r} to leave out", field="exclude")
+        raise InputError(f"cannot exclude {unknown[0]!r}: no point has this id", field="exclude")
     # Rays of a point beside each other, and points beside those of the same images: memory is read as it lies.
     order = Ordering.of(points, np.ones(points.rays, dtype=bool), points.control).rays
     stated = points.of_rays(order)
@@ -185,10 +185,10 @@ def _refuse_many_outside(solved: Solved, whole: Selection) -> None:
         low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
         raise DegeneratePoints(
             f"the rays of {number} of {counted(int(of.sum()), 'point')} are parallel or meet outside of their models "
-            f"(heights {low:.0f} to {high:.0f} m): without control the heights are as right as the images lie to each "
-            "other, and that is not enough here",
+            f"(heights {low:.0f} to {high:.0f} m). Without control, heights are only as accurate as the relative "
+            "position of the images, and that is not enough here",
             file=problem.points.source or None,
-            remedy="give control points: one that is seen in two images says how high the block lies",
+            remedy="give a control point that two images show, or a DEM: it fixes the heights of the block",
         )
 
 
@@ -198,7 +198,7 @@ def _among(points: BlockPoints, ids: Set[str]) -> Mask:
 
 
 def _undecided(points: Sequence[str]) -> Notice:
-    text = f"points contradict each other, and without them the block is not determined: {', '.join(points[:10])}"
+    text = f"points contradict each other, but the block is not determined without them: {', '.join(points[:10])}"
     return Notice("undecided-contradiction", text, points=list(points))
 
 
@@ -244,7 +244,7 @@ def _without(points: BlockPoints, lost: Mask) -> list[Notice]:
             who = counted(len(names), f"{role} point takes", f"{role} points take")
             text = (
                 f"{who} no part (fewer rays than needed, rays that do not meet or are parallel, or outside of the "
-                f"models): {some}" + ("; whether their known ground is right is not tested" if role == "check" else "")
+                f"models): {some}" + ("; their known ground is not tested" if role == "check" else "")
             )
             notes.append(Notice("takes-no-part", text, role=role, count=len(names), points=names[:10]))
     return notes
@@ -274,13 +274,13 @@ def pseudo_of(
     found, begin = [], 0
     strangers = sorted(set(priors) - set(points.images))
     if strangers:
-        raise InputError(f"a prior names the image {strangers[0]!r}, which there is not", field="priors")
+        raise InputError(f"a prior is for the image {strangers[0]!r}, which is not in the block", field="priors")
     for image, model in zip(points.images, models, strict=True):
         names = list(model.param_names)
         for name, prior in priors.get(image, {}).items():
             if name not in names:
                 raise InputError(
-                    f"a prior names the parameter {name!r}, which the model of {image!r} does not have",
+                    f"a prior is for the parameter {name!r}, which the model of {image!r} does not have",
                     field="priors",
                     remedy=f"its parameters are {', '.join(names) or 'none'}",
                 )

@@ -235,6 +235,7 @@ class Heights:
 
         Roofs and trees that are too low to be left out one by one do this.
         """
+        used = used & (spread > _REDUNDANT**2 * self.sigmas**2)
         if used.sum() < _ENOUGH:
             return self
         square, chance = float(np.mean(apart[used] ** 2 / spread[used])), math.sqrt(2.0 / used.sum())
@@ -335,28 +336,28 @@ class HeightsRecord(Record):
         found = []
         if self.sigma_is == "assumed":
             text = Text(
-                f"accuracy of the heights not given; assuming {metres(self.sigma_m)}. Set it with ",
+                f"DEM accuracy not given; assuming {metres(self.sigma_m)}. Set it with ",
                 Setting("surface.sigma"),
             )
             found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
         elif self.sigma_is == "estimated":
             text = Text(
-                f"accuracy of the heights not given; estimated as {metres(self.sigma_m)} from "
+                f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from "
                 f"{counted(self.used, 'height')}. Set it with ",
                 Setting("surface.sigma"),
             )
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         elif self.sigma_is == "enlarged":
             text = Text(
-                f"the DEM and the ties differ more than the stated accuracy of the DEM allows; assuming "
-                f"{metres(self.sigma_m)}, estimated from {counted(self.used, 'height')}. Roofs and trees do this"
+                f"DEM and ties differ more than the stated DEM accuracy allows; using {metres(self.sigma_m)}, "
+                f"estimated from {counted(self.used, 'height')}. Roofs and trees cause this"
             )
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         if self.left_out:
             number, named = len(self.left_out), self.left_out[:_NAMED]
-            said = (
-                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees: these heights were not "
+            left_out = (
+                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees. The heights were not "
                 f"used, the ties were ({', '.join(named)})"
             )
-            found.append(Notice("heights-left-out", said, count=number, points=list(named)))
+            found.append(Notice("heights-left-out", left_out, count=number, points=list(named)))
         return found

@@ -60,7 +60,9 @@ class DemHeights:
             value = getattr(self, name)
             if value is not None and not (0 <= value < np.inf and (name != "correlation" or value > 0)):
                 raise InputError(
-                    f"{value} is no {name} of heights", field=f"points.{_OPTIONS[name]}", remedy="give metres"
+                    f"the {name} of heights is {value}, not a length",
+                    field=f"points.{_OPTIONS[name]}",
+                    remedy="give metres",
                 )
         object.__setattr__(self, "surface", self.surface.with_fill("mask"))
 
@@ -71,7 +73,7 @@ class DemHeights:
             return heights
         if isinstance(heights, DemSurface):
             return cls(heights)
-        raise InputError("flat ground is no observation of heights", field="heights", remedy="give a DEM")
+        raise InputError("flat ground has no heights to observe", field="heights", remedy="give a DEM")
 
     def heights(self, ground: Array) -> Array:
         """Return the heights ``(n,)`` at lon, lat ``(n, 2+)``; NaN in voids."""

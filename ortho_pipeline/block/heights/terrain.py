@@ -136,8 +136,8 @@ def expected_slopes(slopes: Array, sigmas: Array, variance: float, images: Index
     weights, of = sigmas[rows] ** -2.0, images[rows]
     sums = np.bincount(of, weights)
     seen = sums > 0
-    means = np.stack([np.bincount(of, weights * slope) for slope in slopes[rows].T], axis=1)
-    means[seen] /= sums[seen, None]
+    totals = np.stack([np.bincount(of, weights * slope) for slope in slopes[rows].T], axis=1)
+    means = totals / np.where(seen, sums, 1.0)[:, None]
     apart = slopes[rows] - means[of]
     covariance = (apart * weights[:, None]).T @ apart
     values, axes = np.linalg.eigh(covariance)
