@@ -152,18 +152,17 @@ class Heights:
 
         After fewer `rounds` than they need, it is near that.
         """
-        found = self
+        heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
-            judged = found._under(solved.problem, solved.state.local)._judged(solved, number)
+            judged = heights._under(solved.problem, solved.state.local)._judged(solved, number)
             problem = judged.applied(solved.problem)
-            if judged._same_errors(found) and _stable(solved, problem):
-                return solved, replace(judged, wrong=found.wrong, broken=found.broken)
-            tolerance = NEAR if number == 0 or rounds < _ROUNDS else EXACT
+            if judged._same_errors(heights) and _stable(solved, problem):
+                return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
             again = attempt(problem, solved.state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
                 break
-            solved, found = again, judged
-        return solved, found
+            solved, heights = again, judged
+        return solved, heights
 
     def _same_errors(self, other: Heights) -> bool:
         """Tell whether their sigmas and shared errors are those of others."""
@@ -177,25 +176,25 @@ class Heights:
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
             common = replace(common, value=common.value + step)
-        found = replace(self, common=common)
-        apart, spread, used = found._apart(solved)
+        judged = replace(self, common=common)
+        residuals, variances, used = judged._residuals(solved)
         if self.stated is None:
-            found = found._estimated(apart, spread, used)
+            judged = judged._estimated(residuals, variances, used)
         elif number:
-            found = found._scaled(apart, spread, used)
+            judged = judged._scaled(residuals, variances, used)
         if number > _ROUNDS // 2:
             # Otherwise heights at the limit may be left out and return without end.
-            return found
-        sigma = np.sqrt(np.maximum(spread, (0.2 * found.sigmas) ** 2))
+            return judged
+        sigmas = np.sqrt(np.maximum(variances, (0.2 * judged.sigmas) ** 2))
         with np.errstate(invalid="ignore"):
-            wrong = np.abs(apart) > np.where(self.wrong, _RIGHT, _WRONG) * sigma
-        broken = found.broken if number else found._breaking(solved)
-        return replace(found, wrong=np.asarray(found.of & wrong), broken=broken)
+            wrong = np.abs(residuals) > np.where(self.wrong, _RIGHT, _WRONG) * sigmas
+        broken = judged.broken if number else judged._breaking(solved)
+        return replace(judged, wrong=np.asarray(judged.of & wrong), broken=broken)
 
-    def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
+    def _residuals(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
 
-        Of one that takes part the residual varies less than the height, of one that does not more.
+        The residual of a height that takes part varies less than the height, that of another one more.
         """
         problem, local = solved.problem, solved.state.local
         planes = self._planes(problem, self.of)
@@ -204,41 +203,39 @@ class Heights:
         used = rows & self.of & planes.on
         assert problem.heights is not None
         taking = used & problem.heights.on
-        # Along the normal; over its share of the vertical both are upwards.
-        covariance = solved.points.ground(solved.cofactors, 1.0)
+        # All along the normal; `upright` is its share of the vertical.
         normal = planes.axes[:, 2]
-        told = np.einsum("nc,ncd,nd->n", normal, covariance, normal)
+        of_points = np.einsum("nc,ncd,nd->n", normal, solved.points.ground(solved.cofactors, 1.0), normal)
         upright = np.where(planes.on, planes.sigmas / (self.sigmas * np.sqrt(self.own)), 1.0)
-        whole, single = planes.sigmas**2, (upright * self.sigmas) ** 2
+        weighed, single = planes.sigmas**2, (upright * self.sigmas) ** 2
         # A height that shares samples with others weighs less than by its own variance.
-        shared = np.maximum(whole - single, 0.0)
-        whole = np.maximum(whole, single)
+        shared = np.maximum(weighed - single, 0.0)
+        weighed = np.maximum(weighed, single)
         with np.errstate(invalid="ignore"):
-            left = whole - told - shared * (1.0 - told / whole) ** 2
-        spread = np.where(taking, left, whole - shared + told)
-        apart = planes.above(local)
-        with np.errstate(invalid="ignore"):
-            return np.where(used, apart / upright, 0.0), np.where(used, spread / upright**2, np.inf), taking
+            left = weighed - of_points - shared * (1.0 - of_points / weighed) ** 2
+            variances = np.where(taking, left, weighed - shared + of_points) / upright**2
+            residuals = planes.above(local) / upright
+        return np.where(used, residuals, 0.0), np.where(used, variances, np.inf), taking
 
-    def _estimated(self, apart: Array, spread: Array, used: Mask) -> Heights:
+    def _estimated(self, residuals: Array, variances: Array, used: Mask) -> Heights:
         """Return them with a robust sigma of the residuals; unchanged if too few have enough redundancy."""
-        redundancy = spread / self.sigma**2
+        redundancy = variances / self.sigma**2
         testable = used & (redundancy > _REDUNDANT)
         if testable.sum() < _ENOUGH:
             return self
-        sigma = _NORMAL * float(np.median(np.abs(apart[testable]) / np.sqrt(redundancy[testable])))
+        sigma = _NORMAL * float(np.median(np.abs(residuals[testable]) / np.sqrt(redundancy[testable])))
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 
-    def _scaled(self, apart: Array, spread: Array, used: Mask) -> Heights:
+    def _scaled(self, residuals: Array, variances: Array, used: Mask) -> Heights:
         """Return them with larger sigmas where the residuals are significantly larger than stated ones allow.
 
         Roofs and trees that are too low to be left out one by one do this.
         """
-        used = used & (spread > _REDUNDANT**2 * self.sigmas**2)
+        used = used & (variances > _REDUNDANT**2 * self.sigmas**2)
         if used.sum() < _ENOUGH:
             return self
-        square, chance = float(np.mean(apart[used] ** 2 / spread[used])), math.sqrt(2.0 / used.sum())
+        square, chance = float(np.mean(residuals[used] ** 2 / variances[used])), math.sqrt(2.0 / used.sum())
         if self.scale == 1.0 and square < 1.0 + _SIGNIFICANT * chance:
             return self
         scale = max(self.scale * math.sqrt(square), 1.0)
