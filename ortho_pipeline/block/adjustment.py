@@ -188,7 +188,7 @@ def _refuse_many_outside(solved: Solved, whole: Selection) -> None:
             f"(heights {low:.0f} to {high:.0f} m). Without control, heights are only as accurate as the relative "
             "position of the images, and that is not enough here",
             file=problem.points.source or None,
-            remedy="give a control point that two images show, or a DEM: it fixes the heights of the block",
+            remedy="give control points that two images show, or a DEM: they fix the heights of the block",
         )
 
 
