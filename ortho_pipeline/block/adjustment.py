@@ -47,6 +47,8 @@ from ortho_pipeline.surface.base import Surface
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3
+#: Heights of a DEM are renewed so often before the search for gross errors.
+_FIRST_ROUNDS = 1
 #: Part of the points that gross errors of their own may lead out of the models; where it is more, the block is tilted.
 _ASTRAY = 0.05
 #: Part of the points beyond which it is not they that are wrong, but where the images lie.
@@ -102,7 +104,7 @@ def adjust(
     chosen = models_of(models, points)
     unknown = sorted(set(exclude) - set(points.ids))
     if unknown:
-        raise InputError(f"there is no point {unknown[0]!r} to leave out", field="exclude")
+        raise InputError(f"cannot exclude {unknown[0]!r}: no point has this id", field="exclude")
     # Rays of a point beside each other, and points beside those of the same images: memory is read as it lies.
     order = Ordering.of(points, np.ones(points.rays, dtype=bool), points.control).rays
     stated = points.of_rays(order)
@@ -110,7 +112,7 @@ def adjust(
     problem, state, whole = _prepared(chosen, stated, priors or {}, exclude, dem)
     dem_heights = None if dem is None else Heights.under(dem, problem, state.local)
     if dem_heights is not None:
-        problem = dem_heights.applied(problem, state.local)
+        problem = dem_heights.applied(problem)
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
@@ -158,7 +160,7 @@ def _first(
     _refuse_many_outside(solved if held is None else held, whole)
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
     if dem_heights is not None:
-        solved, dem_heights = dem_heights.settled(solved, inside, tolerance)
+        solved, dem_heights = dem_heights.settled(solved, inside, _FIRST_ROUNDS)
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
     return solved, inside, dem_heights
@@ -194,7 +196,7 @@ def _refuse_many_outside(solved: Solved, whole: Selection) -> None:
             f"(heights {low:.0f} to {high:.0f} m). Without control points, heights depend on the models of the images, "
             "which are not accurate enough here",
             file=problem.points.source or None,
-            remedy="give control points: one that is measured in two images gives the height of the block",
+            remedy="give control points that two images show, or a DEM: they fix the heights of the block",
         )
 
 
@@ -204,7 +206,7 @@ def _among(points: BlockPoints, ids: Set[str]) -> Mask:
 
 
 def _undecided(points: Sequence[str]) -> Notice:
-    text = f"points contradict each other, and without them the block is not determined: {', '.join(points[:10])}"
+    text = f"points contradict each other, but the block is not determined without them: {', '.join(points[:10])}"
     return Notice("undecided-contradiction", text, points=list(points))
 
 
@@ -250,7 +252,7 @@ def _without(points: BlockPoints, lost: Mask) -> list[Notice]:
             who = counted(len(names), f"{role} point takes", f"{role} points take")
             text = (
                 f"{who} no part (fewer rays than needed, rays that do not meet or are parallel, or outside of the "
-                f"models): {some}" + ("; whether their known ground is right is not tested" if role == "check" else "")
+                f"models): {some}" + ("; their known ground is not tested" if role == "check" else "")
             )
             notes.append(Notice("takes-no-part", text, role=role, count=len(names), points=names[:10]))
     return notes
@@ -280,13 +282,13 @@ def pseudo_of(
     found, begin = [], 0
     strangers = sorted(set(priors) - set(points.images))
     if strangers:
-        raise InputError(f"a prior names the image {strangers[0]!r}, which there is not", field="priors")
+        raise InputError(f"a prior is for the image {strangers[0]!r}, which is not in the block", field="priors")
     for image, model in zip(points.images, models, strict=True):
         names = list(model.param_names)
         for name, prior in priors.get(image, {}).items():
             if name not in names:
                 raise InputError(
-                    f"a prior names the parameter {name!r}, which the model of {image!r} does not have",
+                    f"a prior is for the parameter {name!r}, which the model of {image!r} does not have",
                     field="priors",
                     remedy=f"its parameters are {', '.join(names) or 'none'}",
                 )
@@ -310,7 +312,9 @@ def _weighed(
     """Return the solution with the sigmas that the observations have, what is known of these, and common errors."""
     if common is not None:
         solved, common = common.settled(solved, selection)
-    found = posterior(solved)
+    if dem_heights is not None:
+        solved, dem_heights = dem_heights.settled(solved, selection)
+    settled, found = solved, posterior(solved)
     for _ in range(_WEIGHINGS):
         if found.moved <= _MOVED:
             break
@@ -323,7 +327,7 @@ def _weighed(
         before = solved
         solved, common = common.settled(solved, selection)
         found = found if solved is before else posterior(solved)
-    if dem_heights is not None:
+    if dem_heights is not None and solved is not settled:
         before = solved
         solved, dem_heights = dem_heights.settled(solved, selection)
         found = found if solved is before else posterior(solved)

@@ -42,7 +42,7 @@ def with_datum(
     """Return the problem with a datum, and what defines it."""
     control = int((problem.active(selection) & selection.ground).sum())
     if hold is not None and not hold > 0:
-        raise InputError("a standard deviation is positive", field="hold")
+        raise InputError("a standard deviation must be positive", field="hold")
     if not problem.size:
         return problem, "nothing is adjusted but the points: the models stay as they are"
     if hold is None and control:

@@ -23,9 +23,9 @@ def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
     rays = selection.rays & problem.active(selection)[points.point]
     if not rays.any():
         raise TooFewPoints(
-            "no point was measured in two images, or in one with known ground",
+            "no point is in two images, and no point with known ground is in one",
             file=points.source or None,
-            remedy="points of one id are one point: check the ids and the names of the images",
+            remedy="check the ids of the points and the names of the images: points with the same id are one point",
         )
     of_priors, _ = problem.columns.image_and_place([one.column for one in problem.pseudo])
     priors = np.bincount(of_priors, minlength=len(problem.models))
@@ -92,8 +92,8 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         name = problem.points.images[image]
         if inside > EXTRAPOLATION_LIMIT and not held:
             raise DegeneratePoints(
-                f"the points do not determine the image {name!r}: at its own points it is {inside:.0f} times less "
-                "certain than these were measured",
+                f"the points do not determine the image {name!r}: at them, its position is {inside:.0f} times less "
+                "accurate than the measurements",
                 file=problem.points.source or None,
                 remedy="give more control points in it, spread in plan and height, or take a simpler model",
             )
@@ -102,6 +102,6 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            text = f"at a corner {factor:.0f} times less certain than a measured point"
+            text = f"at a corner, the position is {factor:.0f} times less accurate than a measured point"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

@@ -72,10 +72,10 @@ def read_block_points(
         joined.add(gcps, [row for row in known.rows if row.id in joined.index], ground, known.rows)
         if not any(row.id in joined.index for row in known.rows):
             raise InputError(
-                "none of these points was measured in an image",
+                "no image shows any of these points",
                 file=gcps,
                 field="id",
-                remedy=f"the ids have to be those of {os.fspath(path)}",
+                remedy=f"use the ids of {os.fspath(path)}",
             )
     return joined.points(path, rays.rows, shift, pyproj.CRS.from_epsg(4326) if plane is None else plane)
 
@@ -98,7 +98,9 @@ def _placed(
         if math.isfinite(row.ground[0]) != math.isfinite(row.ground[1]) or (
             math.isfinite(row.ground[2]) and not math.isfinite(row.ground[0])
         ):
-            raise InputError("ground is x and y, or none", file=path, field=row.where, remedy="give both or neither")
+            raise InputError(
+                "x, y or both are missing", file=path, field=row.where, remedy="give x and y, or no ground"
+            )
     if not any(math.isfinite(row.ground[0]) for row in table.rows):
         return np.full((len(table.rows), 3), np.nan), None
     return ground_of(path, table, crs, vertical)

@@ -99,10 +99,14 @@ class BlockPoints:
     def __post_init__(self) -> None:
         count, rays = len(self.ids), len(self.point)
         for name, shape, kind in (
-            ("ground", (count, 3), float), ("sigma_ground", (count, 3), float), ("point", (rays,), np.int64),
-            ("image", (rays,), np.int64), ("measured", (rays, 2), float), ("sigma_image", (rays,), float),
+            ("ground", (count, 3), float),
+            ("sigma_ground", (count, 3), float),
+            ("point", (rays,), np.int64),
+            ("image", (rays,), np.int64),
+            ("measured", (rays, 2), float),
+            ("sigma_image", (rays,), float),
             ("roles", (count,), "<U7"),
-        ):  # fmt: skip
+        ):
             array = np.asarray(getattr(self, name), dtype=kind)
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}, not {shape}", field=name)
@@ -138,34 +142,7 @@ class BlockPoints:
         InputError
             If the tables contradict each other in the ground or the role of a point.
         """
-        if not tables:
-            raise InputError("a block has images with points", field="points")
-        crs = next(iter(tables.values())).crs
-        index, first, rays = dict[str, int](), list[tuple[Points, int]](), list[tuple[int, int]]()
-        for number, (name, table) in enumerate(tables.items()):
-            moved = table if same_crs(table.crs, crs) else table.to_crs(crs)
-            for k, one in enumerate(moved.ids):
-                row = index.setdefault(one, len(index))
-                if row == len(first):
-                    first.append((moved, k))
-                else:
-                    _agree(one, name, *first[row], moved, k)
-                rays.append((row, number))
-
-        def stated(what: str) -> Any:
-            return [getattr(of, what)[k] for of, k in first]
-
-        places = np.array(rays, dtype=np.int64).reshape(-1, 2)
-        return cls(
-            ids=tuple(index), ground=np.reshape(stated("ground"), (-1, 3)), roles=np.array(stated("roles"), "<U7"),
-            sigma_ground=np.reshape(stated("sigma_ground"), (-1, 3)), crs=crs, images=tuple(tables), point=places[:, 0],
-            image=places[:, 1], measured=np.concatenate([table.image for table in tables.values()]),
-            sigma_image=np.concatenate([table.sigma_image for table in tables.values()]),
-            source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
-            shape_image=shape_of(np.concatenate([table.covariance_image for table in tables.values()])),
-            sigma_common=np.array(stated("sigma_common")),
-            groups=np.concatenate([table.groups for table in tables.values()]),
-        )  # fmt: skip
+        return _joined(tables)
 
     @property
     def control(self) -> NDArray[np.bool_]:
@@ -215,9 +192,10 @@ class BlockPoints:
         height = plan if height is None else height
         if not (is_usable(plan) and plan > 0 and is_usable(height) and height > 0):
             raise InputError(
-                "standard deviations of the ground are positive numbers", field="points.ground_sigma",
+                "standard deviations of the ground must be positive",
+                field="points.ground_sigma",
                 remedy="give metres in plan, or in plan and height, such as 0.5,1",
-            )  # fmt: skip
+            )
         return replace(self, sigma_ground=np.where(self.sigma_ground > 0, self.sigma_ground, (plan, plan, height)))
 
     def select(self, mask: ArrayLike) -> BlockPoints:
@@ -227,18 +205,27 @@ class BlockPoints:
         place[chosen] = np.arange(len(chosen))
         rays = place[self.point] >= 0
         return replace(
-            self.of_rays(rays), ids=tuple(self.ids[i] for i in chosen), ground=self.ground[chosen],
-            roles=self.roles[chosen], sigma_ground=self.sigma_ground[chosen], point=place[self.point[rays]],
+            self.of_rays(rays),
+            ids=tuple(self.ids[i] for i in chosen),
+            ground=self.ground[chosen],
+            roles=self.roles[chosen],
+            sigma_ground=self.sigma_ground[chosen],
+            point=place[self.point[rays]],
             sigma_common=self.sigma_common[chosen],
-        )  # fmt: skip
+        )
 
     def of_rays(self, rays: ArrayLike) -> BlockPoints:
         """Return these points with some of their rays, a mask ``(M,)`` or indices; points without any stay."""
         chosen = np.arange(self.rays)[np.asarray(rays)]
         return replace(
-            self, point=self.point[chosen], image=self.image[chosen], measured=self.measured[chosen],
-            sigma_image=self.sigma_image[chosen], shape_image=self._shape_of(chosen), groups=self.grouped[chosen],
-        )  # fmt: skip
+            self,
+            point=self.point[chosen],
+            image=self.image[chosen],
+            measured=self.measured[chosen],
+            sigma_image=self.sigma_image[chosen],
+            shape_image=self._shape_of(chosen),
+            groups=self.grouped[chosen],
+        )
 
     def _shape_of(self, rays: NDArray[Any]) -> Array | None:
         return None if self.shape_image is None else self.shape_image[rays]
@@ -268,17 +255,26 @@ class BlockPoints:
         """Return the points that were measured in one image, as the table of that image."""
         if name not in self.images:
             raise InputError(
-                f"there are no points of the image {name!r}", file=self.source or None, field="image",
+                f"no point was measured in the image {name!r}",
+                file=self.source or None,
+                field="image",
                 remedy=f"the images are {', '.join(self.images)}",
-            )  # fmt: skip
+            )
         rays = np.flatnonzero(self.image == self.images.index(name))
         rows = self.point[rays]
         return Points(
-            ids=tuple(self.ids[i] for i in rows), image=self.measured[rays], ground=self.ground[rows],
-            roles=self.roles[rows], sigma_image=self.sigma_image[rays], sigma_ground=self.sigma_ground[rows],
-            crs=self.crs, source=self.source, covariance_image=self.covariance_image[rays],
-            sigma_common=self.sigma_common[rows], groups=self.grouped[rays],
-        )  # fmt: skip
+            ids=tuple(self.ids[i] for i in rows),
+            image=self.measured[rays],
+            ground=self.ground[rows],
+            roles=self.roles[rows],
+            sigma_image=self.sigma_image[rays],
+            sigma_ground=self.sigma_ground[rows],
+            crs=self.crs,
+            source=self.source,
+            covariance_image=self.covariance_image[rays],
+            sigma_common=self.sigma_common[rows],
+            groups=self.grouped[rays],
+        )
 
     def known_in(self, crs: str | pyproj.CRS) -> Array:
         """Return the known ground ``(N, 3)`` in another CRS; an unknown height makes the whole row NaN."""
@@ -288,36 +284,80 @@ class BlockPoints:
 
 def _check_values(points: BlockPoints) -> None:
     if not np.isin(points.roles, ROLES).all():
-        raise InputError(f"each point has one role of {', '.join(ROLES)}", field="roles")
+        raise InputError(f"the role of a point must be one of {', '.join(ROLES)}", field="roles")
     if not np.isfinite(points.measured).all() or not (points.sigma_image > 0).all():
-        raise InputError("measurements are finite, their sigmas positive", field="measured, sigma_image")
+        raise InputError("measurements must be finite, and their sigmas positive", field="measured, sigma_image")
     if not (points.sigma_ground >= 0).all():
-        raise InputError("standard deviations are not negative", field="sigma_ground")
+        raise InputError("a standard deviation must not be negative", field="sigma_ground")
     for role in ("control", "check"):
         nowhere = (points.roles == role) & ~np.isfinite(points.ground[:, :2]).all(axis=1)
         if nowhere.any():
             names = ", ".join(points.ids[i] for i in np.flatnonzero(nowhere)[:5])
             raise InputError(
-                f"{role} points without ground coordinates: {names}", file=points.source or None, field="role",
+                f"{role} points without ground coordinates: {names}",
+                file=points.source or None,
+                field="role",
                 remedy="give their ground, or make them tie points",
-            )  # fmt: skip
+            )
+
+
+def _joined(tables: Mapping[str, Points]) -> BlockPoints:
+    """Return the points of several tables, by name of the image."""
+    if not tables:
+        raise InputError("no images with points; a block needs some", field="points")
+    crs = next(iter(tables.values())).crs
+    index, first, rays = dict[str, int](), list[tuple[Points, int]](), list[tuple[int, int]]()
+    for number, (name, table) in enumerate(tables.items()):
+        moved = table if same_crs(table.crs, crs) else table.to_crs(crs)
+        for k, one in enumerate(moved.ids):
+            row = index.setdefault(one, len(index))
+            if row == len(first):
+                first.append((moved, k))
+            else:
+                _agree(one, name, *first[row], moved, k)
+            rays.append((row, number))
+
+    def stated(what: str) -> Any:
+        return [getattr(of, what)[k] for of, k in first]
+
+    places = np.array(rays, dtype=np.int64).reshape(-1, 2)
+    return BlockPoints(
+        ids=tuple(index),
+        ground=np.reshape(stated("ground"), (-1, 3)),
+        roles=np.array(stated("roles"), "<U7"),
+        sigma_ground=np.reshape(stated("sigma_ground"), (-1, 3)),
+        crs=crs,
+        images=tuple(tables),
+        point=places[:, 0],
+        image=places[:, 1],
+        measured=np.concatenate([table.image for table in tables.values()]),
+        sigma_image=np.concatenate([table.sigma_image for table in tables.values()]),
+        source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
+        shape_image=shape_of(np.concatenate([table.covariance_image for table in tables.values()])),
+        sigma_common=np.array(stated("sigma_common")),
+        groups=np.concatenate([table.groups for table in tables.values()]),
+    )
 
 
 def _check_identity(points: BlockPoints) -> None:
     if len(set(points.ids)) != len(points.ids) or len(set(points.images)) != len(points.images):
-        raise InputError("an id or the name of an image stands twice", file=points.source or None, field="id")
+        raise InputError("duplicate id or image name", file=points.source or None, field="id")
     if len(points.point) and not (
-        (points.point >= 0).all() and (points.point < len(points.ids)).all()
-        and (points.image >= 0).all() and (points.image < len(points.images)).all()
-    ):  # fmt: skip
-        raise InputError("a ray is of a point or an image that does not exist", field="point, image")
+        (points.point >= 0).all()
+        and (points.point < len(points.ids)).all()
+        and (points.image >= 0).all()
+        and (points.image < len(points.images)).all()
+    ):
+        raise InputError("a measurement names a point or an image that does not exist", field="point, image")
     rays, counts = np.unique(points.point * max(len(points.images), 1) + points.image, return_counts=True)
     if (counts > 1).any():
         point, image = divmod(int(rays[counts > 1][0]), len(points.images))
         raise InputError(
             f"the point {points.ids[point]!r} was measured twice in the image {points.images[image]!r}",
-            file=points.source or None, field="id", remedy="remove one of the two measurements",
-        )  # fmt: skip
+            file=points.source or None,
+            field="id",
+            remedy="remove one of the two measurements",
+        )
 
 
 def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
@@ -342,12 +382,21 @@ def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
         return np.concatenate([getattr(table, name) for table in tables])
 
     return BlockPoints(
-        ids=tuple(ids), ground=np.concatenate(grounds), roles=all_of("roles"), sigma_ground=all_of("sigma_ground"),
-        crs=crs, images=tuple(images), point=np.concatenate(points), image=np.concatenate(places),
-        measured=all_of("measured"), sigma_image=all_of("sigma_image"),
+        ids=tuple(ids),
+        ground=np.concatenate(grounds),
+        roles=all_of("roles"),
+        sigma_ground=all_of("sigma_ground"),
+        crs=crs,
+        images=tuple(images),
+        point=np.concatenate(points),
+        image=np.concatenate(places),
+        measured=all_of("measured"),
+        sigma_image=all_of("sigma_image"),
         source=", ".join(dict.fromkeys(table.source for table in tables if table.source)),
-        shape_image=shape_of(all_of("covariance_image")), sigma_common=all_of("sigma_common"), groups=all_of("grouped"),
-    )  # fmt: skip
+        shape_image=shape_of(all_of("covariance_image")),
+        sigma_common=all_of("sigma_common"),
+        groups=all_of("grouped"),
+    )
 
 
 def _agree(one: str, name: str, first: Points, row: int, table: Points, k: int) -> None:
@@ -358,9 +407,11 @@ def _agree(one: str, name: str, first: Points, row: int, table: Points, k: int) 
     ):
         if not same:
             raise InputError(
-                f"the {what} of the point {one!r} is another one in the image {name!r}", file=table.source or None,
-                field="role" if what == "role" else "x, y, h", remedy="points of one id are one point on the ground",
-            )  # fmt: skip
+                f"the {what} of the point {one!r} differs in the image {name!r}",
+                file=table.source or None,
+                field="role" if what == "role" else "x, y, h",
+                remedy="points with the same id must have the same ground and role",
+            )
 
 
 def shape_of(covariance: Array) -> Array | None:

@@ -8,11 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pyproj
+from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.exchange.rpc import export_rpc
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import FrameCamera, ImageCorrection
-from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.surface.dem import DemSurface, open_dem
 from ortho_pipeline.surface.writing import write_dem
@@ -30,7 +34,9 @@ class Chain:
     """How a chain of frames is flown.
 
     `errors` are how far (px) the vendor's models are off, uniformly in each axis; normally distributed if `normal`.
-    Ties are of two images each if `pairwise`, as a matcher of pairs makes them, else of all that show them.
+    Ties are of two images each if `pairwise`, as a matcher of pairs makes them, else of all that show them. The shares
+    `trees` and `roofs` of them are 15 m, and 3 to 12 m, above the ground. A `sensor` is a frame, a pushbroom in orbit
+    that looks to alternate sides, or the RPC of one.
     """
 
     images: int = 6
@@ -44,6 +50,9 @@ class Chain:
     normal: bool = False
     noise: float = 0.1
     pairwise: bool = True
+    trees: float = 0.0
+    roofs: float = 0.0
+    sensor: str = "frame"
 
     @property
     def base(self) -> float:
@@ -94,6 +103,28 @@ def camera(flown: Chain, along: float, across: float) -> FrameCamera:
     )  # fmt: skip
 
 
+def scanner(flown: Chain, along: float, across: float, place: int) -> SensorModel:
+    """Return the pushbroom, or its RPC, whose middle ray meets the level so many metres east and north."""
+    lon, lat, _ = ground_transform(CRS, GEODETIC)(np.array([[EAST + along, NORTH + across, LEVEL]]))[0]
+    margin = 3 * flown.relief + 50.0
+    off_nadir_deg = flown.tilt_deg + (place % 2 - 0.5) * flown.convergence_deg
+    model = LineScanner.over(
+        lon, lat, LEVEL, image_width=WIDTH, image_height=HEIGHT, gsd=PIXEL, off_nadir_deg=off_nadir_deg,
+        heading_deg=0.0, heights=(LEVEL - margin, LEVEL + margin),
+    )  # fmt: skip
+    return export_rpc(model).rpc if flown.sensor == "rpc" else model
+
+
+def to_image(model: SensorModel, ground: Array) -> Array:
+    """Return the image points of ground ``(N, 3)`` in `CRS`."""
+    return model.ground_to_image(ground_transform(CRS, model.crs)(ground))
+
+
+def to_ground(model: SensorModel, image: Array, heights: Array) -> Array:
+    """Return the ground ``(N, 3)`` in `CRS` of image points at heights."""
+    return ground_transform(model.crs, CRS)(model.image_to_ground(image, heights))
+
+
 def fly(flown: Chain, seed: int) -> Block:
     """Return a chain, its ties, and the truth."""
     random = np.random.default_rng(seed)
@@ -102,7 +133,8 @@ def fly(flown: Chain, seed: int) -> Block:
     row = flown.images // flown.strips
     for number in range(flown.images):
         strip, place = divmod(number, row)
-        frame = camera(flown, place * flown.base, strip * 0.7 * HEIGHT * PIXEL)
+        east, north = place * flown.base, strip * 0.7 * HEIGHT * PIXEL
+        frame = camera(flown, east, north) if flown.sensor == "frame" else scanner(flown, east, north, place + strip)
         off = random.normal(0, flown.errors, 2) if flown.normal else random.uniform(-flown.errors, flown.errors, 2)
         start[f"i{number}"] = ImageCorrection.identity(frame, "shift", ORIGIN)
         truth[f"i{number}"] = start[f"i{number}"].with_params(off)
@@ -111,15 +143,15 @@ def fly(flown: Chain, seed: int) -> Block:
     ground = np.zeros((0, 3))
     while len(ground) < flown.ties:
         plan = np.array([EAST, NORTH]) + random.uniform(low, high, (2 * flown.ties, 2))
-        some = np.column_stack([plan, terrain.heights(plan)])
-        seen = sum(_inside(model.ground_to_image(some)).astype(int) for model in truth.values())
+        some = np.column_stack([plan, terrain.heights(plan) + _above(flown, random, len(plan))])
+        seen = sum(_inside(to_image(model, some)).astype(int) for model in truth.values())
         ground = np.concatenate([ground, some[seen >= 2]])[: flown.ties]
     point, image, measured = [], [], []
-    shown = np.stack([_inside(model.ground_to_image(ground)) for model in truth.values()], axis=1)
+    shown = np.stack([_inside(to_image(model, ground)) for model in truth.values()], axis=1)
     if flown.pairwise:
         shown = _paired(shown, random)
     for number, model in enumerate(truth.values()):
-        at = model.ground_to_image(ground)
+        at = to_image(model, ground)
         inside = np.flatnonzero(shown[:, number])
         point.append(inside)
         image.append(np.full(len(inside), number))
@@ -131,6 +163,15 @@ def fly(flown: Chain, seed: int) -> Block:
         measured=np.concatenate(measured), sigma_image=np.full(sum(map(len, measured)), flown.noise),
     )  # fmt: skip
     return Block(flown, start, truth, points, ground, terrain)
+
+
+def _above(flown: Chain, random: np.random.Generator, count: int) -> Array:
+    """Return how far ``(n,)`` ties are above the ground, m."""
+    if not (flown.trees or flown.roofs):
+        return np.zeros(count)
+    of = random.random(count)
+    roofs = (of >= flown.trees) & (of < flown.trees + flown.roofs)
+    return 15.0 * (of < flown.trees) + roofs * random.uniform(3.0, 12.0, count)
 
 
 def _paired(shown: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -224,8 +265,8 @@ def apart(block: Block, fit: BlockFit, first: str, second: str) -> Array:
     mine = [set(points.point[points.image == points.images.index(name)].tolist()) for name in (first, second)]
     ground = block.ground[sorted(mine[0] & mine[1])]
     for name in (first, second):
-        seen = block.truth[name].ground_to_image(ground)
-        found.append(fit.models[name].image_to_ground(seen, ground[:, 2])[:, :2])
+        seen = to_image(block.truth[name], ground)
+        found.append(to_ground(fit.models[name], seen, ground[:, 2])[:, :2])
     return np.asarray((found[1] - found[0]).mean(axis=0) / PIXEL)
 
 

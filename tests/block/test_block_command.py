@@ -546,7 +546,7 @@ def test_pixel_centres_and_ground_of_its_own(tmp_path: Path) -> None:
     with pytest.raises(CrsError, match="CRS of these points is unknown"):
         read(tmp_path, text, gcps=tmp_path / "ground.csv")
     (tmp_path / "ground.csv").write_text("id,x,y,h\nq,24.4,-33.6,100\n")
-    with pytest.raises(InputError, match="none of these points was measured"):
+    with pytest.raises(InputError, match="no image shows any of these points"):
         read(tmp_path, text, **given)
 
 
@@ -558,7 +558,7 @@ def test_pixel_centres_and_ground_of_its_own(tmp_path: Path) -> None:
         ("a,l,1,2,,,,\na,l,3,4,,,,\n", "measured twice in the image 'l'"),
         ("a,l,1,2,,,,\nb,l,1,2,,,,\n", "the same pixel of the same image"),
         ("a,l,1,2,24,-33,5,\nb,l,3,4,24,-33,5,\n", "have the same ground"),
-        ("a,l,1,2,24,,5,\n", "ground is x and y, or none"),
+        ("a,l,1,2,24,,5,\n", "x, y or both are missing"),
         ("a,l,1,2,,,,control\n", "control points without ground"),
         ("a,l,1,nan,,,,\n", "is not a number"),
         ("a,,1,2,,,,\n", "this point has no image"),

@@ -157,7 +157,7 @@ class BlockProblem:
     def with_sigmas(self, image: Array, assumed: tuple[float, float]) -> BlockProblem:
         """Return this problem with other sigmas of measurements ``(M,)``, and of known ground that states none."""
         found = copy.copy(self)
-        for name in ("ground_sigmas", "firmness"):
+        for name in ("ground_sigmas", "firmness", "_observed"):
             found.__dict__.pop(name, None)
         object.__setattr__(found, "points", self.points.with_image_sigmas(image))
         object.__setattr__(found, "assumed", assumed)
@@ -166,6 +166,7 @@ class BlockProblem:
     def with_heights(self, heights: Planes | None) -> BlockProblem:
         """Return this problem with other heights of a surface."""
         found = copy.copy(self)
+        found.__dict__.pop("_observed", None)
         object.__setattr__(found, "heights", heights)
         return found
 
@@ -255,10 +256,24 @@ class BlockProblem:
 
     def on_points(self, local: Array, rows: Index) -> OnPoints:
         """Return what is observed of the places of points `rows` ``(n,)`` by themselves, with points at `local`."""
-        apart = (self.enu[rows] @ (self.target[rows] - local[rows])[:, :, None])[:, :, 0]
-        apart = np.where(np.isfinite(self.known[rows]), apart, 0.0)
-        found = OnPoints(apart, self.enu[rows], self.ground_sigmas[rows])
-        return found if self.heights is None else found.with_heights(self.heights, local, rows)
+        observed, placed = self._observed, self.placed[rows]
+        apart, known = np.zeros((len(rows), 3)), rows[placed]
+        off = (self.enu[known] @ (self.target[known] - local[known])[:, :, None])[:, :, 0]
+        apart[placed] = np.where(np.isfinite(self.known[known]), off, 0.0)
+        found = OnPoints(apart, observed.axes[rows], observed.sigmas[rows])
+        if self.heights is not None:
+            on = self.heights.on[rows]
+            apart[on, 2] = self.heights.above(local, rows[on])
+        return found
+
+    @cached_property
+    def _observed(self) -> OnPoints:
+        """Axes and sigmas of what is observed of the places of all points ``(N,)``, but not how far they are apart."""
+        if self.heights is None:
+            return OnPoints(np.zeros((0, 3)), self.enu, self.ground_sigmas)
+        on, axes, sigmas = self.heights.on, self.enu.copy(), self.ground_sigmas.copy()
+        axes[on], sigmas[on, 2] = self.heights.axes[on], self.heights.sigmas[on]
+        return OnPoints(np.zeros((0, 3)), axes, sigmas)
 
     def pseudo_equations(self, state: State) -> PseudoEquations:
         """Return the equations of priors, datum and the models' constraints at a state."""

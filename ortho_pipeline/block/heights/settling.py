@@ -6,16 +6,19 @@ if it agrees again. No height is used in a void, beside one, or at a cliff withi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
-from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
+from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
-from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights, planes_at
+from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
+from ortho_pipeline.block.heights.terrain import Terrain
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors.texts import Setting, Text, counted
@@ -24,16 +27,19 @@ from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.models.base import Array
 
-#: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma.
-_ROUNDS, _STABLE, _FEW = 10, 0.02, 0.02
+#: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma,
+#: and hardly any (a share) were left out anew or take part again.
+_ROUNDS, _STABLE, _FEW, _HARDLY_ANY = 10, 0.02, 0.02, 1e-3
 #: The estimate of shared errors is stable if it changes by less than this, in standard deviations.
 _SHARED_STABLE = 0.02
-#: A height farther off than so many of its sigmas is left out.
-_WRONG = 4.0
+#: A height farther off than so many of its sigmas is left out; it takes part again if it is nearer than so many.
+_WRONG, _RIGHT = 4.0, 3.0
 #: A height is at a break if the DEM is more sigmas off its plane within the uncertainty of the place.
 _BREAKS = 4.0
 #: A sigma is estimated from so many heights or more, each of at least this redundancy.
 _ENOUGH, _REDUNDANT = 50, 0.2
+#: Stated sigmas count as too small if residuals are larger by so many standard deviations of their mean square.
+_SIGNIFICANT = 2.5
 #: A notice names so many points.
 _NAMED = 10
 #: The sigma of a normal distribution over its median absolute value.
@@ -49,6 +55,10 @@ class Heights:
     source : DemHeights
     of : ndarray (N,) of bool
         Points that take the height of the DEM, if it has one there.
+    images : ndarray (N,)
+        The first image that shows each point.
+    terrain : Terrain
+        The DEM under the points.
     stated : ndarray (N,) or None
         Stated sigmas of the heights, m upwards.
     sigma : float
@@ -61,10 +71,14 @@ class Heights:
         Left out: heights that contradict their ties, and heights at breaks of the DEM.
     estimated : bool
         Whether `sigma` was.
+    scale : float
+        How many times larger than stated their errors are, at least 1.
     """
 
     source: DemHeights
     of: Mask
+    images: Index
+    terrain: Terrain
     stated: Array | None
     sigma: float
     own: Array
@@ -72,6 +86,7 @@ class Heights:
     wrong: Mask
     broken: Mask
     estimated: bool = False
+    scale: float = 1.0
 
     @classmethod
     def under(cls, source: DemHeights, problem: BlockProblem, local: Array) -> Heights:
@@ -100,7 +115,11 @@ class Heights:
             loads = np.hstack([loads, more])
         none = np.zeros(count, dtype=bool)
         common = CommonHeights.of(loads, bias, len(rows), problem.size)
-        return cls(source, of, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        images = np.full(count, len(problem.models))
+        np.minimum.at(images, problem.points.point, problem.points.image)
+        each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
+        terrain = Terrain.under(source, _places(problem, local), of, each, images)
+        return cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
 
     @property
     def shift(self) -> float:
@@ -111,101 +130,134 @@ class Heights:
     @property
     def sigmas(self) -> Array:
         """Sigmas ``(N,)`` of the heights, m upwards."""
-        return np.full(len(self.of), self.sigma) if self.stated is None else self.stated
+        return np.full(len(self.of), self.sigma) if self.stated is None else self.scale * self.stated
 
-    def applied(self, problem: BlockProblem, local: Array) -> BlockProblem:
-        """Return the problem with planes under points at `local` ``(N, 3)``."""
-        return problem.with_heights(self._planes(problem, local, self.of & ~self.wrong & ~self.broken)[0])
+    def applied(self, problem: BlockProblem) -> BlockProblem:
+        """Return the problem with planes under its points."""
+        return problem.with_heights(self._planes(problem, self.of & ~self.wrong & ~self.broken))
 
-    def _planes(self, problem: BlockProblem, local: Array, of: Mask) -> tuple[Planes, Array]:
-        """Return the planes under points of a mask ``(N,)``, and their slopes ``(N, 2)``."""
-        return planes_at(self.source, problem, local, of, self.sigmas * np.sqrt(self.own), self.common.offset)
+    def _planes(self, problem: BlockProblem, of: Mask) -> Planes:
+        """Return the planes under points of a mask ``(N,)``."""
+        return self.terrain.planes(problem, of, self.sigmas * np.sqrt(self.own), self.common.offset)
 
-    def settled(self, solved: Solved, selection: Selection, tolerance: float = EXACT) -> tuple[Solved, Heights]:
-        """Return the solution with stable heights, from one near it, and these heights."""
-        found = self
-        for number in range(_ROUNDS):
-            judged = found._judged(solved, number)
-            problem = judged.applied(solved.problem, solved.state.local)
-            planes, before = problem.heights, solved.problem.heights
-            assert planes is not None
-            assert before is not None
-            off = np.abs(planes.above(solved.state.local) - before.above(solved.state.local)) / planes.sigmas
-            same = bool((planes.on == before.on).all()) and judged.sigma == found.sigma
-            same &= np.array_equal(judged.common.value, found.common.value)
-            if same and (off > _STABLE)[planes.on].sum() <= _FEW * planes.on.sum():
-                return solved, judged
+    def _under(self, problem: BlockProblem, local: Array) -> Heights:
+        """Return them with the DEM under points at `local` ``(N, 3)``."""
+        ground = _places(problem, local)
+        return replace(
+            self, terrain=Terrain.under(self.source, ground, self.of, self.sigmas, self.images, self.terrain)
+        )
+
+    def settled(self, solved: Solved, selection: Selection, rounds: int = _ROUNDS) -> tuple[Solved, Heights]:
+        """Return the solution with stable heights, from one near it, and these heights.
+
+        After fewer `rounds` than they need, it is near that.
+        """
+        heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
+        for number in range(rounds):
+            judged = heights._under(solved.problem, solved.state.local)._judged(solved, number)
+            problem = judged.applied(solved.problem)
+            if judged._same_errors(heights) and _stable(solved, problem):
+                return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
             again = attempt(problem, solved.state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
-                return solved, found
-            solved, found = again, judged
-        return solved, found
+                break
+            solved, heights = again, judged
+        return solved, heights
+
+    def _same_errors(self, other: Heights) -> bool:
+        """Tell whether their sigmas and shared errors are those of others."""
+        same = (self.sigma, self.scale) == (other.sigma, other.scale)
+        return same and np.array_equal(self.common.value, other.common.value)
 
     def _judged(self, solved: Solved, number: int) -> Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
-        _, slopes = self._planes(solved.problem, solved.state.local, self.of)
+        slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
             common = replace(common, value=common.value + step)
-        found = replace(self, common=common)
-        apart, spread, used = found._apart(solved)
+        judged = replace(self, common=common)
+        residuals, variances, used = judged._residuals(solved)
         if self.stated is None:
-            found = found._estimated(apart, spread, used)
+            judged = judged._estimated(residuals, variances, used)
+        elif number:
+            judged = judged._scaled(residuals, variances, used)
         if number > _ROUNDS // 2:
             # Otherwise heights at the limit may be left out and return without end.
-            return found
-        sigma = np.sqrt(np.maximum(spread, (0.2 * found.sigmas) ** 2))
+            return judged
+        sigmas = np.sqrt(np.maximum(variances, (0.2 * judged.sigmas) ** 2))
         with np.errstate(invalid="ignore"):
-            wrong = np.abs(apart) > _WRONG * sigma
-        return replace(found, wrong=np.asarray(found.of & wrong), broken=found._breaking(solved))
+            wrong = np.abs(residuals) > np.where(self.wrong, _RIGHT, _WRONG) * sigmas
+        broken = judged.broken if number else judged._breaking(solved)
+        return replace(judged, wrong=np.asarray(judged.of & wrong), broken=broken)
 
-    def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
+    def _residuals(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
 
-        Of one that takes part the residual varies less than the height, of one that does not more.
+        The residual of a height that takes part varies less than the height, that of another one more.
         """
         problem, local = solved.problem, solved.state.local
-        planes, _ = self._planes(problem, local, self.of)
+        planes = self._planes(problem, self.of)
         rows = np.zeros(len(local), dtype=bool)
         rows[solved.linear.ordering.numbers] = True
         used = rows & self.of & planes.on
         assert problem.heights is not None
         taking = used & problem.heights.on
-        # Along the normal; over its share of the vertical both are upwards.
-        covariance = solved.points.ground(solved.cofactors, 1.0)
+        # All along the normal; `upright` is its share of the vertical.
         normal = planes.axes[:, 2]
-        told = np.einsum("nc,ncd,nd->n", normal, covariance, normal)
+        of_points = np.einsum("nc,ncd,nd->n", normal, solved.points.ground(solved.cofactors, 1.0), normal)
         upright = np.where(planes.on, planes.sigmas / (self.sigmas * np.sqrt(self.own)), 1.0)
-        whole = np.maximum(planes.sigmas**2, (upright * self.sigmas) ** 2)
-        spread = np.where(taking, whole - told, whole + told)
-        apart = planes.above(local)
+        weighed, single = planes.sigmas**2, (upright * self.sigmas) ** 2
+        # A height that shares samples with others weighs less than by its own variance.
+        shared = np.maximum(weighed - single, 0.0)
+        weighed = np.maximum(weighed, single)
         with np.errstate(invalid="ignore"):
-            return np.where(used, apart / upright, 0.0), np.where(used, spread / upright**2, np.inf), taking
+            left = weighed - of_points - shared * (1.0 - of_points / weighed) ** 2
+            variances = np.where(taking, left, weighed - shared + of_points) / upright**2
+            residuals = planes.above(local) / upright
+        return np.where(used, residuals, 0.0), np.where(used, variances, np.inf), taking
 
-    def _estimated(self, apart: Array, spread: Array, used: Mask) -> Heights:
+    def _estimated(self, residuals: Array, variances: Array, used: Mask) -> Heights:
         """Return them with a robust sigma of the residuals; unchanged if too few have enough redundancy."""
-        redundancy = spread / self.sigma**2
+        redundancy = variances / self.sigma**2
         testable = used & (redundancy > _REDUNDANT)
         if testable.sum() < _ENOUGH:
             return self
-        sigma = _NORMAL * float(np.median(np.abs(apart[testable]) / np.sqrt(redundancy[testable])))
+        sigma = _NORMAL * float(np.median(np.abs(residuals[testable]) / np.sqrt(redundancy[testable])))
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 
+    def _scaled(self, residuals: Array, variances: Array, used: Mask) -> Heights:
+        """Return them with larger sigmas where the residuals are significantly larger than stated ones allow.
+
+        Roofs and trees that are too low to be left out one by one do this.
+        """
+        used = used & (variances > _REDUNDANT**2 * self.sigmas**2)
+        if used.sum() < _ENOUGH:
+            return self
+        square, chance = float(np.mean(residuals[used] ** 2 / variances[used])), math.sqrt(2.0 / used.sum())
+        if self.scale == 1.0 and square < 1.0 + _SIGNIFICANT * chance:
+            return self
+        scale = max(self.scale * math.sqrt(square), 1.0)
+        return self if abs(scale / self.scale - 1.0) < 2 * _STABLE else replace(self, scale=scale)
+
     def _breaking(self, solved: Solved) -> Mask:
         """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
-        problem, local = solved.problem, solved.state.local
-        _, slopes = self._planes(problem, local, self.of)
         covariance = solved.ground_covariance(solved.cofactors, 1.0)
         plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
         rows = np.flatnonzero(self.of & np.isfinite(plan))
-        ground, found = problem.frame.geodetic(local), self.broken.copy()
+        ground, slopes, found = self.terrain.ground, np.nan_to_num(self.terrain.slopes), self.broken.copy()
         # The uncertainty is larger while the images are still displaced.
         far = self.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], self.source.surface.sample_size))
         with np.errstate(invalid="ignore"):
             found[rows] = far > _BREAKS * self.sigmas[rows]
         return found
+
+    @property
+    def _sigma_is(self) -> Literal["stated", "enlarged", "estimated", "assumed"]:
+        if self.stated is not None:
+            return "enlarged" if self.scale > 1.0 else "stated"
+        return "estimated" if self.estimated else "assumed"
 
     def record(self, solved: Solved) -> HeightsRecord:
         """Return what is published of them."""
@@ -227,7 +279,7 @@ class Heights:
             at_breaks=int(broken.sum()),
             without=int((active & self.of & ~wrong & ~broken).sum()) - len(used),
             sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else self.sigma,
-            sigma_is="stated" if self.stated is not None else "estimated" if self.estimated else "assumed",
+            sigma_is=self._sigma_is,
             rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
             bias_m=bias,
             bias_sigma_m=bias_sigma,
@@ -239,11 +291,26 @@ class Heights:
         )
 
 
+def _stable(solved: Solved, problem: BlockProblem) -> bool:
+    """Tell whether a problem has the heights of a solution."""
+    planes, old, local = problem.heights, solved.problem.heights, solved.state.local
+    assert planes is not None
+    assert old is not None
+    off, count = np.abs(planes.above(local) - old.above(local)) / planes.sigmas, planes.on.sum()
+    return bool((planes.on != old.on).sum() <= _HARDLY_ANY * count and (off > _STABLE)[planes.on].sum() <= _FEW * count)
+
+
+def _places(problem: BlockProblem, local: Array) -> Array:
+    """Return lon, lat, h ``(N, 3)`` where heights of points at `local` ``(N, 3)`` are read."""
+    return np.where(problem.placed[:, None], problem.known, problem.frame.geodetic(local))
+
+
 class HeightsRecord(Record):
     """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
 
     The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
-    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment.
+    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment. A stated
+    sigma is enlarged if the residuals are significantly larger.
     """
 
     used: Count
@@ -251,7 +318,7 @@ class HeightsRecord(Record):
     at_breaks: Count
     without: Count
     sigma_m: float
-    sigma_is: Literal["stated", "estimated", "assumed"]
+    sigma_is: Literal["stated", "enlarged", "estimated", "assumed"]
     rms_m: float | None
     bias_m: float
     bias_sigma_m: float
@@ -266,22 +333,28 @@ class HeightsRecord(Record):
         found = []
         if self.sigma_is == "assumed":
             text = Text(
-                f"accuracy of the heights not given; assuming {metres(self.sigma_m)}. Set it with ",
+                f"DEM accuracy not given; assuming {metres(self.sigma_m)}. Set it with ",
                 Setting("surface.sigma"),
             )
             found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
         elif self.sigma_is == "estimated":
             text = Text(
-                f"accuracy of the heights not given; estimated as {metres(self.sigma_m)} from "
+                f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from "
                 f"{counted(self.used, 'height')}. Set it with ",
                 Setting("surface.sigma"),
             )
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
+        elif self.sigma_is == "enlarged":
+            text = Text(
+                f"DEM and ties differ more than the stated DEM accuracy allows; using {metres(self.sigma_m)}, "
+                f"estimated from {counted(self.used, 'height')}. Roofs and trees cause this"
+            )
+            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         if self.left_out:
             number, named = len(self.left_out), self.left_out[:_NAMED]
-            said = (
-                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees: these heights were not "
+            left_out = (
+                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees. The heights were not "
                 f"used, the ties were ({', '.join(named)})"
             )
-            found.append(Notice("heights-left-out", said, count=number, points=list(named)))
+            found.append(Notice("heights-left-out", left_out, count=number, points=list(named)))
         return found

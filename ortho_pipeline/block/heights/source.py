@@ -11,8 +11,8 @@ from ortho_pipeline.block.equations.problem import BlockProblem, State
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.local_frame import GEODETIC
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, SensorModel
@@ -21,15 +21,17 @@ from ortho_pipeline.surface.dem import DemSurface
 
 #: Sigma (m) of a DEM without a stated accuracy; matching assumes the same.
 DEFAULT_SIGMA = 10.0
-#: Times that a ray is followed to the height of the DEM below it: terrain is less steep than the ray.
-_FOLLOWED = 6
+#: Times that a ray is followed to the height of the DEM below it, and a change (m) that ends this. Terrain is less
+#: steep than the ray.
+_FOLLOWED, _NEAR_ENOUGH = 6, 1.0
 #: The option of each number that describes a DEM.
 _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
-#: Slopes are taken over so many sigmas of the heights to each side, from one to so many samples.
+#: The heights for a slope are so many of their sigmas apart, from one to so many samples.
 _SLOPE, _WIDEST = 8.0, 3.0
 #: Interpolated errors are alike over so many samples (an integral of their correlation).
 _SHARED = 2.25
-_AROUND = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+_CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+_NINE = np.array([(east, north) for north in (-1.0, 0.0, 1.0) for east in (-1.0, 0.0, 1.0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,9 @@ class DemHeights:
             value = getattr(self, name)
             if value is not None and not (0 <= value < np.inf and (name != "correlation" or value > 0)):
                 raise InputError(
-                    f"{value} is no {name} of heights", field=f"points.{_OPTIONS[name]}", remedy="give metres"
+                    f"the {name} of heights is {value}, not a length",
+                    field=f"points.{_OPTIONS[name]}",
+                    remedy="give metres",
                 )
         object.__setattr__(self, "surface", self.surface.with_fill("mask"))
 
@@ -69,28 +73,41 @@ class DemHeights:
             return heights
         if isinstance(heights, DemSurface):
             return cls(heights)
-        raise InputError("flat ground is no observation of heights", field="heights", remedy="give a DEM")
+        raise InputError("flat ground has no heights to observe", field="heights", remedy="give a DEM")
 
-    def at(self, ground: Array, sigmas: Array) -> tuple[Array, Array]:
-        """Return heights ``(n,)`` at lon, lat ``(n, 2+)``, and the slope ``(n, 2)`` to the east and to the north.
+    def heights(self, ground: Array) -> Array:
+        """Return the heights ``(n,)`` at lon, lat ``(n, 2+)``; NaN in voids."""
+        return self.surface.heights(ground[:, :2], GEODETIC)
 
-        Over so much ground that errors of `sigmas` ``(n,)`` do not look like slopes; NaN beside a void.
-        """
-        side = self.surface.sample_size
-        step = np.clip(_SLOPE * np.nan_to_num(sigmas), side, _WIDEST * side)
-        found = self._around(ground, step)
-        return found[0], np.stack([found[1] - found[2], found[3] - found[4]], axis=1) / (2.0 * step[:, None])
+    def spacing(self, sigmas: Array) -> float:
+        """Return how far (m) heights for a slope are apart, so that errors of `sigmas` ``(n,)`` are small in it."""
+        side, known = self.surface.sample_size, sigmas[np.isfinite(sigmas)]
+        return float(np.clip(_SLOPE * np.median(known), side, _WIDEST * side)) if len(known) else side
 
-    def _around(self, ground: Array, metres: Array) -> Array:
-        """Return heights ``(5, n)``: at places, and so many metres ``(n,)`` to the east, west, north and south."""
+    def slopes(self, ground: Array, spacing: float) -> Array:
+        """Return the slopes ``(n, 2)`` to the east and north of planes through nine heights; NaN next to a void."""
+        heights = self._around(ground, _NINE, np.full(len(ground), spacing))
+        return np.asarray(heights.T @ _NINE) / (6.0 * spacing)
+
+    def slope_variance(self, spacing: float) -> float:
+        """Return the variance of such a slope by errors of the heights, over their variance."""
+        apart = (_NINE[:, None] - _NINE) * spacing
+        if self.correlation is not None:
+            alike = np.exp(-np.linalg.norm(apart, axis=2) / self.correlation)
+        else:
+            alike = _interpolated(apart / self.surface.sample_size).prod(axis=2)
+        return float(_NINE[:, 0] @ alike @ _NINE[:, 0]) / (6.0 * spacing) ** 2
+
+    def _around(self, ground: Array, steps: Array, metres: Array) -> Array:
+        """Return heights ``(k, n)`` at steps ``(k, 2)`` of so many metres ``(n,)`` from places."""
         lonlat = ground[:, :2]
         step = metres[:, None] / metres_per_degree(np.column_stack([lonlat, np.zeros(len(lonlat))]))
-        places = lonlat + _AROUND[:, None] * step
-        return self.surface.heights(places.reshape(-1, 2), GEODETIC).reshape(5, -1)
+        places = lonlat + steps[:, None] * step
+        return self.surface.heights(places.reshape(-1, 2), GEODETIC).reshape(len(steps), -1)
 
     def breaks(self, ground: Array, slopes: Array, metres: Array) -> Array:
         """Return how far ``(n,)`` heights so many `metres` around places are from their planes: at a cliff, far."""
-        found = self._around(ground, metres)
+        found = self._around(ground, _CROSS, metres)
         east, north = (slopes * metres[:, None]).T
         planes = found[0] + np.stack([east, -east, north, -north])
         return np.asarray(np.abs(found[1:] - planes).max(axis=0))
@@ -113,72 +130,56 @@ class DemHeights:
         return np.asarray(1.0 + _SHARED * (counts[which.ravel()] - 1.0))
 
 
-def starts(source: DemHeights, problem: BlockProblem, models: Sequence[SensorModel], rays: Mask, of: Mask) -> Array:
-    """Return where points `of` a mask ``(N,)`` lie ``(N, 3)``: in the middle of where their rays meet the DEM.
+def starts(
+    source: DemHeights, problem: BlockProblem, models: Sequence[SensorModel], near: Array, rays: Mask, of: Mask
+) -> Array:
+    """Return where points `of` a mask ``(N,)`` are ``(N, 3)``: where the first ray of each meets the DEM.
 
-    Nearly parallel rays of models that are a few pixels off meet anywhere; the DEM is right to a few metres.
+    Nearly parallel rays of models that are a few pixels off meet anywhere, even if `near` ``(N, 3)``; the DEM is right
+    to a few metres.
     """
     points, frame = problem.points, problem.frame
-    sums, counts = np.zeros((len(points), 3)), np.zeros(len(points))
-    for model, rays_of in zip(models, points.rays_of_images, strict=True):
-        used = rays_of[rays[rays_of] & of[points.point[rays_of]]]
-        if not len(used):
-            continue
-        heights = np.full(len(used), model.reference_height)
-        to_geodetic = ground_transform(model.crs, GEODETIC)
-        for _ in range(_FOLLOWED):
-            ground = to_geodetic(model.image_to_ground(points.measured[used], heights))
-            below = source.surface.heights(ground[:, :2], GEODETIC)
-            heights = np.where(np.isfinite(below), below, heights)
-        good = np.isfinite(below) & np.isfinite(ground).all(axis=1)
-        local = frame.of_geodetic(np.column_stack([ground[good, :2], heights[good]]))
-        np.add.at(sums, points.point[used[good]], local)
-        np.add.at(counts, points.point[used[good]], 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(sums / counts[:, None])
+    ground = frame.geodetic(near)
+    heights = source.heights(ground)
+    left = np.flatnonzero(_first_rays(points.point, rays & of[points.point]))
+    seen = np.zeros(len(points), dtype=bool)
+    seen[points.point[left]] = True
+    for _ in range(_FOLLOWED):
+        for image in np.unique(points.image[left]):
+            model, used = models[image], left[points.image[left] == image]
+            of_points = points.point[used]
+            at = np.where(np.isfinite(heights[of_points]), heights[of_points], model.reference_height)
+            ground[of_points] = model.image_to_ground(points.measured[used], at)
+            ground[of_points] = ground_transform(model.crs, GEODETIC)(ground[of_points])
+            heights[of_points] = at
+        there = source.heights(ground[points.point[left]])
+        far = np.abs(there - heights[points.point[left]]) > _NEAR_ENOUGH
+        heights[points.point[left]] = there
+        left = left[far]
+        if not len(left):
+            break
+    good = seen & np.isfinite(heights) & np.isfinite(ground).all(axis=1)
+    on_dem = frame.of_geodetic(np.column_stack([ground[:, :2], heights]))
+    return np.where(good[:, None], on_dem, np.nan)
+
+
+def _first_rays(point: Index, used: Mask) -> Mask:
+    """Return of all rays ``(M,)`` the first of each point that is used."""
+    rays, first = np.flatnonzero(used), np.zeros(len(point), dtype=bool)
+    first[rays[np.unique(point[rays], return_index=True)[1]]] = True
+    return first
 
 
 def started(source: DemHeights, problem: BlockProblem, state: State, rays: Mask) -> Array:
     """Return the places ``(N, 3)`` of a state with points on the DEM, as far as all their rays see them there."""
-    found = starts(source, problem, state.models, rays, problem.points.tie & ~problem.placed)
+    found = starts(source, problem, state.models, state.local, rays, problem.points.tie & ~problem.placed)
     seen = np.isfinite(predict(problem.frame, state.models, problem.points, found)).all(axis=1)
     good: Mask = np.array(np.isfinite(found).all(axis=1), dtype=bool)
     good[problem.points.point[rays & ~seen]] = False
     return np.where(good[:, None], found, state.local)
 
 
-def planes_at(
-    source: DemHeights, problem: BlockProblem, local: Array, of: Mask, sigmas: Array, offset: Array
-) -> tuple[Planes, Array]:
-    """Return the planes under points `of` a mask ``(N,)`` that are at `local` ``(N, 3)``, and their slopes ``(N, 2)``.
-
-    Parameters
-    ----------
-    sigmas : ndarray (N,)
-        Standard deviations of the heights, metres upwards.
-    offset : ndarray (N,)
-        Estimates of their errors.
-    """
-    frame, count = problem.frame, len(local)
-    ground = np.where(problem.placed[:, None], problem.known, frame.geodetic(local))
-    rows = np.flatnonzero(of & np.isfinite(ground[:, :2]).all(axis=1))
-    heights, slopes = source.at(ground[rows], sigmas[rows])
-    good = np.isfinite(heights) & np.isfinite(slopes).all(axis=1) & np.isfinite(sigmas[rows])
-    rows, heights, slopes = rows[good], heights[good], slopes[good]
-    plan = problem.placed[rows]
-    # Where a point is known in plan its height is read there, with the error that its sigma in plan makes.
-    own = sigmas[rows] ** 2
-    own = own + np.where(plan, (slopes**2).sum(axis=1) * np.where(plan, problem.ground_sigmas[rows, 0], 0.0) ** 2, 0.0)
-    tilted = np.where(plan[:, None], 0.0, slopes)
-    length = np.sqrt(1.0 + (tilted**2).sum(axis=1))
-    normal = np.column_stack([-tilted, np.ones(len(rows))]) / length[:, None]
-    east = np.column_stack([np.ones(len(rows)), np.zeros(len(rows)), tilted[:, 0]])
-    east /= np.linalg.norm(east, axis=1)[:, None]
-    axes = np.stack([east, np.cross(normal, east), normal], axis=1)
-    on_dem = np.column_stack([ground[rows, :2], heights - offset[rows]])
-    places, turns, found = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan), np.full(count, np.inf)
-    places[rows], turns[rows] = frame.of_geodetic(on_dem), axes @ frame.enu_at(on_dem)
-    found[rows] = np.sqrt(own) / length
-    steep = np.zeros((count, 2))
-    steep[rows] = slopes
-    return Planes(places, turns, found), steep
+def _interpolated(distance: Array) -> Array:
+    """Return the correlation of interpolated errors by their distance along an axis, in samples."""
+    x = np.abs(distance)
+    return np.where(x < 1.0, 1.0 - 1.5 * x**2 + 0.75 * x**3, np.maximum(2.0 - x, 0.0) ** 3 / 4.0)

@@ -43,15 +43,6 @@ class OnPoints:
         """Mask ``(n, 3)`` of the axes with an observation; each is one equation."""
         return np.isfinite(self.sigmas)
 
-    def with_heights(self, planes: Planes, local: Array, rows: NDArray[np.int64]) -> OnPoints:
-        """Return these observations, of points `rows` ``(n,)`` at `local` ``(N, 3)``, with those of their heights."""
-        on = planes.on[rows]
-        axes = np.where(on[:, None, None], planes.axes[rows], self.axes)
-        apart, sigmas = self.apart.copy(), self.sigmas.copy()
-        apart[on, 2] = (axes[on, 2] * (planes.places[rows] - local[rows])[on]).sum(axis=1)
-        sigmas[on, 2] = planes.sigmas[rows][on]
-        return OnPoints(apart, axes, sigmas)
-
     def misfits(self, weights: Array) -> Array:
         """Return the misfits ``(n, 3)`` over their sigmas, with weights ``(n,)``."""
         return self.apart / self.sigmas * np.sqrt(weights)[:, None]
@@ -84,6 +75,6 @@ class Planes:
         """Of which points ``(N,)`` a height is observed."""
         return np.isfinite(self.sigmas)
 
-    def above(self, local: Array) -> Array:
-        """Return how far ``(N,)`` the planes are above points `local` ``(N, 3)``, along their normals."""
-        return np.asarray((self.axes[:, 2] * (self.places - local)).sum(axis=1))
+    def above(self, local: Array, rows: NDArray[np.int64] | slice = slice(None)) -> Array:
+        """Return how far the planes are above points of `rows` ``(n,)``, along their normals; `local` is ``(N, 3)``."""
+        return np.asarray((self.axes[rows, 2] * (self.places[rows] - local[rows])).sum(axis=1))
