@@ -123,6 +123,9 @@ class Scene:
         Model families (`ortho models`) that do not suit this product, each with what to say where it is fitted.
     adjusted : mapping, optional
         What the model was adjusted by before: the section ``adjustment`` of the model file that it comes from.
+    accuracy : float, optional
+        Standard deviation (m, each axis in plan) of the first model without control, as the vendor states it. An RPC
+        may state its own.
     """
 
     sensor: str
@@ -139,6 +142,7 @@ class Scene:
     sources: tuple[str | PathLike[str], ...] = ()
     unsuited: Mapping[str, str] = field(default_factory=dict)
     adjusted: Mapping[str, Any] | None = None
+    accuracy: float | None = None
 
     def __post_init__(self) -> None:
         from ortho_pipeline.files.locations import place

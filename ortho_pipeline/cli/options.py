@@ -262,7 +262,7 @@ block_options = _grouped("points", BlockOptions, "points", "gcps", "crs", "verti
 #: The rest of that group, which is taken by its decorator too.
 adjustment_options = click_options(
     "points", BlockOptions, "ties", "correction", "ground_sigma", "model_crs", "hold", "dem_heights", "dem_bias",
-    "dem_correlation", "dem_shift_sigma", "join_limit",
+    "dem_correlation", "dem_shift", "dem_shift_sigma", "spot_heights", "spot_crs", "spot_vertical", "join_limit",
 )  # fmt: skip
 #: All options of heights, as `SurfaceOptions`.
 surface_options = _grouped("surface", SurfaceOptions)

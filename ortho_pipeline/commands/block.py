@@ -118,6 +118,7 @@ def adjust(
         priors={label: start.priors for label, start in starts.items()},
         hold=points.hold,
         heights=observed(points, surface, gathered.heights),
+        accuracies={label: start.accuracy for label, start in starts.items() if start.accuracy is not None},
     )
     if fit.heights is not None:
         # The block has the last word on the accuracy of the DEM.

@@ -78,7 +78,7 @@ class BlockOptions:
             "PX",
             kind="number",
             above=0,
-            unset="10 where nothing else gives a datum",
+            unset="without control, the accuracy that the metadata state, else 10",
         ),
     ] = None
     dem_heights: Annotated[
@@ -110,6 +110,15 @@ class BlockOptions:
             unset="each sample of the DEM has its own error",
         ),
     ] = None
+    dem_shift: Annotated[
+        str | None,
+        Option(
+            "--dem-shift",
+            "Correct the position of the DEM by this (metres east and north), or by the estimate.",
+            "estimate|E,N",
+            unset="the estimate is only reported",
+        ),
+    ] = None
     dem_shift_sigma: Annotated[
         float | None,
         Option(
@@ -119,6 +128,21 @@ class BlockOptions:
             kind="number",
             unset="half a sample",
         ),
+    ] = None
+    spot_heights: Annotated[
+        PathLike | None,
+        Option(
+            "--spot-heights",
+            "Known heights, such as of laser altimetry: CSV, GeoJSON or GeoParquet with x, y, h, sigma. They fix the "
+            "bias of the DEM.",
+            "FILE",
+        ),
+    ] = None
+    spot_crs: Annotated[
+        str | None, Option("--spot-heights-crs", "CRS of the spot heights, where their file has none.", "CRS")
+    ] = None
+    spot_vertical: Annotated[
+        str | None, Option("--spot-heights-vertical", f"Height datum of the spot heights: {VERTICAL_FORMS}.", "DATUM")
     ] = None
     join_limit: Annotated[
         float,

@@ -24,6 +24,8 @@ from ortho_pipeline.models.base import Array
 
 #: Modes are of the covariance of so many points at most, and are so many at most, of a block of `_MANY` points fewer.
 _ANCHORS, _MODES, _MANY = 800, 120, 5_000
+#: Less information on a shift, over that of its own standard deviation, is none.
+_TOLD = 1e-6
 #: The share of the variance in all modes that are kept.
 _HELD = 0.99
 
@@ -39,11 +41,14 @@ class CommonHeights(CommonUnknown):
         the east and to the north.
     by_params, by_points : ndarray (P, k), (N, 3, k)
         How one standard deviation moves parameters, and points in their east, north, up.
+    undone : ndarray (k,)
+        The part of the estimate with which the DEM was moved before it was read, in standard deviations.
     """
 
     loads: Array
     by_params: Array
     by_points: Array
+    undone: Array
 
     @classmethod
     def of(cls, loads: Array, bias: float, points: int, parameters: int) -> CommonHeights:
@@ -57,12 +62,13 @@ class CommonHeights(CommonUnknown):
             loads=loads,
             by_params=np.zeros((parameters, modes)),
             by_points=np.zeros((count, 3, modes)),
+            undone=np.zeros(modes),
         )
 
     @property
     def offset(self) -> Array:
-        """The estimate ``(N,)`` of how much too high the heights are, m."""
-        return np.asarray(self.loads @ self.value)
+        """The estimate ``(N,)`` of how much too high the heights are as they were read, m."""
+        return np.asarray(self.loads @ (self.value - self.undone))
 
     @property
     def bias(self) -> tuple[float, float]:
@@ -79,6 +85,19 @@ class CommonHeights(CommonUnknown):
     def shift(self, shift: float) -> tuple[Array, Array]:
         """Return the estimate ``(2,)`` of the DEM's shift to the east and north, m, and its covariance, m²."""
         return self.value[1:3] * shift, self.left[1:3, 1:3] * shift**2
+
+    @property
+    def chance(self) -> float | None:
+        """How probable a shift as large as this would seem of a DEM that is not shifted; None where nothing tells."""
+        from scipy.special import chdtrc
+
+        # Without the prior: what the block tells of the shift, with all other unknowns.
+        precision = np.linalg.inv(self.left[1:3, 1:3])
+        told = precision - np.eye(2)
+        if np.linalg.eigvalsh(told)[0] < _TOLD:
+            return None
+        alone = np.linalg.solve(told, precision @ self.value[1:3])
+        return float(chdtrc(2, alone @ told @ alone))
 
     @property
     def of_points(self) -> Array:

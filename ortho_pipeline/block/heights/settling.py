@@ -6,6 +6,7 @@ if it agrees again. No height is used in a void, beside one, or at a cliff withi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,6 +17,7 @@ from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights, planes_at
+from ortho_pipeline.block.heights.spots import SpotDifferences, SpotsRecord
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.estimation.observations.on_points import Planes
@@ -34,6 +36,10 @@ _WRONG = 4.0
 _BREAKS = 4.0
 #: A sigma is estimated from so many heights or more, each of at least this redundancy.
 _ENOUGH, _REDUNDANT = 50, 0.2
+#: Standard deviation (m) of a bias that spot heights tell.
+_FREE = 100.0
+#: A shift of the DEM is significant if one as large is less probable without it.
+_SIGNIFICANT = 0.001
 #: A notice names so many points.
 _NAMED = 10
 #: The sigma of a normal distribution over its median absolute value.
@@ -61,6 +67,8 @@ class Heights:
         Left out: heights that contradict their ties, and heights at breaks of the DEM.
     estimated : bool
         Whether `sigma` was.
+    spots : SpotDifferences, optional
+        Known heights, which tell of the shared errors.
     """
 
     source: DemHeights
@@ -72,6 +80,7 @@ class Heights:
     wrong: Mask
     broken: Mask
     estimated: bool = False
+    spots: SpotDifferences | None = None
 
     @classmethod
     def under(cls, source: DemHeights, problem: BlockProblem, local: Array) -> Heights:
@@ -88,19 +97,28 @@ class Heights:
             sigmas[rows] = stated
         each = np.full(len(rows), DEFAULT_SIGMA) if stated is None else stated
         typical = float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else DEFAULT_SIGMA
-        bias = typical if source.bias is None else source.bias
+        spots = SpotDifferences.of(source, DEFAULT_SIGMA)
+        bias = (typical if spots is None else _FREE) if source.bias is None else source.bias
         own = np.ones(count)
         own[rows] = source.sharing(ground[rows])
         loads = np.zeros((count, 3))
         loads[:, 0] = bias
+        known = np.zeros((0, 3)) if spots is None else problem.frame.of_geodetic(spots.spots.ground)
+        shared, left = np.zeros((len(rows) + len(known), 0)), None
         if source.correlation is not None and len(rows):
-            shared, left = correlated(local[rows], source.correlation)
+            shared, left = correlated(np.vstack([local[rows], known]), source.correlation)
             more = np.zeros((count, shared.shape[1]))
-            more[rows], own[rows] = shared * np.nan_to_num(each)[:, None], left
+            more[rows], own[rows] = shared[: len(rows)] * np.nan_to_num(each)[:, None], left[: len(rows)]
             loads = np.hstack([loads, more])
         none = np.zeros(count, dtype=bool)
         common = CommonHeights.of(loads, bias, len(rows), problem.size)
-        return cls(source, of, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        found = cls(source, of, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        if spots is None:
+            return found
+        there = np.full(len(known), DEFAULT_SIGMA) if spots.stated is None else np.nan_to_num(spots.stated)
+        further = shared[len(rows) :] * there[:, None]
+        left_there = None if left is None else left[len(rows) :]
+        return replace(found, spots=spots.with_loads(bias, found.shift, further, left_there))
 
     @property
     def shift(self) -> float:
@@ -125,7 +143,7 @@ class Heights:
         """Return the solution with stable heights, from one near it, and these heights."""
         found = self
         for number in range(_ROUNDS):
-            judged = found._judged(solved, number)
+            judged = found._following(solved.problem)._judged(solved, number)
             problem = judged.applied(solved.problem, solved.state.local)
             planes, before = problem.heights, solved.problem.heights
             assert planes is not None
@@ -145,10 +163,14 @@ class Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
         _, slopes = self._planes(solved.problem, solved.state.local, self.of)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
+        if self.spots is not None:
+            common, slope = self.spots.told(common, self.sigma, slope)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
             common = replace(common, value=common.value + step)
-        found = replace(self, common=common)
+        settled = self.spots is None or number > _ROUNDS // 2
+        spots = self.spots if settled else self.spots.judged(common, self.sigma)
+        found = replace(self, common=common, spots=spots)
         apart, spread, used = found._apart(solved)
         if self.stated is None:
             found = found._estimated(apart, spread, used)
@@ -159,6 +181,18 @@ class Heights:
         with np.errstate(invalid="ignore"):
             wrong = np.abs(apart) > _WRONG * sigma
         return replace(found, wrong=np.asarray(found.of & wrong), broken=found._breaking(solved))
+
+    def _following(self, problem: BlockProblem) -> Heights:
+        """Return them with the DEM read where the estimate of its shift puts it, if it is to be."""
+        still = self.common.value[1:3] - self.common.undone[1:3]
+        if not self.source.follow or np.abs(still).max() <= _SHARED_STABLE:
+            return self
+        east, north = -still * self.shift
+        moved = self.source.surface.moved((float(east), float(north), 0.0), problem.frame.origin[:2])
+        source, undone = replace(self.source, surface=moved), self.common.undone.copy()
+        undone[1:3] = self.common.value[1:3]
+        spots = None if self.spots is None else self.spots.read_again(source, self.sigma, self.shift)
+        return replace(self, source=source, common=replace(self.common, undone=undone), spots=spots)
 
     def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
@@ -187,9 +221,14 @@ class Heights:
         """Return them with a robust sigma of the residuals; unchanged if too few have enough redundancy."""
         redundancy = spread / self.sigma**2
         testable = used & (redundancy > _REDUNDANT)
-        if testable.sum() < _ENOUGH:
+        alike = np.abs(apart[testable]) / np.sqrt(redundancy[testable])
+        if self.spots is not None:
+            known = self.spots.used
+            left = np.abs(self.spots.residuals(self.common)) / np.sqrt(self.spots.variances(self.sigma))
+            alike = np.concatenate([alike, left[known] * self.sigma])
+        if len(alike) < _ENOUGH:
             return self
-        sigma = _NORMAL * float(np.median(np.abs(apart[testable]) / np.sqrt(redundancy[testable])))
+        sigma = _NORMAL * float(np.median(alike))
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 
@@ -235,7 +274,10 @@ class Heights:
             shift_m=tuple(shift.tolist()),
             shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
             shift_prior_m=self.shift,
+            shift_chance=self.common.chance,
+            shift_applied=self.source.follow,
             correlation_m=self.source.correlation,
+            spots=None if self.spots is None else self.spots.record(self.common),
         )
 
 
@@ -243,7 +285,8 @@ class HeightsRecord(Record):
     """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
 
     The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
-    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment.
+    or outside the DEM. Shifts are east and north; `shift_chance` is how probable one as large would seem of a DEM that
+    is not shifted. A prior is the standard deviation before the adjustment.
     """
 
     used: Count
@@ -259,10 +302,18 @@ class HeightsRecord(Record):
     shift_m: Pair
     shift_sigma_m: Pair
     shift_prior_m: float
+    shift_chance: float | None
+    shift_applied: bool
     correlation_m: float | None
+    spots: SpotsRecord | None = None
+
+    @property
+    def shift_significant(self) -> bool:
+        """Whether the DEM is shifted by more than chance explains."""
+        return self.shift_chance is not None and self.shift_chance < _SIGNIFICANT
 
     def notices(self) -> list[Notice]:
-        """Return notices of an unstated sigma and of heights that were left out."""
+        """Return notices of an unstated sigma, of a shift, and of heights that were left out."""
         found = []
         if self.sigma_is == "assumed":
             text = Text(
@@ -284,4 +335,20 @@ class HeightsRecord(Record):
                 f"used, the ties were ({', '.join(named)})"
             )
             found.append(Notice("heights-left-out", said, count=number, points=list(named)))
+        if self.shift_significant:
+            east, north = self.shift_m
+            size, sigma = metres(math.hypot(east, north)), metres(max(self.shift_sigma_m))
+            done = (
+                "corrected" if self.shift_applied else Text("correct it with ", Setting("points.dem_shift", "estimate"))
+            )
+            text = Text(
+                f"the DEM is shifted by {size} ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma}): ", done
+            )
+            fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
+            found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
+        if self.spots is not None and self.spots.left_out:
+            number, named = len(self.spots.left_out), self.spots.left_out[:_NAMED]
+            said = f"{counted(number, 'spot height contradicts', 'spot heights contradict')} the DEM and the others: "
+            text = f"{said}not used ({', '.join(named)})"
+            found.append(Notice("spot-heights-left-out", text, count=number, points=list(named)))
         return found
