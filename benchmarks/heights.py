@@ -2,9 +2,10 @@
 
 python benchmarks/heights.py              seven chains of six frames at each convergence
 python benchmarks/heights.py --seeds 20   more of them
-python benchmarks/heights.py --draws 60   instead: claimed over found errors, for several kinds of errors of the DEM
+python benchmarks/heights.py --bound 20   instead: errors beside the least that any estimate can have
+python benchmarks/heights.py --draws 60   instead: found errors over their sigmas, for several errors of the DEM
 
-The truth (models, ground, errors of the DEM) is never seen by the estimate.
+The estimate never sees the truth (models, ground, errors of the DEM).
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import argparse
 import os
 import sys
 import tempfile
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,23 +26,51 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "block"))
 
-from chains import Chain, apart, dem, fly, misfits, neighbours, with_control
+from chains import Block, Chain, apart, dem, fly, misfits, neighbours, with_control
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.relative.joins import joins_of
 from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.surface.dem import DemSurface
 
-#: Errors of the DEM as they are made, and as they are told: sigma, and options of `DemHeights`.
-KINDS: dict[str, tuple[dict[str, Any], float, dict[str, Any]]] = {
-    "white, told so": ({"white": 2.0}, 2.0, {"bias": 0.0, "shift": 0.0}),
-    "white, nothing told but 2 m": ({"white": 2.0}, 2.0, {}),
-    "white and a bias of 5 m": ({"white": 2.0, "bias": 5.0}, 2.0, {"bias": 5.0}),
-    "alike over 200 m": ({"correlated": 3.0, "length": 200.0}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 200.0}),
-    "alike over 1 km": ({"correlated": 3.0, "length": 1e3}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 1e3}),
-    "trees on 5 % of cells": ({"white": 2.0, "trees": 0.05}, 2.0, {}),
-    "half a cell off": ({"white": 2.0, "shift": (5.0, 5.0)}, 2.0, {}),
+#: Convergence (degrees) of the chains.
+CONVERGENCE = (1.0, 3.0, 10.0)
+#: Standard deviation (px) of the models, true and stated, where errors are compared with their sigmas.
+HOLD = 5.0
+CELL = 10.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Errors of a DEM as they are, and as they are stated: sigma, and options of `DemHeights`.
+
+    A `bias` (m) is the standard deviation of one, `off` (m) a shift in a random direction.
+    """
+
+    sigma: float = 2.0
+    stated: dict[str, float] = field(default_factory=dict)
+    flown: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=lambda: {"white": 2.0})
+    bias: float = 0.0
+    off: float = 0.0
+
+
+_KNOWN = {"bias": 0.0, "shift": 0.0}
+KINDS: dict[str, Kind] = {
+    "white": Kind(stated=_KNOWN),
+    "white, default options": Kind(),
+    "flat ground (0°)": Kind(stated=_KNOWN, flown={"relief": 0.0}),
+    "gentle slopes (4°)": Kind(stated=_KNOWN, flown={"relief": 10.0}),
+    "steep slopes (45°)": Kind(stated=_KNOWN, flown={"relief": 150.0}),
+    "bias of 5 m": Kind(stated={"bias": 5.0, "shift": 0.0}, bias=5.0),
+    "correlated over 200 m": Kind(3.0, {**_KNOWN, "correlation": 200.0}, errors={"correlated": 3.0, "length": 200.0}),
+    "correlated over 1 km": Kind(3.0, {**_KNOWN, "correlation": 1e3}, errors={"correlated": 3.0, "length": 1e3}),
+    "correlated over 10 km": Kind(3.0, {**_KNOWN, "correlation": 1e4}, errors={"correlated": 3.0, "length": 1e4}),
+    "10 % of ties on trees": Kind(stated=_KNOWN, flown={"trees": 0.1}),
+    "10 % of ties on roofs": Kind(stated=_KNOWN, flown={"roofs": 0.1}),
+    "half a cell off": Kind(stated={"bias": 0.0}, off=CELL / 2.0),
 }
 
 
@@ -47,22 +78,30 @@ def main() -> None:
     """Print one table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=7)
+    parser.add_argument("--bound", type=int, default=0, metavar="SEEDS")
     parser.add_argument("--draws", type=int, default=0)
-    given = parser.parse_args()
+    parser.add_argument("--first", type=int, default=0, metavar="SEED", help="first seed of the draws")
+    parser.add_argument("--convergence", type=float, action="append", metavar="DEG", help="may be repeated")
+    parser.add_argument("--kind", action="append", choices=KINDS, help="may be repeated")
+    options = parser.parse_args()
+    convergence = tuple(options.convergence or CONVERGENCE)
     with tempfile.TemporaryDirectory() as folder:
-        if given.draws:
-            claims(given.draws, Path(folder))
+        if options.draws:
+            seeds = range(options.first, options.first + options.draws)
+            spreads(convergence, options.kind or list(KINDS), seeds, Path(folder))
+        elif options.bound:
+            bounds(convergence, options.bound, Path(folder))
         else:
-            compared(given.seeds, Path(folder))
+            compared(convergence, options.seeds, Path(folder))
 
 
-def compared(seeds: int, folder: Path) -> None:
+def compared(convergence: tuple[float, ...], seeds: int, folder: Path) -> None:
     """Print least and greatest distances of neighbours (px)."""
-    for convergence in (1.0, 3.0, 10.0):
-        found: dict[str, list[np.ndarray]] = {}
+    for angle in convergence:
+        distances: dict[str, list[np.ndarray]] = {}
         for seed in range(seeds):
-            block = fly(Chain(convergence_deg=convergence), seed)
-            surface = dem(block, folder / f"{convergence}-{seed}.tif", seed, white=2.0).with_sigma(2.0)
+            block = fly(Chain(convergence_deg=angle), seed)
+            surface = dem(block, folder / f"{angle}-{seed}.tif", seed, white=2.0).with_sigma(2.0)
             for name, points, heights in (
                 ("ties alone", block.points, None),
                 ("heights of 2 m", block.points, surface),
@@ -70,42 +109,156 @@ def compared(seeds: int, folder: Path) -> None:
                 ("control in the first, ties", with_control(block), None),
                 ("control in the first, heights", with_control(block), surface),
             ):
+                distances.setdefault(name, [])
                 try:
                     fit = adjust(block.start, points, heights=heights)
                 except OrthoError:
                     continue
-                found.setdefault(name, []).append(misfits(block, fit))
-            for name in ("ties alone", "heights of 2 m", "control in the first, ties"):
-                found.setdefault(name, [])
-        for name, all_of in found.items():
-            values = np.concatenate([*all_of, np.zeros(0)])
-            said = f"{values.min():.2f} to {values.max():.2f}, median {np.median(values):.2f}" if len(values) else "-"
-            print(f"{convergence:4.0f}°  {name:32s} {len(all_of):3d} of {seeds} adjusted, apart {said} px", flush=True)
+                distances[name].append(misfits(block, fit))
+        for name, rows in distances.items():
+            values = np.concatenate([*rows, np.zeros(0)])
+            text = f"{values.min():.2f} to {values.max():.2f}, median {np.median(values):.2f}" if len(values) else "-"
+            print(f"{angle:4.0f}°  {name:32s} {len(rows):3d} of {seeds} adjusted, apart {text} px", flush=True)
 
 
-def claims(draws: int, folder: Path) -> None:
-    """Print the spread of errors over their sigmas, of all images (absolute) and between neighbours."""
-    for convergence in (3.0, 10.0):
-        for name, (made, sigma, told) in KINDS.items():
-            absolute, relative = [], []
-            for seed in range(draws):
-                block = fly(Chain(convergence_deg=convergence, normal=True, errors=5.0), seed)
-                bias = made.get("bias", 0.0) * np.random.default_rng(777 + seed).normal()
-                path = folder / "dem.tif"
-                surface = dem(block, path, seed, **{**made, "bias": bias}).with_sigma(sigma)
-                fit: BlockFit = adjust(block.start, block.points, heights=DemHeights(surface, **told), hold=5.0)
-                truth = np.concatenate([model.params for model in block.truth.values()])
-                absolute.append((fit.values - truth) / fit.sigmas)
-                covariances = {(join.first, join.second): join.covariance for join in joins_of(fit)}
-                for pair in neighbours(block):
-                    relative.append(np.linalg.solve(np.linalg.cholesky(covariances[pair]), apart(block, fit, *pair)))
-                path.unlink()
-            spreads = [float(np.sqrt(np.mean(np.square(one)))) for one in (absolute, relative)]
-            inside = float((np.abs(relative) < 1.96).mean())
-            print(
-                f"{convergence:4.0f}°  {name:28s} {draws} draws: spread {spreads[0]:.2f} absolute, {spreads[1]:.2f} "
-                f"between neighbours ({100 * inside:.0f} % within 1.96 sigma)", flush=True,
-            )  # fmt: skip
+# -- the least error ---------------------------------------------------------------------------------------------------
+
+
+def bounds(convergence: tuple[float, ...], seeds: int, folder: Path) -> None:
+    """Print errors between neighbours (px): found, claimed, and the Cramér-Rao bound.
+
+    The bound knows the true slopes of the ground, the covariance of all errors, and that there is no bias and no shift.
+    """
+    for angle in convergence:
+        rows = []
+        for seed in range(seeds):
+            block = fly(Chain(convergence_deg=angle, normal=True, errors=HOLD), seed)
+            surface = dem(block, folder / f"{angle}-{seed}.tif", seed, white=2.0, cell=CELL).with_sigma(2.0)
+            fit = adjust(block.start, block.points, heights=DemHeights(surface, bias=0.0, shift=0.0), hold=HOLD)
+            claimed = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+            least = least_covariance(block, surface, 3.0)
+            for pair in neighbours(block):
+                moves = relative_moves(block, *pair)
+                variance = np.trace(moves @ least @ moves.T)
+                rows.append((np.sum(apart(block, fit, *pair) ** 2), np.trace(claimed[pair]), variance))
+        error, claim, bound = np.sqrt(np.mean(rows, axis=0))
+        random = np.random.default_rng(0).normal(0.0, 1.0, (4_000, 35)) * bound
+        print(
+            f"{angle:4.0f}°  RMS between neighbours: found {error:.3f} px, claimed {claim:.3f} px, least possible "
+            f"{bound:.3f} px; greatest of 35 pairs found {np.sqrt(np.max(rows, axis=0)[0]):.2f} px, by the bound "
+            f"{np.median(np.abs(random).max(axis=1)):.2f} px",
+            flush=True,
+        )
+
+
+def least_covariance(block: Block, surface: DemSurface, each: float) -> np.ndarray:
+    """Return the least covariance ``(P, P)`` of the shifts of images, by samples of a DEM with errors of `each` m."""
+    points, ground = block.points, block.ground
+    count, size = len(ground), 2 * len(block.truth)
+    normals = np.zeros((size + 3 * count, size + 3 * count))
+    for image, model in enumerate(block.truth.values()):
+        rays = np.flatnonzero(points.image == image)
+        rows = points.point[rays]
+        by_ground, by_params = model.ground_partials(ground[rows]), model.param_partials(ground[rows])
+        columns = 2 * image + np.arange(2)
+        for row, of_ground, of_params in zip(rows, by_ground, by_params, strict=True):
+            design = np.hstack([of_params, of_ground]) / block.flown.noise
+            at = np.concatenate([columns, size + 3 * row + np.arange(3)])
+            normals[np.ix_(at, at)] += design.T @ design
+    normals[np.arange(size), np.arange(size)] += HOLD**-2.0
+    samples = surface.samples_at(ground[:, :2])
+    cells, parts = np.floor(samples).astype(int), samples % 1.0
+    weights: dict[tuple[int, int], np.ndarray] = {}
+    for east in (0, 1):
+        for south in (0, 1):
+            share = np.abs(1 - east - parts[:, 0]) * np.abs(1 - south - parts[:, 1])
+            for k, (u, v) in enumerate(cells + np.array([east, south])):
+                weights.setdefault((u, v), np.zeros(count))[k] += share[k]
+    matrix = np.array(list(weights.values()))
+    step = np.eye(2)
+    slopes = np.stack([(block.terrain.heights(ground[:, :2] + d) - block.terrain.heights(ground[:, :2] - d)) / 2
+                       for d in step], axis=1)  # fmt: skip
+    design = np.zeros((count, 3 * count))
+    for axis in range(2):
+        design[np.arange(count), 3 * np.arange(count) + axis] = -slopes[:, axis]
+    design[np.arange(count), 3 * np.arange(count) + 2] = 1.0
+    covariance = each**2 * matrix.T @ matrix + 1e-9 * np.eye(count)
+    normals[size:, size:] += design.T @ np.linalg.solve(covariance, design)
+    return np.linalg.inv(normals)[:size, :size]
+
+
+def relative_moves(block: Block, first: str, second: str) -> np.ndarray:
+    """Return how parameters move two images against each other ``(2, P)``, px."""
+    columns = []
+    for name, model in block.truth.items():
+        for axis in np.eye(2):
+            moved = {**block.truth, name: model.with_params(model.params + axis)}
+            columns.append(apart(block, SimpleNamespace(models=moved), first, second))
+    return np.stack(columns, axis=1)
+
+
+# -- errors over their sigmas ------------------------------------------------------------------------------------------
+
+
+def spreads(convergence: tuple[float, ...], kinds: list[str], seeds: range, folder: Path) -> None:
+    """Print spreads of errors over their sigmas and how many intervals of 95 % contain the truth."""
+    print(
+        "spread of error/sigma (1 is right) and share of 95 % intervals with the truth, absolute and between\n"
+        "neighbours; RMS between neighbours, px; share of heights that were left out\n"
+        f"{'':31s}|        ties alone             |        with heights\n"
+        f"{'':31s}| absolute    neighbours    RMS  | absolute    neighbours    RMS  left out"
+    )
+    for angle in convergence:
+        for name in kinds:
+            alone, together = Normalised(), Normalised()
+            for seed in seeds:
+                block, heights = drawn(KINDS[name], angle, seed, folder / "dem.tif")
+                alone.add(block, adjust(block.start, block.points, hold=HOLD))
+                together.add(block, adjust(block.start, block.points, heights=heights, hold=HOLD))
+            print(f"{angle:4.0f}°  {name:25s}| {alone.row}  | {together.row} {together.left_out:7.3f}", flush=True)
+
+
+def drawn(kind: Kind, angle: float, seed: int, path: Path) -> tuple[Block, DemHeights]:
+    """Return a block and the heights that are stated of its DEM."""
+    random = np.random.default_rng(777 + seed)
+    flown: Any = kind.flown
+    block = fly(Chain(convergence_deg=angle, normal=True, errors=HOLD, **flown), seed)
+    bias, azimuth = kind.bias * random.normal(), random.uniform(0, 2 * np.pi)
+    shift = kind.off * np.cos(azimuth), kind.off * np.sin(azimuth)
+    path.unlink(missing_ok=True)
+    errors: Any = kind.errors
+    surface = dem(block, path, seed, bias=bias, shift=shift, cell=CELL, **errors).with_sigma(kind.sigma)
+    return block, DemHeights(surface, **kind.stated)
+
+
+class Normalised:
+    """Errors over their sigmas, of many blocks."""
+
+    def __init__(self) -> None:
+        self.absolute: list[np.ndarray] = []
+        self.relative: list[np.ndarray] = []
+        self.distances: list[np.ndarray] = []
+        self.shares: list[float] = []
+
+    def add(self, block: Block, fit: BlockFit) -> None:
+        truth = np.concatenate([model.params for model in block.truth.values()])
+        self.absolute.append((fit.values - truth) / fit.sigmas)
+        covariances = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+        for pair in neighbours(block):
+            self.relative.append(np.linalg.solve(np.linalg.cholesky(covariances[pair]), apart(block, fit, *pair)))
+        self.distances.append(misfits(block, fit))
+        self.shares.append(len(fit.heights.left_out) / len(block.points) if fit.heights else 0.0)
+
+    @property
+    def row(self) -> str:
+        parts = [f"{np.sqrt(np.mean(np.square(some))):4.2f} {(np.abs(some) < 1.96).mean():5.3f}  "
+                 for some in (self.absolute, self.relative)]  # fmt: skip
+        return f"{' '.join(parts)} {np.sqrt(np.mean(np.square(self.distances))):5.3f}"
+
+    @property
+    def left_out(self) -> float:
+        """Share of heights that were left out."""
+        return float(np.mean(self.shares))
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def adjust(
     problem, state, whole = _prepared(chosen, stated, priors or {}, exclude, dem)
     dem_heights = None if dem is None else Heights.under(dem, problem, state.local)
     if dem_heights is not None:
-        problem = dem_heights.applied(problem, state.local)
+        problem = dem_heights.applied(problem)
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()

@@ -30,7 +30,8 @@ class Chain:
     """How a chain of frames is flown.
 
     `errors` are how far (px) the vendor's models are off, uniformly in each axis; normally distributed if `normal`.
-    Ties are of two images each if `pairwise`, as a matcher of pairs makes them, else of all that show them.
+    Ties are of two images each if `pairwise`, as a matcher of pairs makes them, else of all that show them. The shares
+    `trees` and `roofs` of them are 15 m, and 3 to 12 m, above the ground.
     """
 
     images: int = 6
@@ -44,6 +45,8 @@ class Chain:
     normal: bool = False
     noise: float = 0.1
     pairwise: bool = True
+    trees: float = 0.0
+    roofs: float = 0.0
 
     @property
     def base(self) -> float:
@@ -111,7 +114,7 @@ def fly(flown: Chain, seed: int) -> Block:
     ground = np.zeros((0, 3))
     while len(ground) < flown.ties:
         plan = np.array([EAST, NORTH]) + random.uniform(low, high, (2 * flown.ties, 2))
-        some = np.column_stack([plan, terrain.heights(plan)])
+        some = np.column_stack([plan, terrain.heights(plan) + _above(flown, random, len(plan))])
         seen = sum(_inside(model.ground_to_image(some)).astype(int) for model in truth.values())
         ground = np.concatenate([ground, some[seen >= 2]])[: flown.ties]
     point, image, measured = [], [], []
@@ -131,6 +134,15 @@ def fly(flown: Chain, seed: int) -> Block:
         measured=np.concatenate(measured), sigma_image=np.full(sum(map(len, measured)), flown.noise),
     )  # fmt: skip
     return Block(flown, start, truth, points, ground, terrain)
+
+
+def _above(flown: Chain, random: np.random.Generator, count: int) -> Array:
+    """Return how far ``(n,)`` ties are above the ground, m."""
+    if not (flown.trees or flown.roofs):
+        return np.zeros(count)
+    of = random.random(count)
+    roofs = (of >= flown.trees) & (of < flown.trees + flown.roofs)
+    return 15.0 * (of < flown.trees) + roofs * random.uniform(3.0, 12.0, count)
 
 
 def _paired(shown: np.ndarray, random: np.random.Generator) -> np.ndarray:

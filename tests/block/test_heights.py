@@ -11,8 +11,10 @@ from chains import Block, Chain, apart, dem, fly, misfits, neighbours, with_cont
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.source import DemHeights
+from ortho_pipeline.block.heights.terrain import expected_slopes
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.surface.flat import FlatSurface
 
 
@@ -119,6 +121,36 @@ def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
     assert max(one[1] for one in _claims(block, fit)) < 0.2
 
 
+def test_slopes_count_as_much_as_their_errors_allow() -> None:
+    """An estimate with expected slopes has the accuracy that it claims; with slopes as measured it claims too much."""
+    random, count = np.random.default_rng(4), 10_000
+    images = np.arange(count) % 20
+    rough = np.column_stack([random.normal(0, 0.05, count), np.zeros(count)])
+    true = rough + random.normal(0, 0.5, (20, 2))[images]
+    measured = true + 0.05 * random.normal(0, 1, (count, 2))
+    expected = expected_slopes(measured, np.full(count, 2.0), (0.05 / 2.0) ** 2, images)
+
+    def apart(slopes: np.ndarray) -> np.ndarray:
+        means = np.stack([np.bincount(images, one) for one in slopes.T], axis=1) / np.bincount(images)[:, None]
+        return slopes - means[images]
+
+    # Information that is claimed, and that is there: the regression of true slopes on expected ones is 1.
+    claimed, there = np.sum(apart(expected) ** 2), np.sum(apart(expected) * apart(true))
+    assert there == pytest.approx(claimed, rel=0.05)
+    assert np.sum(apart(measured) ** 2) > 3 * np.sum(apart(measured) * apart(true)) / 2
+    assert np.ptp(apart(expected)[:, 1]) < 0.25 * np.ptp(apart(measured)[:, 1])
+
+
+def test_slopes_of_interpolated_heights_err_as_predicted(tmp_path: Path) -> None:
+    block = fly(Chain(relief=0.0), 0)
+    source = DemHeights(dem(block, tmp_path / "dem.tif", 0, white=2.0))
+    inside = np.random.default_rng(1).uniform([500_000.0, 4_100_000.0], [500_400.0, 4_100_050.0], (20_000, 2))
+    ground = ground_transform("EPSG:32636", "EPSG:4979")(np.column_stack([inside, np.zeros(20_000)]))
+    for spacing in (10.0, 16.0, 30.0):
+        slopes = source.slopes(ground, spacing)
+        assert np.var(slopes) == pytest.approx(4.0 * source.slope_variance(spacing), rel=0.25)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "sigma", "told"),
@@ -129,21 +161,22 @@ def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
         ({"correlated": 3.0, "length": 200.0}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 200.0}),
     ],
 )
-def test_claims_between_neighbours_are_kept(
-    tmp_path: Path, made: dict[str, float], sigma: float, told: dict[str, float]
-) -> None:
-    """Misfits of neighbours over what is claimed of them have a spread of 1 over sixty draws."""
-    normalised = []
+def test_claims_are_kept(tmp_path: Path, made: dict[str, float], sigma: float, told: dict[str, float]) -> None:
+    """Errors over their sigmas have a spread of 1 over sixty draws: absolute, and between neighbours."""
+    normalised, absolute = [], []
     for seed in range(60):
         block = fly(Chain(convergence_deg=3.0, normal=True, errors=5.0), seed)
         bias = made.get("bias", 0.0) * np.random.default_rng(777 + seed).normal()
         heights = dem(block, tmp_path / f"{seed}.tif", seed, **{**made, "bias": bias}).with_sigma(sigma)
         fit = adjust(block.start, block.points, heights=DemHeights(heights, **told), hold=5.0)
+        truth = np.concatenate([model.params for model in block.truth.values()])
+        absolute.append((fit.values - truth) / fit.sigmas)
         covariances = {(join.first, join.second): join.covariance for join in joins_of(fit)}
         for pair in neighbours(block):
             root = np.linalg.cholesky(covariances[pair])
             normalised.append(np.linalg.solve(root, apart_of(block, fit, pair)))
-    assert 0.85 < float(np.sqrt(np.mean(np.square(normalised)))) < 1.15
+    for errors in (normalised, absolute):
+        assert 0.85 < float(np.sqrt(np.mean(np.square(errors)))) < 1.15
 
 
 def apart_of(block: Block, fit: BlockFit, pair: tuple[str, str]) -> np.ndarray:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ortho_pipeline.block.equations.linear import Linear
+from ortho_pipeline.block.equations.problem import State
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
@@ -138,6 +139,13 @@ class CommonHeights(CommonUnknown):
         told = units.T @ left
         found = replace(self, points=len(rows), told=(told + told.T) / 2, by_params=-step, by_points=by_points)
         return found, units[place[rows]].T @ linear.misfits.ground[rows, 2]
+
+    def followed(self, before: CommonHeights, solved: Solved) -> State:
+        """Return the state of a solution with what parameters and points do if these errors are no longer `before`."""
+        step, frame = self.value - before.value, solved.problem.frame
+        enu = frame.enu_at(frame.geodetic(solved.state.local))
+        points = np.einsum("nji,nj->ni", enu, self.by_points @ step)
+        return solved.state.moved(self.by_params @ step, np.nan_to_num(points))
 
     def _sigmas(self, linear: Linear, rows: Index) -> Array:
         """Return the sigmas ``(n,)`` of heights upwards, not along the normals of their planes."""

@@ -16,13 +16,16 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
-from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights, planes_at
+from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
 from ortho_pipeline.block.heights.spots import SpotDifferences, SpotsRecord
+from ortho_pipeline.block.heights.terrain import Terrain
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.files.json.records import Count, Pair, Record
+from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options.texts import Setting, Text, counted
 
@@ -55,6 +58,10 @@ class Heights:
     source : DemHeights
     of : ndarray (N,) of bool
         Points that take the height of the DEM, if it has one there.
+    images : ndarray (N,)
+        The first image that shows each point.
+    terrain : Terrain
+        The DEM under the points.
     stated : ndarray (N,) or None
         Stated sigmas of the heights, m upwards.
     sigma : float
@@ -73,6 +80,8 @@ class Heights:
 
     source: DemHeights
     of: Mask
+    images: Index
+    terrain: Terrain
     stated: Array | None
     sigma: float
     own: Array
@@ -112,7 +121,11 @@ class Heights:
             loads = np.hstack([loads, more])
         none = np.zeros(count, dtype=bool)
         common = CommonHeights.of(loads, bias, len(rows), problem.size)
-        found = cls(source, of, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        images = np.full(count, len(problem.models))
+        np.minimum.at(images, problem.points.point, problem.points.image)
+        each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
+        terrain = Terrain.under(source, _places(problem, local), of, each, images)
+        found = cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
         if spots is None:
             return found
         there = np.full(len(known), DEFAULT_SIGMA) if spots.stated is None else np.nan_to_num(spots.stated)
@@ -131,20 +144,31 @@ class Heights:
         """Sigmas ``(N,)`` of the heights, m upwards."""
         return np.full(len(self.of), self.sigma) if self.stated is None else self.stated
 
-    def applied(self, problem: BlockProblem, local: Array) -> BlockProblem:
-        """Return the problem with planes under points at `local` ``(N, 3)``."""
-        return problem.with_heights(self._planes(problem, local, self.of & ~self.wrong & ~self.broken)[0])
+    def applied(self, problem: BlockProblem) -> BlockProblem:
+        """Return the problem with planes under its points."""
+        return problem.with_heights(self._planes(problem, self.of & ~self.wrong & ~self.broken))
 
-    def _planes(self, problem: BlockProblem, local: Array, of: Mask) -> tuple[Planes, Array]:
-        """Return the planes under points of a mask ``(N,)``, and their slopes ``(N, 2)``."""
-        return planes_at(self.source, problem, local, of, self.sigmas * np.sqrt(self.own), self.common.offset)
+    def _planes(self, problem: BlockProblem, of: Mask) -> Planes:
+        """Return the planes under points of a mask ``(N,)``."""
+        return self.terrain.planes(problem, of, self.sigmas * np.sqrt(self.own), self.common.offset)
+
+    def _under(self, problem: BlockProblem, local: Array) -> Heights:
+        """Return them with the DEM under points at `local` ``(N, 3)``."""
+        ground = _places(problem, local)
+        return replace(
+            self, terrain=Terrain.under(self.source, ground, self.of, self.sigmas, self.images, self.terrain)
+        )
 
     def settled(self, solved: Solved, selection: Selection, tolerance: float = EXACT) -> tuple[Solved, Heights]:
         """Return the solution with stable heights, from one near it, and these heights."""
         found = self
         for number in range(_ROUNDS):
-            judged = found._following(solved.problem)._judged(solved, number)
-            problem = judged.applied(solved.problem, solved.state.local)
+            judged, state = found._under(solved.problem, solved.state.local)._judged(solved, number), solved.state
+            if judged.common.value is not found.common.value:
+                # Points and images follow the shared errors, so that the DEM is read where they will be.
+                state = judged.common.followed(found.common, solved)
+                judged = judged._following(solved.problem)._under(solved.problem, state.local)
+            problem = judged.applied(solved.problem)
             planes, before = problem.heights, solved.problem.heights
             assert planes is not None
             assert before is not None
@@ -153,7 +177,7 @@ class Heights:
             same &= np.array_equal(judged.common.value, found.common.value)
             if same and (off > _STABLE)[planes.on].sum() <= _FEW * planes.on.sum():
                 return solved, judged
-            again = attempt(problem, solved.state, selection, tolerance)
+            again = attempt(problem, state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
                 return solved, found
             solved, found = again, judged
@@ -161,7 +185,7 @@ class Heights:
 
     def _judged(self, solved: Solved, number: int) -> Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
-        _, slopes = self._planes(solved.problem, solved.state.local, self.of)
+        slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
         if self.spots is not None:
             common, slope = self.spots.told(common, self.sigma, slope)
@@ -187,12 +211,14 @@ class Heights:
         still = self.common.value[1:3] - self.common.undone[1:3]
         if not self.source.follow or np.abs(still).max() <= _SHARED_STABLE:
             return self
-        east, north = -still * self.shift
-        moved = self.source.surface.moved((float(east), float(north), 0.0), problem.frame.origin[:2])
+        east, north = (-still * self.shift).tolist()
+        moved = self.source.surface.moved((east, north, 0.0), problem.frame.origin[:2])
         source, undone = replace(self.source, surface=moved), self.common.undone.copy()
         undone[1:3] = self.common.value[1:3]
         spots = None if self.spots is None else self.spots.read_again(source, self.sigma, self.shift)
-        return replace(self, source=source, common=replace(self.common, undone=undone), spots=spots)
+        read = self.terrain.read + (east, north) / metres_per_degree(problem.frame.origin[None])
+        common, terrain = replace(self.common, undone=undone), replace(self.terrain, read=read)
+        return replace(self, source=source, common=common, terrain=terrain, spots=spots)
 
     def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
@@ -200,7 +226,7 @@ class Heights:
         Of one that takes part the residual varies less than the height, of one that does not more.
         """
         problem, local = solved.problem, solved.state.local
-        planes, _ = self._planes(problem, local, self.of)
+        planes = self._planes(problem, self.of)
         rows = np.zeros(len(local), dtype=bool)
         rows[solved.linear.ordering.numbers] = True
         used = rows & self.of & planes.on
@@ -234,12 +260,10 @@ class Heights:
 
     def _breaking(self, solved: Solved) -> Mask:
         """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
-        problem, local = solved.problem, solved.state.local
-        _, slopes = self._planes(problem, local, self.of)
         covariance = solved.ground_covariance(solved.cofactors, 1.0)
         plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
         rows = np.flatnonzero(self.of & np.isfinite(plan))
-        ground, found = problem.frame.geodetic(local), self.broken.copy()
+        ground, slopes, found = self.terrain.ground, np.nan_to_num(self.terrain.slopes), self.broken.copy()
         # The uncertainty is larger while the images are still displaced.
         far = self.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], self.source.surface.sample_size))
         with np.errstate(invalid="ignore"):
@@ -279,6 +303,11 @@ class Heights:
             correlation_m=self.source.correlation,
             spots=None if self.spots is None else self.spots.record(self.common),
         )
+
+
+def _places(problem: BlockProblem, local: Array) -> Array:
+    """Return lon, lat, h ``(N, 3)`` where heights of points at `local` ``(N, 3)`` are read."""
+    return np.where(problem.placed[:, None], problem.known, problem.frame.geodetic(local))
 
 
 class HeightsRecord(Record):

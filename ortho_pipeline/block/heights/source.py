@@ -12,7 +12,6 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, SensorModel
@@ -26,11 +25,12 @@ DEFAULT_SIGMA = 10.0
 _FOLLOWED = 6
 #: The option of each number that describes a DEM.
 _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
-#: Slopes are taken over so many sigmas of the heights to each side, from one to so many samples.
+#: The heights for a slope are so many of their sigmas apart, from one to so many samples.
 _SLOPE, _WIDEST = 8.0, 3.0
 #: Interpolated errors are alike over so many samples (an integral of their correlation).
 _SHARED = 2.25
-_AROUND = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+_CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+_NINE = np.array([(east, north) for north in (-1.0, 0.0, 1.0) for east in (-1.0, 0.0, 1.0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,26 +78,39 @@ class DemHeights:
             return cls(heights)
         raise InputError("flat ground is no observation of heights", field="heights", remedy="give a DEM")
 
-    def at(self, ground: Array, sigmas: Array) -> tuple[Array, Array]:
-        """Return heights ``(n,)`` at lon, lat ``(n, 2+)``, and the slope ``(n, 2)`` to the east and to the north.
+    def heights(self, ground: Array) -> Array:
+        """Return the heights ``(n,)`` at lon, lat ``(n, 2+)``; NaN in voids."""
+        return self.surface.heights(ground[:, :2], GEODETIC)
 
-        Over so much ground that errors of `sigmas` ``(n,)`` do not look like slopes; NaN beside a void.
-        """
-        side = self.surface.sample_size
-        step = np.clip(_SLOPE * np.nan_to_num(sigmas), side, _WIDEST * side)
-        found = self._around(ground, step)
-        return found[0], np.stack([found[1] - found[2], found[3] - found[4]], axis=1) / (2.0 * step[:, None])
+    def spacing(self, sigmas: Array) -> float:
+        """Return how far (m) heights for a slope are apart, so that errors of `sigmas` ``(n,)`` are small in it."""
+        side, known = self.surface.sample_size, sigmas[np.isfinite(sigmas)]
+        return float(np.clip(_SLOPE * np.median(known), side, _WIDEST * side)) if len(known) else side
 
-    def _around(self, ground: Array, metres: Array) -> Array:
-        """Return heights ``(5, n)``: at places, and so many metres ``(n,)`` to the east, west, north and south."""
+    def slopes(self, ground: Array, spacing: float) -> Array:
+        """Return the slopes ``(n, 2)`` to the east and north of planes through nine heights; NaN next to a void."""
+        heights = self._around(ground, _NINE, np.full(len(ground), spacing))
+        return np.asarray(heights.T @ _NINE) / (6.0 * spacing)
+
+    def slope_variance(self, spacing: float) -> float:
+        """Return the variance of such a slope by errors of the heights, over their variance."""
+        apart = (_NINE[:, None] - _NINE) * spacing
+        if self.correlation is not None:
+            alike = np.exp(-np.linalg.norm(apart, axis=2) / self.correlation)
+        else:
+            alike = _interpolated(apart / self.surface.sample_size).prod(axis=2)
+        return float(_NINE[:, 0] @ alike @ _NINE[:, 0]) / (6.0 * spacing) ** 2
+
+    def _around(self, ground: Array, steps: Array, metres: Array) -> Array:
+        """Return heights ``(k, n)`` at steps ``(k, 2)`` of so many metres ``(n,)`` from places."""
         lonlat = ground[:, :2]
         step = metres[:, None] / metres_per_degree(np.column_stack([lonlat, np.zeros(len(lonlat))]))
-        places = lonlat + _AROUND[:, None] * step
-        return self.surface.heights(places.reshape(-1, 2), GEODETIC).reshape(5, -1)
+        places = lonlat + steps[:, None] * step
+        return self.surface.heights(places.reshape(-1, 2), GEODETIC).reshape(len(steps), -1)
 
     def breaks(self, ground: Array, slopes: Array, metres: Array) -> Array:
         """Return how far ``(n,)`` heights so many `metres` around places are from their planes: at a cliff, far."""
-        found = self._around(ground, metres)
+        found = self._around(ground, _CROSS, metres)
         east, north = (slopes * metres[:, None]).T
         planes = found[0] + np.stack([east, -east, north, -north])
         return np.asarray(np.abs(found[1:] - planes).max(axis=0))
@@ -154,38 +167,7 @@ def started(source: DemHeights, problem: BlockProblem, state: State, rays: Mask)
     return np.where(good[:, None], found, state.local)
 
 
-def planes_at(
-    source: DemHeights, problem: BlockProblem, local: Array, of: Mask, sigmas: Array, offset: Array
-) -> tuple[Planes, Array]:
-    """Return the planes under points `of` a mask ``(N,)`` that are at `local` ``(N, 3)``, and their slopes ``(N, 2)``.
-
-    Parameters
-    ----------
-    sigmas : ndarray (N,)
-        Standard deviations of the heights, metres upwards.
-    offset : ndarray (N,)
-        Estimates of their errors.
-    """
-    frame, count = problem.frame, len(local)
-    ground = np.where(problem.placed[:, None], problem.known, frame.geodetic(local))
-    rows = np.flatnonzero(of & np.isfinite(ground[:, :2]).all(axis=1))
-    heights, slopes = source.at(ground[rows], sigmas[rows])
-    good = np.isfinite(heights) & np.isfinite(slopes).all(axis=1) & np.isfinite(sigmas[rows])
-    rows, heights, slopes = rows[good], heights[good], slopes[good]
-    plan = problem.placed[rows]
-    # Where a point is known in plan its height is read there, with the error that its sigma in plan makes.
-    own = sigmas[rows] ** 2
-    own = own + np.where(plan, (slopes**2).sum(axis=1) * np.where(plan, problem.ground_sigmas[rows, 0], 0.0) ** 2, 0.0)
-    tilted = np.where(plan[:, None], 0.0, slopes)
-    length = np.sqrt(1.0 + (tilted**2).sum(axis=1))
-    normal = np.column_stack([-tilted, np.ones(len(rows))]) / length[:, None]
-    east = np.column_stack([np.ones(len(rows)), np.zeros(len(rows)), tilted[:, 0]])
-    east /= np.linalg.norm(east, axis=1)[:, None]
-    axes = np.stack([east, np.cross(normal, east), normal], axis=1)
-    on_dem = np.column_stack([ground[rows, :2], heights - offset[rows]])
-    places, turns, found = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan), np.full(count, np.inf)
-    places[rows], turns[rows] = frame.of_geodetic(on_dem), axes @ frame.enu_at(on_dem)
-    found[rows] = np.sqrt(own) / length
-    steep = np.zeros((count, 2))
-    steep[rows] = slopes
-    return Planes(places, turns, found), steep
+def _interpolated(distance: Array) -> Array:
+    """Return the correlation of interpolated errors by their distance along an axis, in samples."""
+    x = np.abs(distance)
+    return np.where(x < 1.0, 1.0 - 1.5 * x**2 + 0.75 * x**3, np.maximum(2.0 - x, 0.0) ** 3 / 4.0)

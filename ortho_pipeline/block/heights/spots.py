@@ -71,7 +71,8 @@ class SpotDifferences:
         if source.spots is None:
             return None
         ground, stated = source.spots.ground, source.sigmas(source.spots.ground)
-        heights, slopes = source.at(ground, np.full(len(ground), sigma) if stated is None else stated)
+        spacing = source.spacing(np.full(len(ground), sigma) if stated is None else stated)
+        heights, slopes = source.heights(ground), source.slopes(ground, spacing)
         apart = np.where(np.isfinite(slopes).all(axis=1), heights - ground[:, 2], np.nan)
         known = np.isfinite(apart)
         if not known.any():
