@@ -77,7 +77,8 @@ def with_datum(
     sigmas = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
     # Heights of a DEM tell what ties leave to their slow errors.
     by_ties = not control and problem.heights is None
-    slow = SLOW * sigmas / max(missed, _LEAST_WRONG) if by_ties else np.zeros(len(sigmas))
+    typical = float(np.sqrt(np.mean(sigmas**2)))
+    slow = SLOW * typical / max(missed, _LEAST_WRONG) if by_ties else 0.0
     held = _held(linear, sigmas, slow)
     of = f"sigma {_span(sigmas)} px in the image for each parameter ({len(held)} of {problem.size})"
     if trusted.any() and accuracies:
@@ -146,12 +147,12 @@ def with_start_errors(linear: Linear, covariance: Cofactors) -> Cofactors:
     return covariance.mixed(1.0, covariance.times(rows.T), np.eye(len(rows)))
 
 
-def _held(linear: Linear, sigmas: Array, slow: Array) -> list[Pseudo]:
+def _held(linear: Linear, sigmas: Array, slow: float) -> list[Pseudo]:
     """Return a pseudo-observation for each parameter without a prior, as strong as its effect (px) in its image.
 
     Parameters
     ----------
-    sigmas, slow : ndarray (images,)
+    sigmas : ndarray (images,)
         px.
     """
     problem, params = linear.problem, linear.state.params
@@ -163,7 +164,7 @@ def _held(linear: Linear, sigmas: Array, slow: Array) -> list[Pseudo]:
         for column, size in zip(problem.columns.of_image(image), effect, strict=False):
             if int(column) not in known and size > 0:
                 sigma = float(sigmas[image] / size)
-                found.append(Pseudo(int(column), float(params[column]), sigma, held=True, slow=float(slow[image])))
+                found.append(Pseudo(int(column), float(params[column]), sigma, held=True, slow=slow))
     return found
 
 

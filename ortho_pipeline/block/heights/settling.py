@@ -128,10 +128,8 @@ class Heights:
         found = cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
         if spots is None:
             return found
-        there = np.full(len(known), DEFAULT_SIGMA) if spots.stated is None else np.nan_to_num(spots.stated)
-        further = shared[len(rows) :] * there[:, None]
         left_there = None if left is None else left[len(rows) :]
-        return replace(found, spots=spots.with_loads(bias, found.shift, further, left_there))
+        return replace(found, spots=spots.with_loads(bias, found.shift, shared[len(rows) :], left_there))
 
     @property
     def shift(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights
-from ortho_pipeline.block.heights.source import DemHeights
+from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
@@ -97,9 +97,18 @@ class SpotDifferences:
         with np.errstate(invalid="ignore"):
             return replace(found, wrong=np.abs(apart - middle) > _WRONG * typical)
 
-    def with_loads(self, bias: float, shift: float, more: Array, left: Array | None) -> SpotDifferences:
-        """Return them with loads of a bias, of a shift and of further errors ``(n, k - 3)``; `left` replaces `own`."""
-        loads = np.column_stack([np.full(len(self.apart), bias), -shift * self.slopes, more])
+    def with_loads(self, bias: float, shift: float, shared: Array, left: Array | None) -> SpotDifferences:
+        """Return them with loads of a bias, a shift, and errors correlated by distance.
+
+        Parameters
+        ----------
+        bias, shift : float
+            Standard deviations, m.
+        shared, left : ndarray (n, k - 3), (n,)
+            Loads of correlated errors of sigma 1, and the variances left, which replace `own`.
+        """
+        dem = np.full(len(self.apart), DEFAULT_SIGMA) if self.stated is None else np.nan_to_num(self.stated)
+        loads = np.column_stack([np.full(len(self.apart), bias), -shift * self.slopes, shared * dem[:, None]])
         return replace(self, loads=loads, own=self.own if left is None else left)
 
     def read_again(self, source: DemHeights, sigma: float, shift: float) -> SpotDifferences:
