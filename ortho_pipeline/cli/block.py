@@ -7,6 +7,7 @@ import click
 from ortho_pipeline.cli.options import (
     adjustment_options,
     block_options,
+    block_output_options,
     folder_option,
     images_argument,
     json_option,
@@ -15,8 +16,10 @@ from ortho_pipeline.cli.options import (
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result, print_warnings
-from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.cli.printing import print_result, print_warnings, progress
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options.texts import Setting, Text
 
 _models = click.option(
     "--models", multiple=True, type=click.Path(), metavar="FILE", help="A saved *_model.json of each image."
@@ -31,6 +34,8 @@ _models = click.option(
 @adjustment_options
 @matching_options
 @surface_options
+@click.option("--orthos", is_flag=True, help="Also make the orthos of all images on one grid, for 'ortho mosaic'.")
+@block_output_options
 @sensor_options
 @json_option
 def adjust(
@@ -40,6 +45,8 @@ def adjust(
     models: tuple[str, ...],
     match: MatchOptions,
     surface: SurfaceOptions,
+    orthos: bool,
+    output: OutputOptions,
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
@@ -48,12 +55,18 @@ def adjust(
     The images may be a stereo pair or a block. The command writes a model and an RPC of each image, the ground points
     with their sigmas, and one report. Points with ground coordinates are control or check points; the others tie the
     images together. --models starts from saved models (repeat it, in the order of the images). --ties auto and
-    --reference find points by matching; both need heights.
+    --reference find points by matching; both need heights. --orthos makes the orthos of all images, too.
     """
     from ortho_pipeline.commands import block as blocks
 
+    if not orthos and output != OutputOptions():
+        raise InputError(
+            "this describes orthos, and none are made", field="orthos", remedy=Text("give ", Setting("orthos"), " too")
+        )
     command = click.get_current_context().meta["command"]
-    result = blocks.adjust(images, folder, points, scene, models=models, match=match, surface=surface, command=command)
+    asked = {"match": match, "surface": surface, "orthos": output if orthos else None}
+    with progress() as shown:
+        result = blocks.adjust(images, folder, points, scene, models=models, command=command, progress=shown, **asked)
     print_result(result, as_json)
 
 

@@ -277,6 +277,11 @@ dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_ve
 network_option = _grouped("scene", SceneOptions, "allow_network")
 #: All options of the ortho, as `OutputOptions`.
 output_options = _grouped("output", OutputOptions)
+#: Those of the orthos of a block.
+block_output_options = _grouped(
+    "output", OutputOptions, "crs", "resolution", "extent", "like", "resampling", "bands", "nodata", "format",
+    "creation_options", "memory", "threads",
+)  # fmt: skip
 #: The file says which format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 

@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
+from ortho_pipeline.commands.block_orthos import adjusted_scenes, corrected, make_orthos, ortho_files
 from ortho_pipeline.commands.control.block_points import (
     gather,
     observed,
@@ -31,6 +33,7 @@ from ortho_pipeline.commands.control.block_points import (
     relative_to_reference,
     settled_scenes,
 )
+from ortho_pipeline.commands.heights.surfaces import open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
@@ -45,13 +48,14 @@ from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.texts import Text, counted
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.cards import PICTURES, SIDE
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
 
 #: Pixels of an image of which a picture is made: without overviews nearly all of it has to be read.
@@ -69,7 +73,9 @@ def adjust(
     models: Sequence[str | os.PathLike[str]] = (),
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    orthos: OutputOptions | None = None,
     command: str | None = None,
+    progress: Progress | None = None,
 ) -> Result:
     """Adjust images and points together; write a model of each image, the points, adjusted RPCs and one report.
 
@@ -86,13 +92,15 @@ def adjust(
     match : MatchOptions
         References to take control points from, and how to match, also for ties (`points.ties`).
     surface : SurfaceOptions
-        Heights, for matching and as observations of the ties.
+        Heights, for matching, as observations of the ties, and for orthos.
+    orthos : OutputOptions, optional
+        Make the orthos of all images, on one grid.
 
     Returns
     -------
     Result
         `files` has report, html, points, points-csv, and ``<image> model`` and ``<image> rpc`` (where an RPC stands for
-        the model) of each image.
+        the model) of each image; with orthos also ``<image> ortho`` and so on, as those of `rectify`.
 
     Raises
     ------
@@ -101,9 +109,10 @@ def adjust(
     """
     labels = labels_of(images)
     files = _files(labels, Path(folder))
+    of_orthos = {} if orthos is None else ortho_files(Path(folder), labels, orthos)
     scenes = scenes_of(images, scene, models)
-    refuse_contradictions(points, match, surface)
-    _check_paths(files, images, points, scenes, *models, match=match, surface=surface)
+    refuse_contradictions(points, match, surface, orthos=orthos is not None)
+    _check_paths(files, images, points, scenes, *models, match=match, surface=surface, orthos=of_orthos)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
     table, notes = gathered.table, [*placed, *gathered.notices]
@@ -125,9 +134,10 @@ def adjust(
         notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
     exported: dict[str, rpc.RpcExport] = {}
+    plain = {label: _plain(fit.models[label]) for label in labels}
     for label in labels:
         try:
-            exported[label] = rpc.export_rpc(_plain(fit.models[label]))
+            exported[label] = rpc.export_rpc(plain[label])
             notes += [notice.in_image(label) for notice in exported[label].warnings]
         except InputError as error:
             notes.append(Notice("no-rpc", Text("no RPC is written (", error.message, ")")).in_image(label))
@@ -145,6 +155,18 @@ def adjust(
     with together(folder, "block"):
         _write(files, made, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
+        if orthos is not None:
+            ground = gathered.heights or open_surface(surface, scenes[0], under=[one.scene for one in starts.values()])
+            failed = make_orthos(
+                adjusted_scenes(starts, fit, plain, files),
+                of_orthos,
+                corrected(ground, fit.heights, fit.ground),
+                (scenes[0], surface, orthos),
+                command,
+                progress,
+            )
+            failure = failure or next(iter(failed.values()), None)
+            files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
     text = Text.joined("\n", [*gathered.text, block_report.summary_text(made)])
     return Result(files, {"report": made.to_json(), **gathered.document}, text, failure)
 
@@ -252,12 +274,15 @@ def _check_paths(
     *more: str | os.PathLike[str],
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    orthos: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
 ) -> None:
     if not files:
         return
     for image, scene in zip(images, scenes, strict=True):
-        for read in (options.points, options.gcps, *more):
-            inputs.check_paths(files, Request(image, scene, PointOptions(gcps=read), surface, match))
+        for read in (options.points, options.gcps, options.spot_heights, *more):
+            request = Request(image, scene, PointOptions(gcps=read), surface, match)
+            for written in (files, *orthos.values()):
+                inputs.check_paths(written, request)
 
 
 def _record(
@@ -274,7 +299,7 @@ def _record(
     ledgers = [
         Ledger.of(Request(image, scene, PointOptions(gcps=given), surface, match), start.scene, heights)
         for image, scene, start in zip(images, scenes, starts.values(), strict=True)
-        for given in (options.points, options.gcps)
+        for given in (options.points, options.gcps, options.spot_heights)
     ]
     first = next(iter(starts.values())).scene
     matched = options.ties is not None or bool(match.reference)

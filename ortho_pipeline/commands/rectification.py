@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
 from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
 from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.results import (
     ENDINGS,
     OF_REPORT,
@@ -106,41 +108,7 @@ def rectify(
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
     resolved = adjustable(request)
-    acquired, sun = _acquired(resolved.scene.facts, output), sun_of(resolved.scene.facts, output)
-    with resolved.ledger.hashed_beside(digest) as hashing:
-        stage("Matching and adjusting" if match.reference else "Adjusting", 0.0)
-        placed = place_scene(resolved)
-        adjusted, model, opened = placed.adjusted, placed.model, placed.scene
-        exported, complaints = _as_rpc(model)
-        source = open_rasters(placed.scene, request)
-        budget, notes = layers.budget_of(placed)
-        path = layers.ortho_of(placed, files, other_of(placed, source))
-        warped = _warp(placed, exported, source, path, stage)
-        stage("Layers and report", 0.0)
-        accuracy = layers.write_layers(placed, budget, warped, files)
-        angles = write_angles(placed, sun, files)
-        asked = request.asked("scene", "surface", "output", "match")
-        record = provenance(request, opened, placed.surface, hashing.result(), command, asked)
-    _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
-
-    def described() -> SceneReport:
-        made = report.build_report(
-            scene=opened, fit=adjusted.fit, exported=exported, surface=placed.surface,
-            coverage=placed.footprint.coverage, grid=placed.grid, warp=warped, near=request.points.near,
-            provenance=record | read_since(before), matching=adjusted.matching,
-            warnings=[*adjusted.warnings(placed.surface), *placed.footprint.notes(),
-                      *placed.sparse(warped.valid_pixels), *complaints, *notes, *warped.notes(output.memory)],
-        )  # fmt: skip
-        made = report.with_layers(made, accuracy=accuracy, angles=angles)
-        write_report(made, adjusted.fit, files, adjusted.matched, source)
-        if acquired is not None:
-            from ortho_pipeline.report.stac import write_item
-
-            write_item(files["stac"], made, files, acquired, name or stem)
-        return made
-
-    made = attempted(described, files, *OF_REPORT)
-    resolved.ledger.require_unchanged()
+    made = make_ortho(resolved, files, OrthoJob(stage, command, name or stem, digest, before))
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     if isinstance(made, ReportError):
         return Result(files, {"report": None}, "Ortho and model are complete; there is no report.", made)
@@ -239,6 +207,73 @@ def export(
 
 
 # -- parts -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OrthoJob:
+    """How an ortho is made, besides its request.
+
+    Parameters
+    ----------
+    stage : callable
+        Is told what is done, and how far it is.
+    command : str, optional
+        For the record.
+    name : str
+        Id of the STAC item.
+    digest : callable
+        Takes checksums of the inputs.
+    before : int
+        Bytes that were read over the network when the work began.
+    """
+
+    stage: Progress
+    command: str | None
+    name: str
+    digest: Callable[..., str] = sha256
+    before: int = 0
+
+
+def make_ortho(resolved: Resolved, files: dict[str, Path], job: OrthoJob) -> SceneReport | ReportError:
+    """Make the ortho of a scene, its models unless `files` has none, and its report, or say why there is none."""
+    request, output = resolved.request, resolved.request.output
+    acquired, sun = _acquired(resolved.scene.facts, output), sun_of(resolved.scene.facts, output)
+    with resolved.ledger.hashed_beside(job.digest) as hashing:
+        job.stage("Matching and adjusting" if request.match.reference else "Adjusting", 0.0)
+        placed = place_scene(resolved)
+        adjusted, opened = placed.adjusted, placed.scene
+        exported, complaints = _as_rpc(placed.model)
+        source = open_rasters(placed.scene, request)
+        budget, notes = layers.budget_of(placed)
+        path = layers.ortho_of(placed, files, other_of(placed, source))
+        warped = _warp(placed, exported, source, path, job.stage)
+        job.stage("Layers and report", 0.0)
+        accuracy = layers.write_layers(placed, budget, warped, files)
+        angles = write_angles(placed, sun, files)
+        asked = request.asked("scene", "surface", "output", "match")
+        record = provenance(request, opened, placed.surface, hashing.result(), job.command, asked)
+    if "model" in files:
+        _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
+
+    def described() -> SceneReport:
+        made = report.build_report(
+            scene=opened, fit=adjusted.fit, exported=exported, surface=placed.surface,
+            coverage=placed.footprint.coverage, grid=placed.grid, warp=warped, near=request.points.near,
+            provenance=record | read_since(job.before), matching=adjusted.matching,
+            warnings=[*adjusted.warnings(placed.surface), *placed.footprint.notes(),
+                      *placed.sparse(warped.valid_pixels), *complaints, *notes, *warped.notes(output.memory)],
+        )  # fmt: skip
+        made = report.with_layers(made, accuracy=accuracy, angles=angles)
+        write_report(made, adjusted.fit, files, adjusted.matched, source)
+        if acquired is not None:
+            from ortho_pipeline.report.stac import write_item
+
+            write_item(files["stac"], made, files, acquired, job.name)
+        return made
+
+    made = attempted(described, files, *OF_REPORT)
+    resolved.ledger.require_unchanged()
+    return made
 
 
 def _unwatched(stage: str, share: float) -> None:

@@ -19,7 +19,7 @@ from ortho_pipeline.estimation.records import (
     RmsesOnGround,
 )
 from ortho_pipeline.estimation.spatial.correlation import Covariances
-from ortho_pipeline.files.json.records import Record, Words
+from ortho_pipeline.files.json.records import Pair, Record, Words
 from ortho_pipeline.points.control_hull import ControlHull
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer
@@ -143,6 +143,9 @@ class Dem(Record):
     metres_per_unit: float | None = None
     fill: str | float | None = None
     warnings: tuple[str, ...] = ()
+    #: How far a block moved the DEM to the east and north, and raised it, metres.
+    moved_m: Pair | None = None
+    raised_m: float | None = None
     #: Of heights that were found: the cells that have land, and those that have none.
     cells: tuple[str, ...] = ()
     sea_cells: tuple[str, ...] = ()

@@ -236,7 +236,9 @@ class Heights:
         told = np.einsum("nc,ncd,nd->n", normal, covariance, normal)
         upright = np.where(planes.on, planes.sigmas / (self.sigmas * np.sqrt(self.own)), 1.0)
         whole = np.maximum(planes.sigmas**2, (upright * self.sigmas) ** 2)
-        spread = np.where(taking, whole - told, whole + told)
+        # What neighbours share makes them weigh less, and none of them err more.
+        shared = (upright * self.sigmas) ** 2 * np.maximum(self.own - 1.0, 0.0)
+        spread = np.where(taking, whole - told, whole + told) - shared
         apart = planes.above(local)
         with np.errstate(invalid="ignore"):
             return np.where(used, apart / upright, 0.0), np.where(used, spread / upright**2, np.inf), taking
@@ -248,7 +250,7 @@ class Heights:
         alike = np.abs(apart[testable]) / np.sqrt(redundancy[testable])
         if self.spots is not None:
             known = self.spots.used
-            left = np.abs(self.spots.residuals(self.common)) / np.sqrt(self.spots.variances(self.sigma))
+            left = np.abs(self.spots.residuals(self.common)) / np.sqrt(self.spots.variances(self.sigma, shared=False))
             alike = np.concatenate([alike, left[known] * self.sigma])
         if len(alike) < _ENOUGH:
             return self

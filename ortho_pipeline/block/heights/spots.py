@@ -91,7 +91,7 @@ class SpotDifferences:
             np.zeros((len(ground), 3)),
             np.zeros(len(ground), dtype=bool),
         )
-        spread = np.sqrt(found.variances(sigma))
+        spread = np.sqrt(found.variances(sigma, shared=False))
         middle = np.median(apart[known])
         typical = np.maximum(spread, _NORMAL * np.median(np.abs(apart[known] - middle)))
         with np.errstate(invalid="ignore"):
@@ -124,10 +124,17 @@ class SpotDifferences:
         """Which take part ``(n,)``."""
         return np.asarray(np.isfinite(self.apart) & ~self.wrong)
 
-    def variances(self, sigma: float) -> Array:
-        """Return the variances ``(n,)`` of the differences without the shared errors, m²; infinite where unknown."""
+    def variances(self, sigma: float, *, shared: bool = True) -> Array:
+        """Return the variances ``(n,)`` of the differences without the shared errors, m²; infinite where unknown.
+
+        Parameters
+        ----------
+        shared : bool
+            As they weigh, those of neighbours together as much as one.
+        """
+        own = self.own if shared else np.minimum(self.own, 1.0)
         dem = np.full(len(self.apart), sigma) if self.stated is None else self.stated
-        found = self.own * dem**2 + self.spots.sigmas**2 + (self.slopes**2).sum(axis=1) * self.spots.plan**2
+        found = own * dem**2 + self.spots.sigmas**2 + (self.slopes**2).sum(axis=1) * self.spots.plan**2
         return np.where(np.isfinite(found), found, np.inf)
 
     def residuals(self, common: CommonHeights) -> Array:
@@ -136,7 +143,7 @@ class SpotDifferences:
 
     def judged(self, common: CommonHeights, sigma: float) -> SpotDifferences:
         """Return them without those that contradict an estimate of the shared errors."""
-        spread = self.variances(sigma) + np.einsum("nk,kl,nl->n", self.loads, common.left, self.loads)
+        spread = self.variances(sigma, shared=False) + np.einsum("nk,kl,nl->n", self.loads, common.left, self.loads)
         with np.errstate(invalid="ignore"):
             return replace(self, wrong=np.abs(self.residuals(common)) > _WRONG * np.sqrt(spread))
 

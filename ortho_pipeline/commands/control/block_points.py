@@ -123,8 +123,15 @@ def settled_scenes(
     return settled_options(images, scenes, surface, points_in)
 
 
-def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:
+def refuse_contradictions(
+    options: BlockOptions, match: MatchOptions, surface: SurfaceOptions, *, orthos: bool = False
+) -> None:
     """Refuse options that contradict each other, before any file is opened.
+
+    Parameters
+    ----------
+    orthos : bool
+        Whether orthos are made, which need heights.
 
     Raises
     ------
@@ -159,7 +166,7 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
                     field=f"match.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.ties", "auto")),
                 )
-        if has_surface(surface) and not observes(options, surface):
+        if has_surface(surface) and not observes(options, surface) and not orthos:
             raise InputError(
                 "heights serve matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",
@@ -173,7 +180,7 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
                 field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
             )
-    if options.ties is not None or match.reference:
+    if options.ties is not None or match.reference or orthos:
         require_heights(surface)
 
 
