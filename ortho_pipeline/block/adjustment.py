@@ -23,6 +23,7 @@ from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.common_heights import CommonHeights
+from ortho_pipeline.block.heights.record import record_of
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights, started
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
@@ -378,7 +379,7 @@ def _result(
     used_ground = selection.ground & active
     covariance, of_points = _with_common(covariance, common)
     covariance, of_heights = _with_common(covariance, None if dem_heights is None else dem_heights.common)
-    taken = None if dem_heights is None else dem_heights.record(solved)
+    taken = None if dem_heights is None else record_of(dem_heights, solved)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     ground_covariance = ground_covariance + of_heights

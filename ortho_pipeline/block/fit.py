@@ -13,7 +13,7 @@ import pyproj
 from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.heights.settling import HeightsRecord
+from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints

@@ -157,14 +157,9 @@ def adjust(
         failure = attempted(lambda: _write_report(files, made, pictures), files, "report", "html")
         if orthos is not None:
             ground = gathered.heights or open_surface(surface, scenes[0], under=[one.scene for one in starts.values()])
-            failed = make_orthos(
-                adjusted_scenes(starts, fit, plain, files),
-                of_orthos,
-                corrected(ground, fit.heights, fit.ground),
-                (scenes[0], surface, orthos),
-                command,
-                progress,
-            )
+            adjusted = adjusted_scenes(starts, fit, plain, files)
+            given = scenes[0], surface, orthos
+            failed = make_orthos(adjusted, of_orthos, corrected(ground, fit), given, command, progress)
             failure = failure or next(iter(failed.values()), None)
             files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
     text = Text.joined("\n", [*gathered.text, block_report.summary_text(made)])

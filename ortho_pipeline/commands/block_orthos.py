@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.heights.settling import HeightsRecord
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands.control.points import no_points
 from ortho_pipeline.commands.rectification import OrthoJob, make_ortho
@@ -22,7 +21,6 @@ from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.regridded import grid_of
@@ -68,18 +66,13 @@ def adjusted_scenes(
     }
 
 
-def corrected(surface: Surface, heights: HeightsRecord | None, ground: Array) -> Surface:
-    """Return the heights as the block has them: without the bias of the DEM, on request without its shift.
-
-    Parameters
-    ----------
-    ground : ndarray (N, 3)
-        Lon, lat, h of points of the block.
-    """
+def corrected(surface: Surface, fit: BlockFit) -> Surface:
+    """Return the heights as the block has them: without errors that all share, on request without the shift."""
+    heights = fit.heights
     if heights is None or not isinstance(surface, DemSurface):
         return surface
     east, north = heights.shift_m if heights.shift_applied else (0.0, 0.0)
-    return surface.moved((-east, -north, -heights.bias_m), np.nanmedian(ground[:, :2], axis=0))
+    return surface.moved((-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
 
 
 def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOptions) -> OutputOptions:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
-from ortho_pipeline.block.heights.settling import HeightsRecord
+from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.network import NetworkRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet

@@ -19,7 +19,7 @@ from ortho_pipeline.estimation.records import (
     RmsesOnGround,
 )
 from ortho_pipeline.estimation.spatial.correlation import Covariances
-from ortho_pipeline.files.json.records import Pair, Record, Words
+from ortho_pipeline.files.json.records import Record, Words
 from ortho_pipeline.points.control_hull import ControlHull
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
 from ortho_pipeline.report.layers.angles import AnglesLayer

@@ -6,9 +6,7 @@ if it agrees again. No height is used in a void, beside one, or at a cliff withi
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -17,17 +15,13 @@ from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
-from ortho_pipeline.block.heights.spots import SpotDifferences, SpotsRecord
+from ortho_pipeline.block.heights.spots import SpotDifferences
 from ortho_pipeline.block.heights.terrain import Terrain
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
-from ortho_pipeline.files.json.records import Count, Pair, Record
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options.texts import Setting, Text, counted
 
 #: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma.
 _ROUNDS, _STABLE, _FEW = 10, 0.02, 0.02
@@ -41,10 +35,6 @@ _BREAKS = 4.0
 _ENOUGH, _REDUNDANT = 50, 0.2
 #: Standard deviation (m) of a bias that spot heights tell.
 _FREE = 100.0
-#: A shift of the DEM is significant if one as large is less probable without it.
-_SIGNIFICANT = 0.001
-#: A notice names so many points.
-_NAMED = 10
 #: The sigma of a normal distribution over its median absolute value.
 _NORMAL = 1.4826
 
@@ -270,114 +260,7 @@ class Heights:
             found[rows] = far > _BREAKS * self.sigmas[rows]
         return found
 
-    def record(self, solved: Solved) -> HeightsRecord:
-        """Return what is published of them."""
-        rows = solved.linear.ordering.grounded
-        planes = solved.problem.heights
-        assert planes is not None
-        used = rows[planes.on[rows]]
-        apart = planes.above(solved.state.local)[used]
-        sigmas = self.sigmas[used]
-        known = sigmas[np.isfinite(sigmas)]
-        bias, bias_sigma = self.common.bias
-        active = np.zeros(len(self.of), dtype=bool)
-        active[solved.linear.ordering.numbers] = True
-        wrong, broken = active & self.wrong, active & self.broken & ~self.wrong
-        shift, shift_covariance = self.common.shift(self.shift)
-        return HeightsRecord(
-            used=len(used),
-            left_out=tuple(solved.problem.points.ids[k] for k in np.flatnonzero(wrong)),
-            at_breaks=int(broken.sum()),
-            without=int((active & self.of & ~wrong & ~broken).sum()) - len(used),
-            sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else self.sigma,
-            sigma_is="stated" if self.stated is not None else "estimated" if self.estimated else "assumed",
-            rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
-            bias_m=bias,
-            bias_sigma_m=bias_sigma,
-            bias_prior_m=self.common.sigma,
-            shift_m=tuple(shift.tolist()),
-            shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
-            shift_prior_m=self.shift,
-            shift_chance=self.common.chance,
-            shift_applied=self.source.follow,
-            correlation_m=self.source.correlation,
-            spots=None if self.spots is None else self.spots.record(self.common),
-        )
-
 
 def _places(problem: BlockProblem, local: Array) -> Array:
     """Return lon, lat, h ``(N, 3)`` where heights of points at `local` ``(N, 3)`` are read."""
     return np.where(problem.placed[:, None], problem.known, problem.frame.geodetic(local))
-
-
-class HeightsRecord(Record):
-    """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
-
-    The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
-    or outside the DEM. Shifts are east and north; `shift_chance` is how probable one as large would seem of a DEM that
-    is not shifted. A prior is the standard deviation before the adjustment.
-    """
-
-    used: Count
-    left_out: tuple[str, ...]
-    at_breaks: Count
-    without: Count
-    sigma_m: float
-    sigma_is: Literal["stated", "estimated", "assumed"]
-    rms_m: float | None
-    bias_m: float
-    bias_sigma_m: float
-    bias_prior_m: float
-    shift_m: Pair
-    shift_sigma_m: Pair
-    shift_prior_m: float
-    shift_chance: float | None
-    shift_applied: bool
-    correlation_m: float | None
-    spots: SpotsRecord | None = None
-
-    @property
-    def shift_significant(self) -> bool:
-        """Whether the DEM is shifted by more than chance explains."""
-        return self.shift_chance is not None and self.shift_chance < _SIGNIFICANT
-
-    def notices(self) -> list[Notice]:
-        """Return notices of an unstated sigma, of a shift, and of heights that were left out."""
-        found = []
-        if self.sigma_is == "assumed":
-            text = Text(
-                f"accuracy of the heights not given; assuming {metres(self.sigma_m)}. Set it with ",
-                Setting("surface.sigma"),
-            )
-            found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
-        elif self.sigma_is == "estimated":
-            text = Text(
-                f"accuracy of the heights not given; estimated as {metres(self.sigma_m)} from "
-                f"{counted(self.used, 'height')}. Set it with ",
-                Setting("surface.sigma"),
-            )
-            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
-        if self.left_out:
-            number, named = len(self.left_out), self.left_out[:_NAMED]
-            said = (
-                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees: these heights were not "
-                f"used, the ties were ({', '.join(named)})"
-            )
-            found.append(Notice("heights-left-out", said, count=number, points=list(named)))
-        if self.shift_significant:
-            east, north = self.shift_m
-            size, sigma = metres(math.hypot(east, north)), metres(max(self.shift_sigma_m))
-            done = (
-                "corrected" if self.shift_applied else Text("correct it with ", Setting("points.dem_shift", "estimate"))
-            )
-            text = Text(
-                f"the DEM is shifted by {size} ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma}): ", done
-            )
-            fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
-            found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
-        if self.spots is not None and self.spots.left_out:
-            number, named = len(self.spots.left_out), self.spots.left_out[:_NAMED]
-            said = f"{counted(number, 'spot height contradicts', 'spot heights contradict')} the DEM and the others: "
-            text = f"{said}not used ({', '.join(named)})"
-            found.append(Notice("spot-heights-left-out", text, count=number, points=list(named)))
-        return found
