@@ -82,12 +82,11 @@ class HeightsRecord(Record):
         if self.shift_significant:
             east, north = self.shift_m
             size, sigma = metres(math.hypot(east, north)), metres(max(self.shift_sigma_m))
-            done = (
-                "corrected" if self.shift_applied else Text("correct it with ", Setting("points.dem_shift", "estimate"))
-            )
-            text = Text(
-                f"the DEM is shifted by {size} ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma}): ", done
-            )
+            where = f"{size} apart ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma})"
+            how: tuple[str | Setting, ...] = ("the DEM was moved",)
+            if not self.shift_applied:
+                how = ("if the images are right, move the DEM with ", Setting("points.dem_shift", "estimate"))
+            text = Text(f"the DEM and the images are {where}: ", *how)
             fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
             found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
         if self.spots is not None and self.spots.left_out:
