@@ -137,7 +137,8 @@ def adjust(
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
     notes += uncertain_images(solved, stated)
-    return _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
+    fit = _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
+    return replace(fit, planes=solved.problem.heights, accuracies=stated_by)
 
 
 def _first(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +22,8 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
-from ortho_pipeline.commands.block_orthos import adjusted_scenes, corrected, make_orthos, ortho_files
+from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
+from ortho_pipeline.commands.block_results.orthos import adjusted_scenes, corrected, make_orthos, ortho_files
 from ortho_pipeline.commands.control.block_points import (
     gather,
     observed,
@@ -43,8 +42,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
-from ortho_pipeline.files import json_text, together, write_json, write_text
-from ortho_pipeline.files.json.values import json_position, json_value
+from ortho_pipeline.files import together, write_json, write_text
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
@@ -133,15 +131,9 @@ def adjust(
         # The block has the last word on the accuracy of the DEM.
         notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
-    exported: dict[str, rpc.RpcExport] = {}
     plain = {label: _plain(fit.models[label]) for label in labels}
-    for label in labels:
-        try:
-            exported[label] = rpc.export_rpc(plain[label])
-            notes += [notice.in_image(label) for notice in exported[label].warnings]
-        except InputError as error:
-            notes.append(Notice("no-rpc", Text("no RPC is written (", error.message, ")")).in_image(label))
-            del files[f"{label} rpc"]
+    exported, complaints = _exported(plain, files)
+    notes += complaints
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
         fit=fit,
@@ -193,7 +185,7 @@ def intersect(
         If there are not as many models as images, and for whatever else the user can correct.
     """
     labels = labels_of(images)
-    writer = None if output is None else _writer(output)
+    writer = None if output is None else writer_of(output)
     files = {} if output is None else {"points": Path(output)}
     scenes = scenes_of(images, scene, models)
     _check_paths(files, images, points, scenes, *models)
@@ -213,7 +205,7 @@ def intersect(
             for label, image, own in zip(labels, images, scenes, strict=True)
         }
     found = intersect_rays(chosen, table)
-    rows = _ground_rows(table, found.ground, found.sigmas, _apart(table, found.ground), found.angles_deg)
+    rows = ground_rows(table, found.ground, found.sigmas, _apart(table, found.ground), found.angles_deg)
     if writer is not None and output is not None:
         write_text(output, writer(rows))
     document = {
@@ -313,6 +305,21 @@ def _record(
 # -- what came out ---------------------------------------------------------------------------------------------------
 
 
+def _exported(
+    models: Mapping[str, SensorModel], files: dict[str, Path]
+) -> tuple[dict[str, rpc.RpcExport], list[Notice]]:
+    """Return the models as RPCs, and what there is to say; without an RPC, its file is taken out of `files`."""
+    exported, notes = dict[str, rpc.RpcExport](), list[Notice]()
+    for label, model in models.items():
+        try:
+            exported[label] = rpc.export_rpc(model)
+            notes += [notice.in_image(label) for notice in exported[label].warnings]
+        except InputError as error:
+            notes.append(Notice("no-rpc", Text("no RPC is written (", error.message, ")")).in_image(label))
+            del files[f"{label} rpc"]
+    return exported, notes
+
+
 def _plain(model: SensorModel) -> SensorModel:
     """Return the model without a correction that corrects nothing."""
     return model.model if isinstance(model, ImageCorrection) and model.correction == "none" else model
@@ -367,9 +374,9 @@ def _write(
     exported: Mapping[str, rpc.RpcExport],
     record: Mapping[str, Any],
 ) -> None:
-    rows = _ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
-    write_text(files["points"], _geojson(rows))
-    write_text(files["points-csv"], _csv(rows))
+    rows = ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
+    write_text(files["points"], geojson_of(rows))
+    write_text(files["points-csv"], csv_of(rows))
     for label, start in starts.items():
         scene = start.scene
         adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **made.adjustment.images[label].to_json()}
@@ -388,67 +395,6 @@ def _write(
 def _write_report(files: Mapping[str, Path], made: BlockReport, pictures: Mapping[str, bytes]) -> None:
     write_json(files["report"], made.to_json(), ascii_only=False)
     write_text(files["html"], block_report.page(made, pictures))
-
-
-def _ground_rows(
-    points: BlockPoints, ground: Array, sigmas: Array, residuals: Array, angles_deg: Array | None = None
-) -> list[dict[str, Any]]:
-    """Return the ground points as JSON values: lon, lat, h, sigmas and known minus found in metres east, north, up."""
-    rays = np.bincount(points.point, minlength=len(points))
-    rows = []
-    for k, name in enumerate(points.ids):
-        row = {
-            "id": name,
-            "role": str(points.roles[k]),
-            "rays": int(rays[k]),
-            "ground": json_position(ground[k]),
-            "sigma": json_position(sigmas[k]),
-            "residual": json_position(residuals[k]),
-        }
-        if angles_deg is not None:
-            row["angle_deg"] = json_value(angles_deg[k])
-        rows.append(row)
-    return rows
-
-
-def _writer(path: str | os.PathLike[str]) -> Any:
-    writers = {".csv": _csv, ".geojson": _geojson}
-    suffix = Path(path).suffix.lower()
-    if suffix not in writers:
-        raise InputError(
-            "ground points are not written in this format", file=path, remedy=f"one of {', '.join(writers)}"
-        )
-    return writers[suffix]
-
-
-def _geojson(rows: Sequence[Mapping[str, Any]]) -> str:
-    features = []
-    for row in rows:
-        geometry = None if row["ground"] is None else {"type": "Point", "coordinates": row["ground"]}
-        properties: dict[str, Any] = {"id": row["id"], "kind": row["role"], "rays": row["rays"]}
-        for name, values in (("sigma", row["sigma"]), ("residual", row["residual"])):
-            for axis, value in zip(("e", "n", "h"), values or (None,) * 3, strict=True):
-                properties[f"{name}_{axis}"] = value
-        if "angle_deg" in row:
-            properties["angle_deg"] = row["angle_deg"]
-        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
-    return json_text({"type": "FeatureCollection", "features": features})
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return determined points as a table that --gcps reads."""
-    out = io.StringIO()
-    out.write(f"#CRS: {GEODETIC}\n#vertical: ellipsoid\n")
-    hidden = any(str(row["id"]).startswith("#") for row in rows)
-    writer = csv.writer(out, lineterminator="\n", quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL)
-    writer.writerow(("id", "x", "y", "h", "sigma_xy", "sigma_h", "note"))
-    for row in rows:
-        if row["ground"] is None or row["sigma"] is None:
-            continue
-        note = f"{row['role']}, {counted(row['rays'], 'ray')}"
-        sigma = max(row["sigma"][:2])
-        writer.writerow([row["id"], *map(repr, (*row["ground"], sigma, row["sigma"][2])), note])
-    return out.getvalue()
 
 
 # -- intersections ---------------------------------------------------------------------------------------------------
