@@ -107,6 +107,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "overwrite": "Files of other programs are in the output folder and would attach to the ortho.",
     },
     "More outputs": {
+        "orthos": "You want the orthos of a block on one grid, ready for `mosaic`.",
         "accuracy-raster": "The accuracy differs over the scene: steep ground, or control in one part only.",
         "visibility": "The view is oblique. With a surface model, `nodata` makes a true ortho.",
         "fill-from": "Another ortho shows what is hidden here.",

@@ -133,14 +133,13 @@ def adjust(
     notes += relative_to_reference(fit, points, match)
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)
-    notes += complaints
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     made = block_report.build_report(
         fit=fit,
         starts=starts,
         exported=exported,
         provenance=record,
-        warnings=[*_warnings(fit, starts), *notes],
+        warnings=[*_warnings(fit, starts), *notes, *complaints],
         join_limit=points.join_limit,
     )
     pictures = _pictures(starts, scenes[0])
