@@ -40,7 +40,11 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "dem-heights": "The DEM must help only to find ties, because it is wrong or much coarser than the images.",
         "dem-bias": "You know how far all heights of the DEM may be off together.",
         "dem-correlation": "You know that neighbouring heights of the DEM are off together, and over which distance.",
+        "dem-shift": "The DEM is shifted against the images, and these are right.",
         "dem-shift-sigma": "You know how far the DEM may be shifted in plan.",
+        "spot-heights": "You have a DEM and some more accurate heights, such as of ICESat-2 or of lakes.",
+        "spot-heights-crs": "The file of the spot heights does not state its CRS.",
+        "spot-heights-vertical": "The file of the spot heights does not state its height datum.",
         "dem-interpolation": "The DEM is so coarse that its facets are visible: then use `cubic`.",
     },
     "Control and check points": {
@@ -103,6 +107,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "overwrite": "Files of other programs are in the output folder and would attach to the ortho.",
     },
     "More outputs": {
+        "orthos": "You want the orthos of a block on one grid, ready for `mosaic`.",
         "accuracy-raster": "The accuracy differs over the scene: steep ground, or control in one part only.",
         "visibility": "The view is oblique. With a surface model, `nodata` makes a true ortho.",
         "fill-from": "Another ortho shows what is hidden here.",

@@ -14,6 +14,7 @@ from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.adjustment import adjust as adjust
+    from ortho_pipeline.block.heights.source import DemHeights as DemHeights
     from ortho_pipeline.block.intersection import intersect as intersect
     from ortho_pipeline.block.point_files import read_block_points as read_block_points
     from ortho_pipeline.block.points import BlockPoints as BlockPoints
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
     from ortho_pipeline.points import write_points as write_points
+    from ortho_pipeline.points.heights.spot_heights import read_spot_heights as read_spot_heights
     from ortho_pipeline.raster.source import Grid as Grid
     from ortho_pipeline.raster.source import RasterSource as RasterSource
     from ortho_pipeline.report.notebook.charts import plot as plot
@@ -61,6 +63,7 @@ __version__: str
 #: Public name -> module that holds it.
 _HOMES = {
     "BlockPoints": "block.points",
+    "DemHeights": "block.heights.source",
     "Fit": "estimation.fit",
     "Grid": "raster.source",
     "ImageCorrection": "models",
@@ -97,6 +100,7 @@ _HOMES = {
     "read_block_points": "block.point_files",
     "read_points": "points",
     "read_rpc": "exchange.rpc",
+    "read_spot_heights": "points.heights.spot_heights",
     "rectify": "commands",
     "save_model": "exchange.model_file",
     "to_geodataframe": "exchange.geodataframe",

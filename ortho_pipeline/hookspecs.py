@@ -127,6 +127,9 @@ class Scene:
         Model families (`ortho models`) that do not suit this product, each with its warning.
     adjusted : mapping, optional
         The earlier adjustment of the model: the section ``adjustment`` of its model file.
+    accuracy : float, optional
+        Standard deviation (m, per axis in plan) of the first model without control, as the vendor states it. An RPC
+        may state its own.
 
     Examples
     --------
@@ -151,6 +154,7 @@ class Scene:
     sources: tuple[str | PathLike[str], ...] = ()
     unsuited: Mapping[str, str] = field(default_factory=dict)
     adjusted: Mapping[str, Any] | None = None
+    accuracy: float | None = None
 
     def __post_init__(self) -> None:
         from ortho_pipeline.files.locations import place

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ortho_pipeline.block.common_error import BlockCommonError
-from ortho_pipeline.block.datum import HOLD, by_control, with_datum, with_start_errors
+from ortho_pipeline.block.datum import HOLD, by_control, stated_accuracies, with_datum, with_start_errors
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
@@ -23,6 +23,7 @@ from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.common_heights import CommonHeights
+from ortho_pipeline.block.heights.record import record_of
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights, started
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
@@ -65,6 +66,7 @@ def adjust(
     hold: float | None = None,
     exclude: Collection[str] = (),
     heights: DemHeights | Surface | None = None,
+    accuracies: Mapping[str, float] | None = None,
 ) -> BlockFit:
     """Adjust the models of all images and the ground of all points together.
 
@@ -81,11 +83,14 @@ def adjust(
         Look for gross errors and leave them out.
     hold : float, optional
         Sigma in pixels of effect with which parameters without a prior are held at their start values. By default only
-        where no control point and no prior defines the datum, and then 10 px; `BlockFit.gauge` says what did.
+        where no control point and no prior defines the datum, and then as accurate as the metadata state, else 10 px;
+        `BlockFit.gauge` says what did.
     exclude : collection of str
         Ids of points that take no part.
     heights : DemHeights or Surface, optional
         A DEM. Its height at each tie, and at each control point without a height, is an observation.
+    accuracies : mapping of image name to float, optional
+        Standard deviations (m, each axis in plan) that metadata state of models; by default those that RPCs state.
 
     Raises
     ------
@@ -116,7 +121,8 @@ def adjust(
     # What starts nowhere says nothing yet; where the images come right, it takes part.
     nowhere = np.asarray(~np.isfinite(state.local).all(axis=1))
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
-    problem, gauge = with_datum(problem, state, selection, hold)
+    stated_by = stated_accuracies(models) if accuracies is None else accuracies
+    problem, gauge = with_datum(problem, state, selection, hold, stated_by)
     refuse_too_few(problem, selection)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
@@ -141,7 +147,8 @@ def adjust(
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
     notes += uncertain_images(solved, stated)
-    return _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
+    fit = _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
+    return replace(fit, planes=solved.problem.heights, accuracies=stated_by)
 
 
 def _first(
@@ -385,7 +392,7 @@ def _result(
     used_ground = selection.ground & active
     covariance, of_points = _with_common(covariance, common)
     covariance, of_heights = _with_common(covariance, None if dem_heights is None else dem_heights.common)
-    taken = None if dem_heights is None else dem_heights.record(solved)
+    taken = None if dem_heights is None else record_of(dem_heights, solved)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
     ground_covariance = ground_covariance + of_heights

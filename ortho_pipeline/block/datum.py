@@ -12,10 +12,15 @@ is how many times the weight of its start value's sigma :math:`\sigma` a paramet
 :math:`m`. A correction of which ties show far less than the part :math:`\epsilon / m` stays at its start, with the
 sigma of that; one of which they show far more is theirs.
 
+:math:`\sigma` of an image is the accuracy that its metadata state, else 10 px. Where rays miss each other by far more,
+it is that.
+
 Source: Kish 1965 (design effect of shared errors); Theil 1963 (mixed estimation).
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -23,9 +28,11 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import step_of
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
+from ortho_pipeline.block.local_frame import plan_partials
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.models.base import Array, SensorModel
 
 #: Without any control, each parameter is held at its start value by its effect in the image, with this sigma (px): the
 #: size of what vendors' orientations are off by.
@@ -34,12 +41,24 @@ HOLD = 10.0
 SLOW = 0.1
 #: Start values count as no less wrong than this (px), however well the rays meet.
 _LEAST_WRONG = 1.0
+#: Rays that miss each other by so many stated sigmas contradict these.
+_CONTRADICTED = 3.0
 
 
 def with_datum(
-    problem: BlockProblem, state: State, selection: Selection, hold: float | None
+    problem: BlockProblem,
+    state: State,
+    selection: Selection,
+    hold: float | None,
+    accuracies: Mapping[str, float] | None = None,
 ) -> tuple[BlockProblem, str]:
-    """Return the problem with a datum, and what defines it."""
+    """Return the problem with a datum, and what defines it.
+
+    Parameters
+    ----------
+    accuracies : mapping of image name to float, optional
+        Standard deviations (m, per axis in plan) that the metadata of images state.
+    """
     control = int((problem.active(selection) & selection.ground).sum())
     if hold is not None and not hold > 0:
         raise InputError("a standard deviation must be positive", field="hold")
@@ -53,12 +72,45 @@ def with_datum(
     if hold is None and known and step_of(linear).condition <= CONDITION_LIMIT:
         return problem, "no control points: the datum is that of the priors and constraints of the models"
     missed = 0.0 if control else _missed(linear)
-    sigma = max(HOLD, missed) if hold is None else hold
+    stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
+    trusted = stated >= missed / _CONTRADICTED
+    sigmas = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
     # Heights of a DEM tell what ties leave to their slow errors.
     by_ties = not control and problem.heights is None
-    held = _held(linear, sigma, SLOW * sigma / max(missed, _LEAST_WRONG) if by_ties else 0.0)
-    of = f"sigma {sigma:.3g} px in the image for each parameter ({len(held)} of {problem.size})"
+    typical = float(np.sqrt(np.mean(sigmas**2)))
+    slow = SLOW * typical / max(missed, _LEAST_WRONG) if by_ties else 0.0
+    held = _held(linear, sigmas, slow)
+    of = f"sigma {_span(sigmas)} px in the image for each parameter ({len(held)} of {problem.size})"
+    if trusted.any() and accuracies:
+        known = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
+        who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"
+        of += f"; {who} {_span(known)} m"
+    elif np.isfinite(stated).any():
+        of += f"; not the accuracy of the metadata, because rays miss each other by {missed:.3g} px"
     return problem.with_pseudo(held), _why(control, by_ties, of)
+
+
+def stated_accuracies(models: Mapping[str, SensorModel]) -> dict[str, float]:
+    """Return the standard deviations (m, per axis) that RPCs state of themselves, by image."""
+    found = {image: model.stated_accuracy for image, model in models.items()}
+    return {image: sigma for image, sigma in found.items() if sigma is not None}
+
+
+def _span(values: Array) -> str:
+    """Return one number, or from where to where several are."""
+    low, high = f"{values.min():.2g}", f"{values.max():.2g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _stated(linear: Linear, accuracies: Mapping[str, float]) -> Array:
+    """Return the standard deviation ``(images,)``, px, of each image by its metadata; NaN where they state none."""
+    problem, found = linear.problem, np.full(len(linear.state.models), np.nan)
+    for image, (name, used) in enumerate(zip(problem.points.images, linear.ordering.rays_of_image, strict=True)):
+        if name in accuracies and len(used):
+            ground = problem.frame.geodetic(linear.state.local[problem.points.point[used]])
+            square = (plan_partials(linear.state.models[image], ground) ** 2).sum(axis=(1, 2)) / 2
+            found[image] = accuracies[name] * np.sqrt(np.nanmean(square))
+    return found
 
 
 def _why(control: int, by_ties: bool, of: str) -> str:
@@ -67,12 +119,12 @@ def _why(control: int, by_ties: bool, of: str) -> str:
         return f"{counted(control, 'control point')}, and the orientation is held at its start values ({of})"
     if by_ties:
         return (
-            "no control points: heights and positions are as accurate as the start values of the orientation, no more. "
+            "no control points: heights and positions are as accurate as the delivered models, no more. "
             f"Only what the ties show was corrected; the rest stays at its start values ({of})"
         )
     return (
-        "no control points: heights are those of the DEM, positions as accurate as the start values of the "
-        f"orientation, no more ({of})"
+        "no control points: heights are those of the DEM, positions as accurate as the delivered models, no more "
+        f"({of})"
     )
 
 
@@ -95,8 +147,14 @@ def with_start_errors(linear: Linear, covariance: Cofactors) -> Cofactors:
     return covariance.mixed(1.0, covariance.times(rows.T), np.eye(len(rows)))
 
 
-def _held(linear: Linear, sigma: float, slow: float) -> list[Pseudo]:
-    """Return a pseudo-observation for each parameter without a prior, as strong as its effect (px) in its image."""
+def _held(linear: Linear, sigmas: Array, slow: float) -> list[Pseudo]:
+    """Return a pseudo-observation for each parameter without a prior, as strong as its effect (px) in its image.
+
+    Parameters
+    ----------
+    sigmas : ndarray (images,)
+        px.
+    """
     problem, params = linear.problem, linear.state.params
     known = {one.column for one in problem.pseudo}
     found = []
@@ -105,7 +163,8 @@ def _held(linear: Linear, sigma: float, slow: float) -> list[Pseudo]:
         effect = np.sqrt((partials**2).sum(axis=1).mean(axis=0)) if len(used) else []
         for column, size in zip(problem.columns.of_image(image), effect, strict=False):
             if int(column) not in known and size > 0:
-                found.append(Pseudo(int(column), float(params[column]), sigma / float(size), held=True, slow=slow))
+                sigma = float(sigmas[image] / size)
+                found.append(Pseudo(int(column), float(params[column]), sigma, held=True, slow=slow))
     return found
 
 

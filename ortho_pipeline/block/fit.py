@@ -13,7 +13,7 @@ import pyproj
 from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
-from ortho_pipeline.block.heights.settling import HeightsRecord
+from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
@@ -23,6 +23,7 @@ from ortho_pipeline.block.variances.components import Variances, VariancesRecord
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.records import CommonError as CommonErrorRecord
 from ortho_pipeline.estimation.records import NoticeDocument, Parameter, Residual, Rmse, Role
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
@@ -157,7 +158,8 @@ class BlockFit:
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are what is left beside its
-    estimate. `heights` is what was taken from a DEM. Of images whose neighbouring measurements share errors,
+    estimate. `heights` is what was taken from a DEM, `planes` where it was; `accuracies` (m) are those that metadata
+    state of images. Of images whose neighbouring measurements share errors,
     `shared_errors` says what they do, and covariances have grown by it.
     """
 
@@ -184,6 +186,8 @@ class BlockFit:
     warnings: tuple[Notice, ...] = ()
     common_error: BlockCommonError | None = None
     heights: HeightsRecord | None = None
+    planes: Planes | None = None
+    accuracies: Mapping[str, float] = field(default_factory=dict)
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
     condition: float = 1.0
     iterations: int = 0

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric, geodetic, metres_per_degree
 from ortho_pipeline.models.base import Array, SensorModel
 
@@ -128,3 +129,9 @@ class Places:
             ahead, behind = (way(self.frame.geodetic(self.local + sign * step)) for sign in (1.0, -1.0))
             partials[:, :, axis] = (ahead - behind) / (2 * _STEP)
         return partials
+
+
+def plan_partials(model: SensorModel, ground: Array) -> Array:
+    """Return the derivatives ``(n, 2, 2)``, px per metre, of image points by east and north at lon, lat, h."""
+    there = ground_transform(GEODETIC, model.crs)(ground)
+    return np.asarray((model.ground_partials(there) @ map_from_enu(parse_crs(model.crs), there))[:, :, :2])

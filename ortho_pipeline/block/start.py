@@ -19,3 +19,11 @@ class Start:
     name: str
     source: str
     priors: Mapping[str, Prior] = field(default_factory=dict)
+
+    @property
+    def accuracy(self) -> float | None:
+        """Standard deviation (m, each axis in plan) that its metadata state; None of a model adjusted before."""
+        if self.scene.adjusted is not None:
+            return None
+        first = self.name.split("+")[0] == next(iter(self.scene.models), None)
+        return self.model.stated_accuracy or (self.scene.accuracy if first else None)

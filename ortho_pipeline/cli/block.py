@@ -8,6 +8,7 @@ from ortho_pipeline.cli.machine.browser import open_option
 from ortho_pipeline.cli.options import (
     adjustment_options,
     block_options,
+    block_output_options,
     folder_option,
     images_argument,
     json_option,
@@ -16,8 +17,10 @@ from ortho_pipeline.cli.options import (
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result
-from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.cli.printing import print_result, progress
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
 
 _models = click.option(
     "--models",
@@ -36,6 +39,8 @@ _models = click.option(
 @adjustment_options
 @matching_options
 @surface_options
+@click.option("--orthos", is_flag=True, help="Also make the orthos of all images on one grid, for 'ortho mosaic'.")
+@block_output_options
 @sensor_options
 @open_option
 @json_option
@@ -46,6 +51,8 @@ def adjust(
     models: tuple[str, ...],
     match: MatchOptions,
     surface: SurfaceOptions,
+    orthos: bool,
+    output: OutputOptions,
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
@@ -53,12 +60,19 @@ def adjust(
 
     The images may be a stereo pair or a block. The command writes a model and an RPC of each image, the ground points
     with their sigmas, and one report. Points with ground coordinates are control or check points; the others tie the
-    images together. --ties auto and --reference find points by matching; both need heights.
+    images together. --ties auto and --reference find points by matching; both need heights. --orthos also makes the
+    orthos of all images.
     """
     from ortho_pipeline.commands import block as blocks
 
+    if not orthos and output != OutputOptions():
+        raise InputError(
+            "this describes orthos, and none are made", field="orthos", remedy=Text("give ", Setting("orthos"), " too")
+        )
     command = click.get_current_context().meta["command"]
-    result = blocks.adjust(images, folder, points, scene, models=models, match=match, surface=surface, command=command)
+    asked = {"match": match, "surface": surface, "orthos": output if orthos else None}
+    with progress() as shown:
+        result = blocks.adjust(images, folder, points, scene, models=models, command=command, progress=shown, **asked)
     print_result(result, as_json)
 
 

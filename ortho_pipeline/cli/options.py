@@ -273,7 +273,11 @@ adjustment_options = click_options(
     "dem_heights",
     "dem_bias",
     "dem_correlation",
+    "dem_shift",
     "dem_shift_sigma",
+    "spot_heights",
+    "spot_crs",
+    "spot_vertical",
     "join_limit",
 )
 #: All options of heights, as `SurfaceOptions`.
@@ -289,6 +293,22 @@ dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_ve
 network_option = _grouped("scene", SceneOptions, "allow_network")
 #: All options of the ortho, as `OutputOptions`.
 output_options = _grouped("output", OutputOptions)
+#: The options of the orthos of a block.
+block_output_options = _grouped(
+    "output",
+    OutputOptions,
+    "crs",
+    "resolution",
+    "extent",
+    "like",
+    "resampling",
+    "bands",
+    "nodata",
+    "format",
+    "creation_options",
+    "memory",
+    "threads",
+)
 #: The suffix of the file sets the format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,8 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
+from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
+from ortho_pipeline.commands.block_results.orthos import adjusted_scenes, corrected, make_orthos, ortho_files
 from ortho_pipeline.commands.control.block_points import (
     gather,
     observed,
@@ -31,6 +32,7 @@ from ortho_pipeline.commands.control.block_points import (
     relative_to_reference,
     settled_scenes,
 )
+from ortho_pipeline.commands.heights.surfaces import open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
@@ -41,17 +43,17 @@ from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
 from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
-from ortho_pipeline.files import json_text, together, write_json, write_text
-from ortho_pipeline.files.json.values import json_position, json_value
+from ortho_pipeline.files import together, write_json, write_text
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import BlockOptions, MatchOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.cards import PICTURES, SIDE
 from ortho_pipeline.report.wording import ENOUGH_CHECK_POINTS, few_check_points
+from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
 
 #: Pixels of an image of which a picture is made: without overviews nearly all of it has to be read.
@@ -69,7 +71,9 @@ def adjust(
     models: Sequence[str | os.PathLike[str]] = (),
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    orthos: OutputOptions | None = None,
     command: str | None = None,
+    progress: Progress | None = None,
 ) -> Result:
     """Adjust images and points together; write a model of each image, the points, adjusted RPCs and one report.
 
@@ -86,13 +90,15 @@ def adjust(
     match : MatchOptions
         References to take control points from, and how to match, also for ties (`points.ties`).
     surface : SurfaceOptions
-        Heights, for matching and as observations of the ties.
+        Heights, for matching, as observations of the ties, and for orthos.
+    orthos : OutputOptions, optional
+        Make the orthos of all images, on one grid.
 
     Returns
     -------
     Result
         `files` has report, html, points, points-csv, and ``<image> model`` and ``<image> rpc`` (where an RPC stands for
-        the model) of each image.
+        the model) of each image; with orthos also ``<image> ortho`` and so on, as those of `rectify`.
 
     Raises
     ------
@@ -101,9 +107,10 @@ def adjust(
     """
     labels = labels_of(images)
     files = _files(labels, Path(folder))
+    of_orthos = {} if orthos is None else ortho_files(Path(folder), labels, orthos)
     scenes = scenes_of(images, scene, models)
-    refuse_contradictions(points, match, surface)
-    _check_paths(files, images, points, scenes, *models, match=match, surface=surface)
+    refuse_contradictions(points, match, surface, orthos=orthos is not None)
+    _check_paths(files, images, points, scenes, *models, match=match, surface=surface, orthos=of_orthos)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
     table, notes = gathered.table, [*placed, *gathered.notices]
@@ -118,32 +125,35 @@ def adjust(
         priors={label: start.priors for label, start in starts.items()},
         hold=points.hold,
         heights=observed(points, surface, gathered.heights),
+        accuracies={label: start.accuracy for label, start in starts.items() if start.accuracy is not None},
     )
     if fit.heights is not None:
         # The block has the last word on the accuracy of the DEM.
         notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
-    exported: dict[str, rpc.RpcExport] = {}
-    for label in labels:
-        try:
-            exported[label] = rpc.export_rpc(_plain(fit.models[label]))
-            notes += [notice.in_image(label) for notice in exported[label].warnings]
-        except InputError as error:
-            notes.append(Notice("no-rpc", Text("no RPC written: ", error.message)).in_image(label))
-            del files[f"{label} rpc"]
+    plain = {label: _plain(fit.models[label]) for label in labels}
+    exported, complaints = _exported(plain, files)
     record = _record(images, points, scenes, starts, command, match, surface, gathered.heights)
     report = block_report.build_report(
         fit=fit,
         starts=starts,
         exported=exported,
         provenance=record,
-        warnings=[*_warnings(fit, starts), *notes],
+        warnings=[*_warnings(fit, starts), *notes, *complaints],
         join_limit=points.join_limit,
     )
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
         _write(files, report, fit, starts, exported, record)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
+        if orthos is not None:
+            under = [start.scene for start in starts.values()]
+            ground = gathered.heights or open_surface(surface, scenes[0], under=under)
+            adjusted = adjusted_scenes(starts, fit, plain, files)
+            options = scenes[0], surface, orthos
+            failed = make_orthos(adjusted, of_orthos, corrected(ground, fit), options, command, progress)
+            failure = failure or next(iter(failed.values()), None)
+            files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text])
     return Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
 
@@ -175,7 +185,7 @@ def intersect(
         If the number of models differs from that of images, or another input is wrong.
     """
     labels = labels_of(images)
-    writer = None if output is None else _writer(output)
+    writer = None if output is None else writer_of(output)
     files = {} if output is None else {"points": Path(output)}
     scenes = scenes_of(images, scene, models)
     _check_paths(files, images, points, scenes, *models)
@@ -195,7 +205,7 @@ def intersect(
             for label, image, own in zip(labels, images, scenes, strict=True)
         }
     intersection = intersect_rays(chosen, table)
-    rows = _ground_rows(
+    rows = ground_rows(
         table, intersection.ground, intersection.sigmas, _apart(table, intersection.ground), intersection.angles_deg
     )
     if writer is not None and output is not None:
@@ -253,12 +263,15 @@ def _check_paths(
     *more: str | os.PathLike[str],
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
+    orthos: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
 ) -> None:
     if not files:
         return
     for image, scene in zip(images, scenes, strict=True):
-        for read in (options.points, options.gcps, *more):
-            inputs.check_paths(files, Request(image, scene, PointOptions(gcps=read), surface, match))
+        for read in (options.points, options.gcps, options.spot_heights, *more):
+            request = Request(image, scene, PointOptions(gcps=read), surface, match)
+            for written in (files, *orthos.values()):
+                inputs.check_paths(written, request)
 
 
 def _record(
@@ -275,7 +288,7 @@ def _record(
     ledgers = [
         Ledger.of(Request(image, scene, PointOptions(gcps=file), surface, match), start.scene, heights)
         for image, scene, start in zip(images, scenes, starts.values(), strict=True)
-        for file in (options.points, options.gcps)
+        for file in (options.points, options.gcps, options.spot_heights)
     ]
     first = next(iter(starts.values())).scene
     matched = options.ties is not None or bool(match.reference)
@@ -292,6 +305,21 @@ def _record(
 
 
 # -- what came out ---------------------------------------------------------------------------------------------------
+
+
+def _exported(
+    models: Mapping[str, SensorModel], files: dict[str, Path]
+) -> tuple[dict[str, rpc.RpcExport], list[Notice]]:
+    """Return the RPCs of the models, and notices; where no RPC represents a model, remove its file from `files`."""
+    exported, notes = dict[str, rpc.RpcExport](), list[Notice]()
+    for label, model in models.items():
+        try:
+            exported[label] = rpc.export_rpc(model)
+            notes += [notice.in_image(label) for notice in exported[label].warnings]
+        except InputError as error:
+            notes.append(Notice("no-rpc", Text("no RPC written: ", error.message)).in_image(label))
+            del files[f"{label} rpc"]
+    return exported, notes
 
 
 def _plain(model: SensorModel) -> SensorModel:
@@ -350,9 +378,9 @@ def _write(
     exported: Mapping[str, rpc.RpcExport],
     record: Mapping[str, Any],
 ) -> None:
-    rows = _ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
-    write_text(files["points"], _geojson(rows))
-    write_text(files["points-csv"], _csv(rows))
+    rows = ground_rows(fit.points, fit.ground, fit.ground_sigmas, fit.object_residuals)
+    write_text(files["points"], geojson_of(rows))
+    write_text(files["points-csv"], csv_of(rows))
     for label, start in starts.items():
         scene = start.scene
         adjustment = {"gauge": fit.gauge, "sigma0": fit.sigma0, **report.adjustment.images[label].to_json()}
@@ -371,67 +399,6 @@ def _write(
 def _write_report(files: Mapping[str, Path], report: BlockReport, pictures: Mapping[str, bytes]) -> None:
     write_json(files["report"], report.to_json(), ascii_only=False)
     write_text(files["html"], block_report.page(report, pictures))
-
-
-def _ground_rows(
-    points: BlockPoints, ground: Array, sigmas: Array, residuals: Array, angles_deg: Array | None = None
-) -> list[dict[str, Any]]:
-    """Return the ground points as JSON values: lon, lat, h, sigmas and known minus found in metres east, north, up."""
-    rays = np.bincount(points.point, minlength=len(points))
-    rows = []
-    for k, name in enumerate(points.ids):
-        row = {
-            "id": name,
-            "role": str(points.roles[k]),
-            "rays": int(rays[k]),
-            "ground": json_position(ground[k]),
-            "sigma": json_position(sigmas[k]),
-            "residual": json_position(residuals[k]),
-        }
-        if angles_deg is not None:
-            row["angle_deg"] = json_value(angles_deg[k])
-        rows.append(row)
-    return rows
-
-
-def _writer(path: str | os.PathLike[str]) -> Any:
-    writers = {".csv": _csv, ".geojson": _geojson}
-    suffix = Path(path).suffix.lower()
-    if suffix not in writers:
-        raise InputError(
-            "ground points cannot be written in this format", file=path, remedy=f"one of {', '.join(writers)}"
-        )
-    return writers[suffix]
-
-
-def _geojson(rows: Sequence[Mapping[str, Any]]) -> str:
-    features = []
-    for row in rows:
-        geometry = None if row["ground"] is None else {"type": "Point", "coordinates": row["ground"]}
-        properties: dict[str, Any] = {"id": row["id"], "kind": row["role"], "rays": row["rays"]}
-        for name, values in (("sigma", row["sigma"]), ("residual", row["residual"])):
-            for axis, value in zip(("e", "n", "h"), values or (None,) * 3, strict=True):
-                properties[f"{name}_{axis}"] = value
-        if "angle_deg" in row:
-            properties["angle_deg"] = row["angle_deg"]
-        features.append({"type": "Feature", "properties": properties, "geometry": geometry})
-    return json_text({"type": "FeatureCollection", "features": features})
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return determined points as a table that --gcps reads."""
-    out = io.StringIO()
-    out.write(f"#CRS: {GEODETIC}\n#vertical: ellipsoid\n")
-    hidden = any(str(row["id"]).startswith("#") for row in rows)
-    writer = csv.writer(out, lineterminator="\n", quoting=csv.QUOTE_ALL if hidden else csv.QUOTE_MINIMAL)
-    writer.writerow(("id", "x", "y", "h", "sigma_xy", "sigma_h", "note"))
-    for row in rows:
-        if row["ground"] is None or row["sigma"] is None:
-            continue
-        note = f"{row['role']}, {counted(row['rays'], 'ray')}"
-        sigma = max(row["sigma"][:2])
-        writer.writerow([row["id"], *map(repr, (*row["ground"], sigma, row["sigma"][2])), note])
-    return out.getvalue()
 
 
 # -- intersections ---------------------------------------------------------------------------------------------------

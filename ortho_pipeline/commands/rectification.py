@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from ortho_pipeline.commands.layers.filling import other_of
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
 from ortho_pipeline.commands.resolved.ledger import RASTERS, provenance, read_since
 from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.results import (
     ENDINGS,
     OF_REPORT,
@@ -112,35 +114,7 @@ def rectify(
     # Before the DEM is read: left alone, GDAL keeps blocks in a share of the machine's memory.
     limit_cache(output.memory, 1)
     resolved = adjustable(request)
-    acquired, sun = _acquired(resolved.scene.facts, output), sun_of(resolved.scene.facts, output)
-    with resolved.ledger.hashed_beside(digest) as hashing:
-        stage("Matching and adjusting" if match.reference else "Adjusting", 0.0)
-        placed = place_scene(resolved)
-        adjusted, model, opened = placed.adjusted, placed.model, placed.scene
-        exported, complaints = _as_rpc(model)
-        source = open_rasters(placed.scene, request)
-        budget, notes = layers.budget_of(placed)
-        path = layers.ortho_of(placed, files, other_of(placed, source))
-        warped = _warp(placed, exported, source, path, stage)
-        stage("Layers and report", 0.0)
-        accuracy = layers.write_layers(placed, budget, warped, files)
-        angles = write_angles(placed, sun, files)
-        settings = request.asked("scene", "surface", "output", "match")
-        record = provenance(request, opened, placed.surface, hashing.result(), command, settings)
-    _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
-
-    def described() -> SceneReport:
-        outcome = _report_of(placed, exported, warped, record | read_since(before), [*complaints, *notes])
-        outcome = report.with_layers(outcome, accuracy=accuracy, angles=angles)
-        write_report(outcome, adjusted.fit, files, adjusted.matched, source)
-        if acquired is not None:
-            from ortho_pipeline.report.stac import write_item
-
-            write_item(files["stac"], outcome, files, acquired, name or stem)
-        return outcome
-
-    outcome = attempted(described, files, *OF_REPORT)
-    resolved.ledger.require_unchanged()
+    outcome = make_ortho(resolved, files, OrthoJob(stage, command, name or stem, digest, before))
     retire(_of_earlier_run(Path(folder), stem, files, all_of_them=overwrite))
     if isinstance(outcome, ReportError):
         return Result(files, {"report": None}, "Ortho and model are complete, but the report is missing.", outcome)
@@ -244,6 +218,67 @@ def export(
 
 
 # -- parts -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OrthoJob:
+    """The settings of an ortho that are not in its request.
+
+    Parameters
+    ----------
+    stage : callable
+        Receives the stage and the progress.
+    command : str, optional
+        For the record.
+    name : str
+        Id of the STAC item.
+    digest : callable
+        Computes checksums of the inputs.
+    before : int
+        Bytes that were read over the network before the work began.
+    """
+
+    stage: Progress
+    command: str | None
+    name: str
+    digest: Callable[..., str] = sha256
+    before: int = 0
+
+
+def make_ortho(resolved: Resolved, files: dict[str, Path], job: OrthoJob) -> SceneReport | ReportError:
+    """Make the ortho of a scene, its report (or its error), and its models if `files` has them."""
+    request, output = resolved.request, resolved.request.output
+    acquired, sun = _acquired(resolved.scene.facts, output), sun_of(resolved.scene.facts, output)
+    with resolved.ledger.hashed_beside(job.digest) as hashing:
+        job.stage("Matching and adjusting" if request.match.reference else "Adjusting", 0.0)
+        placed = place_scene(resolved)
+        adjusted, opened = placed.adjusted, placed.scene
+        exported, complaints = _as_rpc(placed.model)
+        source = open_rasters(placed.scene, request)
+        budget, notes = layers.budget_of(placed)
+        path = layers.ortho_of(placed, files, other_of(placed, source))
+        warped = _warp(placed, exported, source, path, job.stage)
+        job.stage("Layers and report", 0.0)
+        accuracy = layers.write_layers(placed, budget, warped, files)
+        angles = write_angles(placed, sun, files)
+        settings = request.asked("scene", "surface", "output", "match")
+        record = provenance(request, opened, placed.surface, hashing.result(), job.command, settings)
+    if "model" in files:
+        _write_models(placed, exported, files, {**record, "adjustment": adjusted.record()})
+
+    def described() -> SceneReport:
+        outcome = _report_of(placed, exported, warped, record | read_since(job.before), [*complaints, *notes])
+        outcome = report.with_layers(outcome, accuracy=accuracy, angles=angles)
+        write_report(outcome, adjusted.fit, files, adjusted.matched, source)
+        if acquired is not None:
+            from ortho_pipeline.report.stac import write_item
+
+            write_item(files["stac"], outcome, files, acquired, job.name)
+        return outcome
+
+    outcome = attempted(described, files, *OF_REPORT)
+    resolved.ledger.require_unchanged()
+    return outcome
 
 
 def _unwatched(stage: str, share: float) -> None:

@@ -114,6 +114,11 @@ class SensorModel(ABC):
         return self
 
     @property
+    def stated_accuracy(self) -> float | None:
+        """Standard deviation (m, each axis in plan) that the vendor states of the model; None if none is stated."""
+        return None
+
+    @property
     def corners(self) -> Array:
         """Ground points ``(N, 3)`` at the corners of the model's area, at its lowest and highest height.
 

@@ -69,6 +69,10 @@ class OverAnother(SensorModel):
         return self._replace(model=self.model.with_heights(low, high))
 
     @property
+    def stated_accuracy(self) -> float | None:
+        return self.model.stated_accuracy
+
+    @property
     def corners(self) -> Array:
         return self.model.corners
 

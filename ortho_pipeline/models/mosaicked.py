@@ -71,6 +71,10 @@ class Pieces(SensorModel):
         return self._replace(models=tuple(model.with_heights(low, high) for model in self.models))
 
     @property
+    def stated_accuracy(self) -> float | None:
+        return self.first.stated_accuracy
+
+    @property
     def corners(self) -> Array:
         return np.concatenate([model.corners for model in self.models])
 

@@ -15,6 +15,7 @@ Source: NIMA STDI-0002, appendix E (RPC00B); Grodecki and Dial 2001; formula 6 o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -119,6 +120,13 @@ class RPC(SensorModel):
         low, high = sound_heights(numbers, self._polynomials)
         # If it is sound up to the end of the box, then beyond it as far as horizontally.
         return low if low > -1.0 else -DOMAIN_LIMIT, high if high < 1.0 else DOMAIN_LIMIT
+
+    @property
+    def stated_accuracy(self) -> float | None:
+        """ERR_BIAS and ERR_RAND together."""
+        # What is not positive stands for unknown: -1 in the standard, 0 of some programs.
+        given = [value for value in (self.err_bias, self.err_rand) if value is not None and value > 0]
+        return math.hypot(*given) if given else None
 
     @property
     def crs(self) -> str:

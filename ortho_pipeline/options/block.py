@@ -80,7 +80,7 @@ class BlockOptions:
             "PX",
             kind="number",
             above=0,
-            unset="10 if nothing else defines the datum",
+            unset="without control, the accuracy in the metadata, else 10",
         ),
     ] = None
     dem_heights: Annotated[
@@ -112,6 +112,15 @@ class BlockOptions:
             unset="errors of the samples are independent",
         ),
     ] = None
+    dem_shift: Annotated[
+        str | None,
+        Option(
+            "--dem-shift",
+            "Correct the position of the DEM by this (metres east and north), or by the estimate.",
+            "estimate|E,N",
+            unset="the estimate is only reported",
+        ),
+    ] = None
     dem_shift_sigma: Annotated[
         float | None,
         Option(
@@ -121,6 +130,21 @@ class BlockOptions:
             kind="number",
             unset="half a sample",
         ),
+    ] = None
+    spot_heights: Annotated[
+        PathLike | None,
+        Option(
+            "--spot-heights",
+            "Known heights, such as of laser altimetry: CSV, GeoJSON or GeoParquet with x, y, h, sigma. They fix the "
+            "bias of the DEM.",
+            "FILE",
+        ),
+    ] = None
+    spot_crs: Annotated[
+        str | None, Option("--spot-heights-crs", "CRS of the spot heights, where their file has none.", "CRS")
+    ] = None
+    spot_vertical: Annotated[
+        str | None, Option("--spot-heights-vertical", f"Height datum of the spot heights: {VERTICAL_FORMS}.", "DATUM")
     ] = None
     join_limit: Annotated[
         float,

@@ -13,6 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.points.image_errors import read_image_errors
 from ortho_pipeline.points.rows import (
+    ALTIMETRY,
     CSV_ERRORS,
     CSV_IMAGE,
     OF_IMAGE,
@@ -90,6 +91,18 @@ class Header:
             return "geographic"
         return "projected" if names & _PROJECTED else None
 
+    @property
+    def of_altimetry(self) -> bool:
+        """Whether the heights are those of a laser altimeter."""
+        return "h" in self.place and _plain(self.names[self.place["h"]]) in ALTIMETRY
+
+
+def altimetry(table: Table) -> None:
+    """State of a table what heights of laser altimeters are above, and the CRS of its longitudes and latitudes."""
+    table.assumed_vertical = "ellipsoid"
+    if table.of_ground == "geographic" and table.crs is None:
+        table.crs = "EPSG:4326"
+
 
 def is_header(text: str) -> bool:
     """Return whether a line is a header, not numbers: at least three of its words name an id or coordinates."""
@@ -118,6 +131,8 @@ def read_csv(path: str | os.PathLike[str], text: str, expected: ColumnRules = OF
         if header is None:
             header = _header(path, line, expected)
             table.of_ground = header.of_ground
+            if header.of_altimetry:
+                altimetry(table)
             continue
         row = _row(path, line, header, expected, marks)
         if row is not None:
@@ -137,16 +152,16 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", _OWN_UNIT.sub("", name.strip().lower()))
 
 
-def _ours(name: str) -> str:
+def _ours(name: str, aliases: Mapping[str, str] = _ALIASES) -> str:
     """Return our name of a column; of an unknown one its own name."""
     lowered = name.strip().lower()
-    return lowered if lowered in ("id", "col", "row", "x", "y", "h", "role") else _ALIASES.get(_plain(name), lowered)
+    return lowered if lowered in ("id", "col", "row", "x", "y", "h", "role") else aliases.get(_plain(name), lowered)
 
 
 def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> Header:
     delimiter = _delimiter(line.text)
     names = cells_of(path, line, delimiter)
-    ours = _our_names(names)
+    ours = _our_names(names, expected)
     place: dict[str, int] = {}
 
     def refuse(message: str) -> InputError:
@@ -161,6 +176,8 @@ def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> 
         if name in CSV_IGNORED or (not name and index in (0, len(names) - 1)):
             continue
         if name not in (*expected.names, "status"):
+            if expected.aliases:
+                continue
             raise refuse(f"unknown column {short(names[index])}")
         if name in place:
             raise refuse(f"the columns {short(names[place[name]])} and {short(names[index])} both mean {name}")
@@ -171,9 +188,10 @@ def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> 
     return Header(names, place, delimiter)
 
 
-def _our_names(names: Sequence[str]) -> list[str]:
+def _our_names(names: Sequence[str], expected: ColumnRules) -> list[str]:
     """Return our name of each column; the meaning of some names depends on the other columns."""
-    ours, plain = [_ours(name) for name in names], [_plain(name) for name in names]
+    aliases = {**_ALIASES, **expected.aliases}
+    ours, plain = [_ours(name, aliases) for name in names], [_plain(name) for name in names]
     # A table that was saved with its index has a first column without a name.
     if re.fullmatch(r"(unnamed:\s*0)?", names[0].strip().lower()):
         ours[0] = "" if "id" in ours else "id"

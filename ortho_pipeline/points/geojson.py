@@ -77,6 +77,12 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
         value = properties.get(name)
         return None if value is None else sigma_of(value, path, f"{where}.properties.{name}", zero=zero)
 
+    for alias, ours in expected.aliases.items():
+        value = next((value for key, value in properties.items() if key.lower().replace("_", "") == alias), None)
+        if value is not None and ours == "h" and math.isnan(ground[2]):
+            ground = (*ground[:2], number(value, path, f"{where}.properties, {alias}"))
+        elif value is not None and ours != "h":
+            properties = {ours: value, **properties}
     name = properties.get("id", feature.get("id"))
     if name is not None and not isinstance(name, str | int):
         raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")

@@ -10,7 +10,7 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,18 +37,31 @@ CSV_IMAGE = "image"
 CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common", "sigma_alike")
 
 
+#: What laser altimetry calls heights, always above the ellipsoid, and their sigmas: SlideRule, ATL06, ATL08.
+ALTIMETRY = {"hmean": "hsigma", "hli": "hlisigma", "htebestfit": "hteuncertainty"}
+
+
 class ColumnRules(NamedTuple):
-    """Columns that a CSV may have, those that every line needs, and the default role."""
+    """Columns that a CSV may have, those that every line needs, and the default role.
+
+    `aliases` are further names of ours (without punctuation). With aliases, unknown columns are skipped.
+    """
 
     names: tuple[str, ...]
     needed: tuple[str, ...]
     role: str
+    aliases: Mapping[str, str] = {}
 
 
 #: Points of one image; rays of a block, with or without ground; ground points that test heights; ground points.
 OF_IMAGE = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[1:5], "control")
 OF_BLOCK = ColumnRules(("id", CSV_IMAGE, *CSV_COLUMNS[1:], *CSV_ERRORS), ("id", CSV_IMAGE, "col", "row"), "")
-OF_HEIGHTS = ColumnRules((*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE), CSV_COLUMNS[3:6], "check")
+OF_HEIGHTS = ColumnRules(
+    (*CSV_COLUMNS, *CSV_ERRORS, CSV_IMAGE),
+    CSV_COLUMNS[3:6],
+    "check",
+    dict.fromkeys(ALTIMETRY, "h") | dict.fromkeys(("sigma", *ALTIMETRY.values()), "sigma_h"),
+)
 OF_GROUND = ColumnRules(("id", *CSV_COLUMNS[3:7], *CSV_COLUMNS[8:]), ("id", "x", "y"), "")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 

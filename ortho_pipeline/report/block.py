@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
-from ortho_pipeline.block.heights.settling import HeightsRecord
+from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.network import NetworkRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
@@ -21,7 +21,14 @@ from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.estimation.records import Rmse, is_known
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.points.rows import ROLES
-from ortho_pipeline.report.block_records import BlockHeadline, BlockImage, BlockProvenance, BlockReport
+from ortho_pipeline.report.block_records import (
+    AbsoluteAccuracy,
+    BlockHeadline,
+    BlockImage,
+    BlockProvenance,
+    BlockReport,
+    RelativeAccuracy,
+)
 from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
@@ -102,6 +109,8 @@ def build_report(
             headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
         ),
         network=network,
+        absolute=_absolute(fit),
+        relative=_relative(network),
         map_scale=None if refuted(noted["notices"]) else suffices,
     )
 
@@ -204,7 +213,7 @@ def summary_text(report: BlockReport) -> str:
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
-    lines += [*height_lines(adjustment.heights), *join_lines(report.network)]
+    lines += [*height_lines(adjustment.heights), *sigma_lines(report)]
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
@@ -246,15 +255,37 @@ def height_lines(heights: HeightsRecord | None) -> list[str]:
     ]
 
 
-def join_lines(network: NetworkRecord) -> list[str]:
-    """Say how accurate the relative positions of images with points in common are."""
-    known = sorted(one.sigma_px for one in network.pairs if one.sigma_px is not None)
+def sigma_lines(report: BlockReport) -> list[str]:
+    """Return the sigmas of ground points, and of the relative positions of images with points in common."""
+    found = []
+    if (ground := report.absolute) is not None:
+        found.append(
+            f"Absolute accuracy: sigma {ground.east_m:.2g} m east, {ground.north_m:.2g} m north, "
+            f"{ground.height_m:.2g} m in height (median of {counted(ground.points, 'point')})"
+        )
+    if (pairs := report.relative) is not None:
+        found.append(
+            f"Relative accuracy of {counted(pairs.pairs, 'pair')} of images: sigma {pairs.median_px:.2g} px "
+            f"(median), {pairs.worst_px:.2g} px (worst)"
+        )
+    return found
+
+
+def _absolute(fit: BlockFit) -> AbsoluteAccuracy | None:
+    sigmas = fit.ground_sigmas[np.isfinite(fit.ground_sigmas).all(axis=1)]
+    if not len(sigmas):
+        return None
+    east, north, up = np.median(sigmas, axis=0).tolist()
+    return AbsoluteAccuracy(east_m=east, north_m=north, height_m=up, points=len(sigmas))
+
+
+def _relative(network: NetworkRecord) -> RelativeAccuracy | None:
+    known = [(one.sigma_px, one.sigma_m) for one in network.pairs if one.sigma_px is not None]
     if not known:
-        return []
-    return [
-        f"Relative accuracy of {counted(len(known), 'pair')} of images: sigma {known[len(known) // 2]:.2g} px "
-        f"(median), {known[-1]:.2g} px (worst)"
-    ]
+        return None
+    sizes, lengths = (sorted(values) for values in zip(*known, strict=True))
+    middle = len(known) // 2
+    return RelativeAccuracy(pairs=len(known), median_px=sizes[middle], median_m=lengths[middle], worst_px=sizes[-1])
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:
@@ -316,6 +347,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         marks=_marks(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         ground_sigmas=variance_lines(adjustment.variances),
+        sigmas=sigma_lines(report),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(
             zip(adjustment.points, report.network.largest_deg, strict=True), key=lambda one: ROLES.index(one[0].role)

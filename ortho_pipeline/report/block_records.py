@@ -11,7 +11,7 @@ from typing import Any, Literal
 from ortho_pipeline.block.fit import BlockAdjustment
 from ortho_pipeline.block.network import NetworkRecord
 from ortho_pipeline.estimation.records import NoticeDocument
-from ortho_pipeline.files.json.records import Pair, Record, Words
+from ortho_pipeline.files.json.records import Count, Pair, Record, Words
 from ortho_pipeline.report.records import InputFile, MapScaleRecord, RpcRecord, Size
 
 
@@ -55,6 +55,27 @@ class BlockHeadline(Record):
     notes: tuple[str, ...]
 
 
+class AbsoluteAccuracy(Record):
+    """Standard deviations on the ground, metres: medians over the points, with the errors of the datum."""
+
+    east_m: float
+    north_m: float
+    height_m: float
+    points: Count
+
+
+class RelativeAccuracy(Record):
+    """Standard deviations of the relative positions of images with points in common, where they are largest.
+
+    The errors of the datum, which all images share, are not in them.
+    """
+
+    pairs: Count
+    median_px: float
+    median_m: float
+    worst_px: float
+
+
 class BlockReport(Record):
     """The content of block_report.json. Numbers that do not exist are null."""
 
@@ -67,4 +88,6 @@ class BlockReport(Record):
     notices: tuple[NoticeDocument, ...]
     headline: BlockHeadline
     network: NetworkRecord
+    absolute: AbsoluteAccuracy | None
+    relative: RelativeAccuracy | None
     map_scale: MapScaleRecord | None

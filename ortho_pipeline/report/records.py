@@ -143,6 +143,9 @@ class Dem(Record):
     metres_per_unit: float | None = None
     fill: str | float | None = None
     warnings: tuple[str, ...] = ()
+    #: How far a block moved the DEM to the east and north, and raised it, metres.
+    moved_m: Pair | None = None
+    raised_m: float | None = None
     #: Of heights that were found: the cells that have land, and those that have none.
     cells: tuple[str, ...] = ()
     sea_cells: tuple[str, ...] = ()

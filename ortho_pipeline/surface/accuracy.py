@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.ground import ground_of
-from ortho_pipeline.points.rows import OF_HEIGHTS
+from ortho_pipeline.points.heights.spot_heights import read_height_table
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
@@ -178,7 +177,7 @@ def typical_sigma(surface: Surface) -> float | None:
 def read_check_heights(
     path: str | os.PathLike[str], crs: str | None = None, vertical: str | None = None
 ) -> tuple[Array, pyproj.CRS, tuple[str, ...]]:
-    """Read check heights: CSV or GeoJSON with x, y, h. Other columns, such as image coordinates, are not used.
+    """Read check heights: CSV, GeoJSON or GeoParquet with x, y, h. Other columns are not used.
 
     Returns
     -------
@@ -192,7 +191,7 @@ def read_check_heights(
     InputError, CrsError, DatumError
         As `points.read_points`; also if no point has a height.
     """
-    table = read_block_table(path, OF_HEIGHTS)
+    table = read_height_table(path)
     ground, plane = ground_of(
         path, table, None if crs is None else parse_crs(crs), None if vertical is None else Vertical.parse(vertical)
     )

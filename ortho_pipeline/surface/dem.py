@@ -23,6 +23,7 @@ from ortho_pipeline.errors import CoverageError, DatumError, completed
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.datum import dem_unit, dem_vertical, dem_vertical_remedy
 from ortho_pipeline.geodesy.declared_vertical import declared_vertical
+from ortho_pipeline.geodesy.distortion import map_from_enu
 from ortho_pipeline.surface.base import Array, Excerpt, Surface, Window, parse_fill, positions
 from ortho_pipeline.surface.dem_file import Affine, DemFile, SampleGrid
 from ortho_pipeline.surface.dem_mosaic import Samples, matching_files, open_mosaic
@@ -175,6 +176,8 @@ class DemSurface(Surface):
     cache_bytes : int
         Bytes of cached heights.
     sigma : float, Surface or None
+    raised : float
+        What is added to the heights, m.
     """
 
     file: Samples
@@ -185,6 +188,7 @@ class DemSurface(Surface):
     record: Mapping[str, Any]
     cache_bytes: int
     sigma: float | Surface | None = None
+    raised: float = 0.0
     # What is kept follows from all of the above, so no two surfaces share it.
     _tiles: TileCache = field(init=False, repr=False)
 
@@ -244,6 +248,22 @@ class DemSurface(Surface):
         sigma = self.sigma.around(lon) if isinstance(self.sigma, Surface) else self.sigma
         grid = self.grid.around(lon)
         return self if grid is self.grid and sigma is self.sigma else replace(self, grid=grid, sigma=sigma)
+
+    def moved(self, metres: tuple[float, float, float], place: Array) -> DemSurface:
+        """Return this DEM moved so far to the east and north, and raised.
+
+        Parameters
+        ----------
+        place : ndarray (2,)
+            Longitude and latitude where these are metres.
+        """
+        east, north, up = metres
+        there = ground_transform("EPSG:4979", self.crs)(np.array([[*place, 0.0]]))
+        dx, dy, _ = map_from_enu(self.crs, there)[0] @ (east, north, 0.0)
+        x, a, b, y, c, d = self.grid.crs_from_pixel
+        grid = replace(self.grid, crs_from_pixel=(x + float(dx), a, b, y + float(dy), c, d))
+        record = {**self.record, "moved_m": [east, north], "raised_m": up}
+        return replace(self, grid=grid, raised=self.raised + up, record=record)
 
     @property
     def nearest_reach(self) -> int:
@@ -366,7 +386,7 @@ class DemSurface(Surface):
             heights = np.concatenate([heights, rest], axis=1)
         if not self.vertical.is_ellipsoid:
             heights += _undulations(self.vertical, self.grid, (left, top, width, height))
-        return heights
+        return heights + self.raised if self.raised else heights
 
     # -- ranges ------------------------------------------------------------------------------------------------------
 

@@ -95,6 +95,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
         facts=_facts(product, model, name, dataset.RasterCount),
         warnings=(*warnings, *_contradictions(product)),
         unsuited=UNSUITED,
+        accuracy=None if product.circular_error is None else product.circular_error * _SIGMA_OF_CE90,
     )
 
 
@@ -122,7 +123,6 @@ def _facts(product: Product, model: RPC, image: str, bands: int) -> dict[str, ob
         facts["acquired"] = product.acquired.isoformat().replace("+00:00", "Z")
     if product.circular_error is not None:
         facts["circular_error_m"] = product.circular_error
-        facts["position_sigma_m"] = round(product.circular_error * _SIGMA_OF_CE90, 2)
     optional = {"cloud_cover_percent": product.cloud_cover, "orbit": product.orbit, "bits_per_pixel": product.bits}
     facts |= {key: value for key, value in optional.items() if value is not None}
     return facts

@@ -320,9 +320,7 @@ def test_the_search_is_what_the_scene_says_of_itself() -> None:
         == 4.0
     )
     unknown = replace(stated, models={"rpc": replace(model, err_bias=None, err_rand=None)})
-    assert search_of(replace(unknown, facts={"position_sigma_m": 5.0}), options, 0.5).distance == pytest.approx(
-        15 * math.sqrt(2)
-    )
+    assert search_of(replace(unknown, accuracy=5.0), options, 0.5).distance == pytest.approx(15 * math.sqrt(2))
     found = search_of(unknown, options, 1.0)
     assert (found.distance, found.known) == (100.0, False)
     assert search_of(unknown, options, 0.01).distance == pytest.approx(0.25 * 0.01 * min(unknown.width, unknown.height))

@@ -19,6 +19,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.rational import RPC
 
@@ -40,7 +41,7 @@ def cameras() -> dict[str, RPC]:
 
 def starts_of(cameras: dict[str, RPC], correction: str = "shift-drift", **priors: Prior) -> dict[str, Start]:
     """Return cameras whose image points are to be corrected; only their models count here."""
-    scene: Any = None
+    scene = Scene("test", "test.tif", 1000, 1000, dict(cameras), "test")
     return {
         name: Start(scene, ImageCorrection.identity(camera, correction, (500.0, 500.0)), name, "test", priors)
         for name, camera in cameras.items()

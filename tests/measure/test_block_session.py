@@ -89,7 +89,7 @@ def test_clicks_tie_the_images_and_the_block_is_that_of_the_file(
     metres = np.subtract(fit.ground[1], known) * [111320 * np.cos(np.radians(37.25)), 111320, 1]
     assert (np.abs(metres) < 3 * fit.ground_sigmas[1] + 0.3).all()
     session.save()
-    adjust([SAMPLE / "scene.tif", stereo.path], tmp_path / "out", BlockOptions(points=session.output))
+    adjust([SAMPLE / "scene.tif", stereo.path], tmp_path / "out", BlockOptions(points=session.output), surface=SURFACE)
     made = json.loads((tmp_path / "out/block_report.json").read_text())["adjustment"]
     for label in ("scene", "second"):
         for name, said in made["images"][label]["parameters"].items():

@@ -77,7 +77,7 @@ def test_a_delivery_keeps_the_contract(delivery, scene):
     assert list(opened.models) == ["rpc"]
     assert opened.facts["kind"] == "panchromatic"
     assert opened.facts["families"] == ["affine14", "affine12", "affine3d", "dlt"]
-    assert opened.facts["position_sigma_m"] == pytest.approx(33 / 2.146, abs=0.02)
+    assert opened.accuracy == pytest.approx(33 / 2.146, abs=0.02)
     assert "cloud_cover_percent" not in opened.facts
     assert not opened.warnings
     assert np.abs(read_product(opened.facts["label"]).corner_misses).max() < 0.01
@@ -355,8 +355,9 @@ def test_hostile_labels_are_answered_at_once(tmp_path, calls):
 
 def test_unknown_numbers_are_none(copied):
     edit(copied, ("circularError = 32.98", "circularError = 999; x = 32.98"), ("acquisitionOrbitNumber", "other"))
-    facts = open_scene(copied).facts
-    assert not {"circular_error_m", "position_sigma_m", "orbit", "cloud_cover_percent"} & set(facts)
+    opened = open_scene(copied)
+    assert not {"circular_error_m", "orbit", "cloud_cover_percent"} & set(opened.facts)
+    assert opened.accuracy is None
     edit(copied, ("productCloudCoverPercentage = 999", "productCloudCoverPercentage = 12"))
     assert open_scene(copied).facts["cloud_cover_percent"] == 12
 

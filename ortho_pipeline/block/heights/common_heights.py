@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ortho_pipeline.block.equations.linear import Linear
+from ortho_pipeline.block.equations.problem import State
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
@@ -24,6 +25,8 @@ from ortho_pipeline.models.base import Array
 
 #: Modes are of the covariance of so many points at most, and are so many at most, of a block of `_MANY` points fewer.
 _ANCHORS, _MODES, _MANY = 800, 120, 5_000
+#: Less information on a shift, over that of its own standard deviation, is none.
+_TOLD = 1e-6
 #: The share of the variance in all modes that are kept.
 _HELD = 0.99
 
@@ -39,11 +42,14 @@ class CommonHeights(CommonUnknown):
         the east and to the north.
     by_params, by_points : ndarray (P, k), (N, 3, k)
         How one standard deviation moves parameters, and points in their east, north, up.
+    undone : ndarray (k,)
+        The part of the estimate with which the DEM was moved before it was read, in standard deviations.
     """
 
     loads: Array
     by_params: Array
     by_points: Array
+    undone: Array
 
     @classmethod
     def of(cls, loads: Array, bias: float, points: int, parameters: int) -> CommonHeights:
@@ -57,12 +63,13 @@ class CommonHeights(CommonUnknown):
             loads=loads,
             by_params=np.zeros((parameters, modes)),
             by_points=np.zeros((count, 3, modes)),
+            undone=np.zeros(modes),
         )
 
     @property
     def offset(self) -> Array:
-        """The estimate ``(N,)`` of how much too high the heights are, m."""
-        return np.asarray(self.loads @ self.value)
+        """The estimate ``(N,)`` of how much too high the heights are as they were read, m."""
+        return np.asarray(self.loads @ (self.value - self.undone))
 
     @property
     def bias(self) -> tuple[float, float]:
@@ -79,6 +86,19 @@ class CommonHeights(CommonUnknown):
     def shift(self, shift: float) -> tuple[Array, Array]:
         """Return the estimate ``(2,)`` of the DEM's shift to the east and north, m, and its covariance, m²."""
         return self.value[1:3] * shift, self.left[1:3, 1:3] * shift**2
+
+    @property
+    def chance(self) -> float | None:
+        """How probable a shift as large as this would seem of a DEM that is not shifted; None where nothing tells."""
+        from scipy.special import chdtrc
+
+        # Without the prior: what the block tells of the shift, with all other unknowns.
+        precision = np.linalg.inv(self.left[1:3, 1:3])
+        told = precision - np.eye(2)
+        if np.linalg.eigvalsh(told)[0] < _TOLD:
+            return None
+        alone = np.linalg.solve(told, precision @ self.value[1:3])
+        return float(chdtrc(2, alone @ told @ alone))
 
     @property
     def of_points(self) -> Array:
@@ -119,6 +139,13 @@ class CommonHeights(CommonUnknown):
         told = units.T @ left
         found = replace(self, points=len(rows), told=(told + told.T) / 2, by_params=-step, by_points=by_points)
         return found, units[place[rows]].T @ linear.misfits.ground[rows, 2]
+
+    def followed(self, before: CommonHeights, solved: Solved) -> State:
+        """Return the state of a solution with what parameters and points do if these errors are no longer `before`."""
+        step, frame = self.value - before.value, solved.problem.frame
+        enu = frame.enu_at(frame.geodetic(solved.state.local))
+        points = np.einsum("nji,nj->ni", enu, self.by_points @ step)
+        return solved.state.moved(self.by_params @ step, np.nan_to_num(points))
 
     def _sigmas(self, linear: Linear, rows: Index) -> Array:
         """Return the sigmas ``(n,)`` of heights upwards, not along the normals of their planes."""

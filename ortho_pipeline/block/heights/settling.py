@@ -17,14 +17,12 @@ from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
+from ortho_pipeline.block.heights.spots import SpotDifferences
 from ortho_pipeline.block.heights.terrain import Terrain
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import metres
-from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
-from ortho_pipeline.files.json.records import Count, Pair, Record
+from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
 
 #: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma,
@@ -40,8 +38,8 @@ _BREAKS = 4.0
 _ENOUGH, _REDUNDANT = 50, 0.2
 #: Stated sigmas count as too small if residuals are larger by so many standard deviations of their mean square.
 _SIGNIFICANT = 2.5
-#: A notice names so many points.
-_NAMED = 10
+#: Standard deviation (m) before the adjustment of a bias that spot heights fix.
+_FREE = 100.0
 #: The sigma of a normal distribution over its median absolute value.
 _NORMAL = 1.4826
 
@@ -73,6 +71,8 @@ class Heights:
         Whether `sigma` was.
     scale : float
         How many times larger than stated their errors are, at least 1.
+    spots : SpotDifferences, optional
+        Known heights, observations of the shared errors.
     """
 
     source: DemHeights
@@ -87,6 +87,7 @@ class Heights:
     broken: Mask
     estimated: bool = False
     scale: float = 1.0
+    spots: SpotDifferences | None = None
 
     @classmethod
     def under(cls, source: DemHeights, problem: BlockProblem, local: Array) -> Heights:
@@ -103,15 +104,18 @@ class Heights:
             sigmas[rows] = stated
         each = np.full(len(rows), DEFAULT_SIGMA) if stated is None else stated
         typical = float(np.sqrt(np.nanmean(each**2))) if np.isfinite(each).any() else DEFAULT_SIGMA
-        bias = typical if source.bias is None else source.bias
+        spots = SpotDifferences.of(source, DEFAULT_SIGMA)
+        bias = (typical if spots is None else _FREE) if source.bias is None else source.bias
         own = np.ones(count)
         own[rows] = source.sharing(ground[rows])
         loads = np.zeros((count, 3))
         loads[:, 0] = bias
+        known = np.zeros((0, 3)) if spots is None else problem.frame.of_geodetic(spots.spots.ground)
+        shared, left = np.zeros((len(rows) + len(known), 0)), None
         if source.correlation is not None and len(rows):
-            shared, left = correlated(local[rows], source.correlation)
+            shared, left = correlated(np.vstack([local[rows], known]), source.correlation)
             more = np.zeros((count, shared.shape[1]))
-            more[rows], own[rows] = shared * np.nan_to_num(each)[:, None], left
+            more[rows], own[rows] = shared[: len(rows)] * np.nan_to_num(each)[:, None], left[: len(rows)]
             loads = np.hstack([loads, more])
         none = np.zeros(count, dtype=bool)
         common = CommonHeights.of(loads, bias, len(rows), problem.size)
@@ -119,7 +123,11 @@ class Heights:
         np.minimum.at(images, problem.points.point, problem.points.image)
         each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
         terrain = Terrain.under(source, _places(problem, local), of, each, images)
-        return cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        heights = cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
+        if spots is None:
+            return heights
+        left_there = None if left is None else left[len(rows) :]
+        return replace(heights, spots=spots.with_loads(bias, heights.shift, shared[len(rows) :], left_there))
 
     @property
     def shift(self) -> float:
@@ -154,11 +162,15 @@ class Heights:
         """
         heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
-            judged = heights._under(solved.problem, solved.state.local)._judged(solved, number)
+            judged, state = heights._under(solved.problem, solved.state.local)._judged(solved, number), solved.state
+            if judged.common.value is not heights.common.value:
+                # Points and images follow the shared errors, so that the DEM is read where they will be.
+                state = judged.common.followed(heights.common, solved)
+                judged = judged._moved(solved)._under(solved.problem, state.local)
             problem = judged.applied(solved.problem)
             if judged._same_errors(heights) and _stable(solved, problem):
                 return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
-            again = attempt(problem, solved.state, selection, tolerance)
+            again = attempt(problem, state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
                 break
             solved, heights = again, judged
@@ -173,23 +185,43 @@ class Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
         slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
+        if self.spots is not None:
+            common, slope = self.spots.told(common, self.sigma, slope)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
             common = replace(common, value=common.value + step)
-        judged = replace(self, common=common)
+        # Otherwise heights at the limit may be left out and return without end.
+        settled = number > _ROUNDS // 2
+        spots = self.spots if self.spots is None or settled else self.spots.judged(common, self.sigma)
+        judged = replace(self, common=common, spots=spots)
         residuals, variances, used = judged._residuals(solved)
         if self.stated is None:
             judged = judged._estimated(residuals, variances, used)
         elif number:
             judged = judged._scaled(residuals, variances, used)
-        if number > _ROUNDS // 2:
-            # Otherwise heights at the limit may be left out and return without end.
+        if settled:
             return judged
         sigmas = np.sqrt(np.maximum(variances, (0.2 * judged.sigmas) ** 2))
         with np.errstate(invalid="ignore"):
             wrong = np.abs(residuals) > np.where(self.wrong, _RIGHT, _WRONG) * sigmas
         broken = judged.broken if number else judged._breaking(solved)
         return replace(judged, wrong=np.asarray(judged.of & wrong), broken=broken)
+
+    def _moved(self, solved: Solved) -> Heights:
+        """Return them with the DEM moved by the estimate of its shift, if the source asks for it."""
+        rest = self.common.value[1:3] - self.common.undone[1:3]
+        if not self.source.follow or np.abs(rest).max() <= _SHARED_STABLE:
+            return self
+        east, north = (-rest * self.shift).tolist()
+        origin = solved.problem.frame.origin
+        source = replace(self.source, surface=self.source.surface.moved((east, north, 0.0), origin[:2]))
+        undone = self.common.undone.copy()
+        undone[1:3] = self.common.value[1:3]
+        spots = None if self.spots is None else self.spots.read_again(source, self.sigma, self.shift)
+        read = self.terrain.read + (east, north) / metres_per_degree(origin[None])
+        common, terrain = replace(self.common, undone=undone), replace(self.terrain, read=read)
+        moved = replace(self, source=source, common=common, terrain=terrain, spots=spots)
+        return replace(moved, broken=moved._breaking(solved))
 
     def _residuals(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
@@ -221,9 +253,12 @@ class Heights:
         """Return them with a robust sigma of the residuals; unchanged if too few have enough redundancy."""
         redundancy = variances / self.sigma**2
         testable = used & (redundancy > _REDUNDANT)
-        if testable.sum() < _ENOUGH:
+        scaled = np.abs(residuals[testable]) / np.sqrt(redundancy[testable])
+        if self.spots is not None:
+            scaled = np.concatenate([scaled, self.sigma * self.spots.standardised(self.common, self.sigma)])
+        if len(scaled) < _ENOUGH:
             return self
-        sigma = _NORMAL * float(np.median(np.abs(residuals[testable]) / np.sqrt(redundancy[testable])))
+        sigma = _NORMAL * float(np.median(scaled))
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 
@@ -239,7 +274,9 @@ class Heights:
         if self.scale == 1.0 and square < 1.0 + _SIGNIFICANT * chance:
             return self
         scale = max(self.scale * math.sqrt(square), 1.0)
-        return self if abs(scale / self.scale - 1.0) < 2 * _STABLE else replace(self, scale=scale)
+        if abs(scale / self.scale - 1.0) < 2 * _STABLE:
+            return self
+        return replace(self, scale=scale, spots=None if self.spots is None else replace(self.spots, scale=scale))
 
     def _breaking(self, solved: Solved) -> Mask:
         """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
@@ -254,41 +291,11 @@ class Heights:
         return found
 
     @property
-    def _sigma_is(self) -> Literal["stated", "enlarged", "estimated", "assumed"]:
+    def sigma_is(self) -> Literal["stated", "enlarged", "estimated", "assumed"]:
+        """The source of the sigmas."""
         if self.stated is not None:
             return "enlarged" if self.scale > 1.0 else "stated"
         return "estimated" if self.estimated else "assumed"
-
-    def record(self, solved: Solved) -> HeightsRecord:
-        """Return what is published of them."""
-        rows = solved.linear.ordering.grounded
-        planes = solved.problem.heights
-        assert planes is not None
-        used = rows[planes.on[rows]]
-        apart = planes.above(solved.state.local)[used]
-        sigmas = self.sigmas[used]
-        known = sigmas[np.isfinite(sigmas)]
-        bias, bias_sigma = self.common.bias
-        active = np.zeros(len(self.of), dtype=bool)
-        active[solved.linear.ordering.numbers] = True
-        wrong, broken = active & self.wrong, active & self.broken & ~self.wrong
-        shift, shift_covariance = self.common.shift(self.shift)
-        return HeightsRecord(
-            used=len(used),
-            left_out=tuple(solved.problem.points.ids[k] for k in np.flatnonzero(wrong)),
-            at_breaks=int(broken.sum()),
-            without=int((active & self.of & ~wrong & ~broken).sum()) - len(used),
-            sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else self.sigma,
-            sigma_is=self._sigma_is,
-            rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
-            bias_m=bias,
-            bias_sigma_m=bias_sigma,
-            bias_prior_m=self.common.sigma,
-            shift_m=tuple(shift.tolist()),
-            shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
-            shift_prior_m=self.shift,
-            correlation_m=self.source.correlation,
-        )
 
 
 def _stable(solved: Solved, problem: BlockProblem) -> bool:
@@ -303,58 +310,3 @@ def _stable(solved: Solved, problem: BlockProblem) -> bool:
 def _places(problem: BlockProblem, local: Array) -> Array:
     """Return lon, lat, h ``(N, 3)`` where heights of points at `local` ``(N, 3)`` are read."""
     return np.where(problem.placed[:, None], problem.known, problem.frame.geodetic(local))
-
-
-class HeightsRecord(Record):
-    """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
-
-    The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
-    or outside the DEM. Shifts are east and north. A prior is the standard deviation before the adjustment. A stated
-    sigma is enlarged if the residuals are significantly larger.
-    """
-
-    used: Count
-    left_out: tuple[str, ...]
-    at_breaks: Count
-    without: Count
-    sigma_m: float
-    sigma_is: Literal["stated", "enlarged", "estimated", "assumed"]
-    rms_m: float | None
-    bias_m: float
-    bias_sigma_m: float
-    bias_prior_m: float
-    shift_m: Pair
-    shift_sigma_m: Pair
-    shift_prior_m: float
-    correlation_m: float | None
-
-    def notices(self) -> list[Notice]:
-        """Return notices of an unstated sigma and of heights that were left out."""
-        found = []
-        if self.sigma_is == "assumed":
-            text = Text(
-                f"DEM accuracy not given; assuming {metres(self.sigma_m)}. Set it with ",
-                Setting("surface.sigma"),
-            )
-            found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
-        elif self.sigma_is == "estimated":
-            text = Text(
-                f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from "
-                f"{counted(self.used, 'height')}. Set it with ",
-                Setting("surface.sigma"),
-            )
-            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
-        elif self.sigma_is == "enlarged":
-            text = Text(
-                f"DEM and ties differ more than the stated DEM accuracy allows; using {metres(self.sigma_m)}, "
-                f"estimated from {counted(self.used, 'height')}. Roofs and trees cause this"
-            )
-            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
-        if self.left_out:
-            number, named = len(self.left_out), self.left_out[:_NAMED]
-            left_out = (
-                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees. The heights were not "
-                f"used, the ties were ({', '.join(named)})"
-            )
-            found.append(Notice("heights-left-out", left_out, count=number, points=list(named)))
-        return found

@@ -16,6 +16,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.points.heights.spot_heights import SpotHeights
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
@@ -48,12 +49,18 @@ class DemHeights:
     correlation : float, optional
         Distance (m) over which errors are correlated, by exp(-d / correlation). By default each sample of the DEM has
         its own error, besides the bias.
+    spots : SpotHeights, optional
+        Known heights, which tell of the errors that heights share.
+    follow : bool
+        Read the DEM where the estimate of its shift puts it. By default its slope at each tie stands for that.
     """
 
     surface: DemSurface
     bias: float | None = None
     correlation: float | None = None
     shift: float | None = None
+    spots: SpotHeights | None = None
+    follow: bool = False
 
     def __post_init__(self) -> None:
         for name in ("bias", "correlation", "shift"):

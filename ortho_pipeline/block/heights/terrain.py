@@ -133,6 +133,8 @@ def expected_slopes(slopes: Array, sigmas: Array, variance: float, images: Index
         An image that shows each point.
     """
     rows = np.flatnonzero(np.isfinite(slopes).all(axis=1) & (sigmas > 0))
+    if not len(rows):
+        return slopes
     weights, of = sigmas[rows] ** -2.0, images[rows]
     sums = np.bincount(of, weights)
     seen = sums > 0

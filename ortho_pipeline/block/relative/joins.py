@@ -16,11 +16,10 @@ import numpy as np
 
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.local_frame import GEODETIC
+from ortho_pipeline.block.local_frame import GEODETIC, plan_partials
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
-from ortho_pipeline.geodesy.distortion import map_from_enu
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
 
 #: Points of a pair at which it is computed.
@@ -97,8 +96,7 @@ def _moves(fit: BlockFit, image: int, ground: Array) -> tuple[Array, float]:
     """Return how parameters of an image move the ground ``(2, p)`` east and north, m, on average; and a pixel, m."""
     model = fit.models[fit.points.images[image]]
     there = ground_transform(GEODETIC, model.crs)(ground)
-    by_plan = (model.ground_partials(there) @ map_from_enu(parse_crs(model.crs), there))[:, :, :2]
-    inverse = np.linalg.inv(by_plan)
+    inverse = np.linalg.inv(plan_partials(model, ground))
     pixel = float(np.sqrt(np.abs(np.linalg.det(inverse)).mean()))
     if not len(model.params):
         return np.zeros((2, 0)), pixel

@@ -25,9 +25,11 @@ from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.locations import located
-from ortho_pipeline.geodesy.crs import Vertical, parse_crs
+from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, SurfaceOptions, numbers_of
 from ortho_pipeline.points import Points, assign_roles
+from ortho_pipeline.points.heights.spot_heights import read_spot_heights
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
 
@@ -77,7 +79,7 @@ def gather(
         notices += notes
     if matched:
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
-        heights = open_surface(surface, scenes[0], under=alone)
+        heights = _placed(open_surface(surface, scenes[0], under=alone), options, alone[0])
         opened = {label: on_surface(scene, heights) for label, scene in zip(labels, alone, strict=True)}
         if options.ties is not None:
             tied = tie_scenes(opened, match, heights, scenes[0])
@@ -93,7 +95,7 @@ def gather(
             text += matches.text
     elif observes(options, surface):
         alone = [inputs.open_scene(image, scene) for image, scene in zip(images, scenes, strict=True)]
-        heights = open_surface(surface, scenes[0], under=alone)
+        heights = _placed(open_surface(surface, scenes[0], under=alone), options, alone[0])
     return Gathered(joined(labels, tables), notices, document, text, heights)
 
 
@@ -121,8 +123,15 @@ def settled_scenes(
     return settled_options(images, scenes, surface, points_in)
 
 
-def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: SurfaceOptions) -> None:
+def refuse_contradictions(
+    options: BlockOptions, match: MatchOptions, surface: SurfaceOptions, *, orthos: bool = False
+) -> None:
     """Refuse options that contradict each other, before any file is opened.
+
+    Parameters
+    ----------
+    orthos : bool
+        Whether orthos are made, which need heights.
 
     Raises
     ------
@@ -157,7 +166,7 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
                     field=f"match.{name}",
                     remedy=Text("leave it out, or give ", Setting("points.ties", "auto")),
                 )
-        if has_surface(surface) and not observes(options, surface):
+        if has_surface(surface) and not observes(options, surface) and not orthos:
             raise InputError(
                 "heights are used only for matching, and nothing is matched",
                 field="surface.dem" if surface.dem is not None else "surface.height",
@@ -171,20 +180,61 @@ def refuse_contradictions(options: BlockOptions, match: MatchOptions, surface: S
                 field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
             )
-    if options.ties is not None or match.reference:
+    if options.ties is not None or match.reference or orthos:
         require_heights(surface)
 
 
 def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
     """Refuse options of observed heights if no heights are observed."""
     remedy = Setting("surface.dem") if surface.dem is None else Setting("points.dem_heights", "on")
-    for name in ("dem_bias", "dem_correlation", "dem_shift_sigma"):
+    for name in ("dem_bias", "dem_correlation", "dem_shift", "dem_shift_sigma", "spot_heights"):
         if getattr(options, name) is not None and not observes(options, surface):
             raise InputError(
                 "this option describes DEM heights that are observations, but no heights are observed",
                 field=f"points.{name}",
                 remedy=Text("leave it out, or give ", remedy),
             )
+    for name in ("spot_crs", "spot_vertical"):
+        if getattr(options, name) is not None and options.spot_heights is None:
+            raise InputError(
+                "this describes spot heights, and there are none",
+                field=f"points.{name}",
+                remedy=Text("leave it out, or give ", Setting("points.spot_heights", "FILE")),
+            )
+    shift_of(options)
+
+
+def shift_of(options: BlockOptions) -> tuple[float, float] | None:
+    """Return by how much (m, east and north) the DEM is moved before anything else; None if by nothing stated.
+
+    Raises
+    ------
+    InputError
+        If it is neither two numbers nor the word.
+    """
+    if options.dem_shift in (None, "estimate"):
+        return None
+    found = numbers_of(str(options.dem_shift))
+    if len(found) != 2 or not np.isfinite(found).all():
+        raise InputError(
+            f"{options.dem_shift!r} is no shift",
+            field="points.dem_shift",
+            remedy="give estimate, or metres east and north, such as 10,-5",
+        )
+    return found[0], found[1]
+
+
+def _placed(heights: Surface, options: BlockOptions, scene: Scene) -> Surface:
+    """Return heights where the user says that they are."""
+    shift = shift_of(options)
+    if shift is None or not isinstance(heights, DemSurface):
+        return heights
+    if not scene.models:
+        rows, columns = heights.shape
+        return heights.moved((*shift, 0.0), np.concatenate(heights.grid.lonlat(*np.array([[columns], [rows]]) / 2)))
+    middle = np.array([[scene.width / 2, scene.height / 2]])
+    ground = scene.model.image_to_ground(middle, scene.model.reference_height)
+    return heights.moved((*shift, 0.0), ground_transform(scene.model.crs, "EPSG:4979")(ground)[0, :2])
 
 
 def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
@@ -193,10 +243,26 @@ def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
 
 
 def observed(options: BlockOptions, surface: SurfaceOptions, heights: Surface | None) -> DemHeights | None:
-    """Return the heights of a DEM as observations; None without."""
+    """Return the heights of a DEM as observations; None without.
+
+    Raises
+    ------
+    InputError
+        For spot heights that cannot be used.
+    """
     if not observes(options, surface) or not isinstance(heights, DemSurface):
         return None
-    return DemHeights(heights, options.dem_bias, options.dem_correlation, options.dem_shift_sigma)
+    spots = None
+    if options.spot_heights is not None:
+        spots = read_spot_heights(options.spot_heights, options.spot_crs, options.spot_vertical)
+    return DemHeights(
+        heights,
+        options.dem_bias,
+        options.dem_correlation,
+        options.dem_shift_sigma,
+        spots,
+        follow=options.dem_shift == "estimate",
+    )
 
 
 def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOptions) -> list[Notice]:

@@ -20,7 +20,6 @@ from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.models import RPC
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
@@ -369,15 +368,12 @@ def rotation_of(scene: Scene, options: MatchOptions) -> float:
 def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
     """Return the standard deviation (m) of a scene's model and its source; None if it is not stated."""
     model = scene.model
-    if isinstance(model, RPC):
-        errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
-        if errors:
-            return math.hypot(*errors), "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
+    sigma = model.stated_accuracy
+    if sigma is not None:
+        return sigma, "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
+    if scene.accuracy is not None:
+        return scene.accuracy * math.sqrt(2), "the accuracy in the metadata"
     names = model.param_names
-    sigma = scene.facts.get("position_sigma_m")
-    # With an orientation it is the position of the sensor, and the attitude has errors too.
-    if not names and isinstance(sigma, int | float) and sigma > 0:
-        return float(sigma) * math.sqrt(2), "the position accuracy in the metadata"
     known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
     if names and set(names) <= set(known):
         centre = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)

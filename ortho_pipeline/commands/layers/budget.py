@@ -18,7 +18,6 @@ from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
-from ortho_pipeline.models import RPC, ImageCorrection, Pieces, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.report.document import accuracy_style
 from ortho_pipeline.report.layers.accuracy import AccuracyLayer
@@ -67,7 +66,7 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
 
     surface, fit = placed.surface, placed.adjusted.fit
     covariance = _covariance(placed)
-    stated = None if covariance is not None else stated_accuracy(placed.model)
+    stated = None if covariance is not None else placed.model.stated_accuracy or placed.scene.accuracy
     datum = 0.0 if surface.sigma is None else _datum(surface)
     apart, unstated = _reference(fit.warnings, placed.scene.adjusted)
     budget = Budget(covariance=covariance, stated=stated, heights=surface.sigma, datum=datum, reference=apart)
@@ -108,17 +107,6 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
         "the accuracy raster does not include the errors of ", sources, ", which are unknown; real errors are larger"
     )
     return known, [Notice("accuracy-in-part", text, unknown=unknown)]
-
-
-def stated_accuracy(model: SensorModel) -> float | None:
-    """Return the standard deviation (m, per axis) that a vendor states of an RPC: ERR_BIAS and ERR_RAND together."""
-    while isinstance(model, ImageCorrection | Pieces):
-        model = model.model if isinstance(model, ImageCorrection) else model.first
-    if not isinstance(model, RPC):
-        return None
-    # Values that are not positive mean unknown: -1 in the standard, 0 of some programs.
-    errors = [value for value in (model.err_bias, model.err_rand) if value is not None and value > 0]
-    return math.hypot(*errors) if errors else None
 
 
 def _covariance(placed: Placement) -> Array | None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ortho_measure.block.solution import BlockSolution, solve
+from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
@@ -60,7 +61,11 @@ class _Tried:
 
 
 def compare_corrections(
-    starts_of: Callable[[str], Mapping[str, Start]], names: Sequence[str], points: BlockPoints, hold: float | None
+    starts_of: Callable[[str], Mapping[str, Start]],
+    names: Sequence[str],
+    points: BlockPoints,
+    hold: float | None,
+    heights: DemHeights | None = None,
 ) -> dict[str, Any]:
     """Return rows and recommendation, as JSON values.
 
@@ -75,14 +80,18 @@ def compare_corrections(
             known[name] = starts_of(name)
         except OrthoError:
             continue
-    first = [solve(starts, points, hold) for starts in known.values()]
+    first = [solve(starts, points, hold, heights=heights) for starts in known.values()]
     votes = Counter(
         one.point for found in first if found.fit for one in {r.point: r for r in found.fit.rejected}.values()
     )
     wrong = {name for name, count in votes.items() if 2 * count > sum(found.fit is not None for found in first)}
     kept = points.select(~np.isin(np.array(points.ids), list(wrong))) if wrong else points
     tried = [
-        _Tried(name, sum(len(start.model.params) for start in starts.values()), solve(starts, kept, hold, robust=False))
+        _Tried(
+            name,
+            sum(len(start.model.params) for start in starts.values()),
+            solve(starts, kept, hold, heights=heights, robust=False),
+        )
         for name, starts in known.items()
     ]
     model, reason = _recommended([one for one in tried if one.solution.fit is not None])

@@ -63,7 +63,8 @@ class LeftOutResiduals:
         rays = np.where(fit.used_rays[:, None], np.nan, fit.residuals)
         of_rays = left_out(np.eye(2) - hats[0][used], misfits.rays[used], known=_KNOWN, testable=TESTABLE)
         rays[used] = problem.points.in_pixels(of_rays.misfits, used)
-        grounded = linear.ordering.grounded
+        # A height of a DEM that contradicts its tie, on a roof, is none of the tie's errors.
+        grounded = linear.ordering.grounded[problem.placed[linear.ordering.grounded]]
         ground = np.where(fit.used_ground[:, None], np.nan, fit.object_residuals)
         of_ground = left_out(np.eye(3) - hats[1][grounded], misfits.ground[grounded], known=_KNOWN, testable=TESTABLE)
         ground[grounded] = of_ground.whole * problem.on_points(linear.state.local, grounded).sigmas
@@ -85,7 +86,8 @@ def _equations(fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -
     problem = BlockProblem(points, begun, frame_of(begun, points), known, pseudo_of(begun, points, priors))
     local = problem.frame.of_geodetic(fit.ground)
     selection = Selection.of(fit.used_rays, fit.used_ground)
-    problem, _ = with_datum(problem, State(begun, local), selection, hold)
+    problem = problem.with_heights(fit.planes)
+    problem, _ = with_datum(problem, State(begun, local), selection, hold, fit.accuracies)
     problem = fit.variances.applied(problem)
     problem = replace(problem, assumed=(max(problem.assumed[0], _LEAST), max(problem.assumed[1], _LEAST)))
     return problem, Linear.at(problem, State(models, local), selection)

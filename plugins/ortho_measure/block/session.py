@@ -19,10 +19,11 @@ from ortho_measure.marks import GROUND_CRS, Mark
 from ortho_measure.places import Geometry, SceneGeometry, Sheet
 from ortho_measure.planning import Next
 from ortho_measure.project import Project, moved, now, points_file
+from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
-from ortho_pipeline.commands.control.block_points import read_points, settled_scenes
+from ortho_pipeline.commands.control.block_points import observed, read_points, settled_scenes
 from ortho_pipeline.commands.control.matching import search_of
 from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
@@ -162,9 +163,15 @@ class BlockSession(Project):
                 raise InputError("unknown image", field="rays", remedy="reload the page")
         self.starts(correction)
 
+    @property
+    def _observed(self) -> DemHeights | None:
+        """The heights of the DEM as observations; None of flat ground."""
+        return observed(self._options, self._heights, self.images.places[0].surface)
+
     def _solve(self) -> None:
         table = block_points(self.marks, self.images.labels, self._called)
-        self._solution = solve(self.starts(self.marks.correction), table, self._options.hold)
+        starts = self.starts(self.marks.correction)
+        self._solution = solve(starts, table, self._options.hold, heights=self._observed)
         if self._solution.fit is None:
             # Use the opened models, which know the heights below the scene.
             delivered = dict(zip(self.images.labels, self.rendered[0], strict=True))
@@ -265,7 +272,7 @@ class BlockSession(Project):
         """Return a comparison of the corrections on the present points."""
         with self._lock:
             table = block_points(self.marks, self.images.labels, self._called)
-        return compare_corrections(self.starts, CORRECTIONS, table, self._options.hold)
+        return compare_corrections(self.starts, CORRECTIONS, table, self._options.hold, self._observed)
 
     def ortho(self, progress: Progress, number: int = 0) -> Result:
         """Run `ortho adjust` with the saved points, and `ortho rectify` for an image with its adjusted model."""
@@ -278,7 +285,8 @@ class BlockSession(Project):
         label, folder = self.images.labels[number], self.output.with_name(f"{self.output.stem}_ortho")
         path, own = self.images.paths[number], self._opened[number]
         with confined(self.output.parent):
-            block = adjust(self.images.paths, folder / "block", options, self._opened)
+            surface = self._heights if self._observed is not None else SurfaceOptions()
+            block = adjust(self.images.paths, folder / "block", options, self._opened, surface=surface)
             opened = SceneOptions(model=block.files[f"{label} model"], allow_network=own.allow_network, roots=own.roots)
             return rectify(path, folder / label, scene=opened, surface=self._heights, progress=progress)
 

@@ -13,6 +13,7 @@ from ortho_measure.block.left_out import LeftOutResiduals
 from ortho_measure.solution import LEAST_CHECK_POINTS, SUSPICIOUS
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
@@ -44,7 +45,12 @@ class BlockSolution:
 
 
 def solve(
-    starts: Mapping[str, Start], points: BlockPoints, hold: float | None, *, robust: bool = True
+    starts: Mapping[str, Start],
+    points: BlockPoints,
+    hold: float | None,
+    *,
+    heights: DemHeights | None = None,
+    robust: bool = True,
 ) -> BlockSolution:
     """Adjust images and points, like `ortho adjust`; without `robust`, gross errors stay in."""
     models = {label: start.model for label, start in starts.items()}
@@ -55,7 +61,8 @@ def solve(
         return BlockSolution(models, None, f"no points yet in {without[0]}")
     try:
         priors = {label: start.priors for label, start in starts.items()}
-        fit = adjust(models, points, priors=priors, robust=robust, hold=hold)
+        stated = {label: start.accuracy for label, start in starts.items() if start.accuracy is not None}
+        fit = adjust(models, points, priors=priors, robust=robust, hold=hold, heights=heights, accuracies=stated)
         left_out = LeftOutResiduals.of(fit, starts, hold)
     except OrthoError as error:
         return BlockSolution(models, None, error.message)

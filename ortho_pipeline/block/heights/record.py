@@ -1,0 +1,139 @@
+"""The record of the heights of a DEM in a block, and its notices."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.heights.spots import SpotsRecord
+from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import metres
+from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.files.json.records import Count, Pair, Record
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.heights.settling import Heights
+
+#: A shift of the DEM is significant if one as large is less probable without it.
+_SIGNIFICANT = 0.001
+#: A notice names so many points.
+_NAMED = 10
+
+
+class HeightsRecord(Record):
+    """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
+
+    The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
+    or outside the DEM. Shifts are east and north; `shift_chance` is the probability of one as large without a shift.
+    A prior is the standard deviation before the adjustment. A stated sigma is enlarged if the residuals are
+    significantly larger. `mean_error_m` is the mean of the shared errors at the ties, without a shift that was applied.
+    """
+
+    used: Count
+    left_out: tuple[str, ...]
+    at_breaks: Count
+    without: Count
+    sigma_m: float
+    sigma_is: Literal["stated", "enlarged", "estimated", "assumed"]
+    rms_m: float | None
+    mean_error_m: float
+    bias_m: float
+    bias_sigma_m: float
+    bias_prior_m: float
+    shift_m: Pair
+    shift_sigma_m: Pair
+    shift_prior_m: float
+    shift_chance: float | None
+    shift_applied: bool
+    correlation_m: float | None
+    spots: SpotsRecord | None = None
+
+    @property
+    def shift_significant(self) -> bool:
+        """Whether the DEM is shifted by more than chance explains."""
+        return self.shift_chance is not None and self.shift_chance < _SIGNIFICANT
+
+    def notices(self) -> list[Notice]:
+        """Return notices of an unstated sigma, of a shift, and of heights that were left out."""
+        found = []
+        if self.sigma_is == "assumed":
+            text = Text(
+                f"DEM accuracy not given; assuming {metres(self.sigma_m)}. Set it with ",
+                Setting("surface.sigma"),
+            )
+            found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
+        elif self.sigma_is == "estimated":
+            text = Text(
+                f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from "
+                f"{counted(self.used, 'height')}. Set it with ",
+                Setting("surface.sigma"),
+            )
+            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
+        elif self.sigma_is == "enlarged":
+            text = Text(
+                f"DEM and ties differ more than the stated DEM accuracy allows; using {metres(self.sigma_m)}, "
+                f"estimated from {counted(self.used, 'height')}. Roofs and trees cause this"
+            )
+            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
+        if self.left_out:
+            number, named = len(self.left_out), self.left_out[:_NAMED]
+            left_out = (
+                f"the DEM contradicts {counted(number, 'tie')}, for example on roofs and trees. The heights were not "
+                f"used, the ties were ({', '.join(named)})"
+            )
+            found.append(Notice("heights-left-out", left_out, count=number, points=list(named)))
+        if self.shift_significant:
+            east, north = self.shift_m
+            size, sigma = metres(math.hypot(east, north)), metres(max(self.shift_sigma_m))
+            shift = f"{size} ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma})"
+            remedy: tuple[str | Setting, ...] = ("The DEM was moved by this",)
+            if not self.shift_applied:
+                remedy = ("If the images are right, move the DEM with ", Setting("points.dem_shift", "estimate"))
+            text = Text(f"the DEM is shifted from the images by {shift}. ", *remedy)
+            fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
+            found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
+        if self.spots is not None and self.spots.left_out:
+            number, named = len(self.spots.left_out), self.spots.left_out[:_NAMED]
+            who = counted(number, "spot height contradicts", "spot heights contradict")
+            left_out = f"{who} the DEM and the other spot heights; not used: {', '.join(named)}"
+            found.append(Notice("spot-heights-left-out", left_out, count=number, points=list(named)))
+        return found
+
+
+def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
+    """Return what is published of the heights of a solution."""
+    rows = solved.linear.ordering.grounded
+    planes = solved.problem.heights
+    assert planes is not None
+    used = rows[planes.on[rows]]
+    apart = planes.above(solved.state.local)[used]
+    sigmas = heights.sigmas[used]
+    known = sigmas[np.isfinite(sigmas)]
+    bias, bias_sigma = heights.common.bias
+    active = np.zeros(len(heights.of), dtype=bool)
+    active[solved.linear.ordering.numbers] = True
+    wrong, broken = active & heights.wrong, active & heights.broken & ~heights.wrong
+    shift, shift_covariance = heights.common.shift(heights.shift)
+    return HeightsRecord(
+        used=len(used),
+        left_out=tuple(solved.problem.points.ids[k] for k in np.flatnonzero(wrong)),
+        at_breaks=int(broken.sum()),
+        without=int((active & heights.of & ~wrong & ~broken).sum()) - len(used),
+        sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
+        sigma_is=heights.sigma_is,
+        rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
+        mean_error_m=float(heights.common.offset[used].mean()) if len(used) else 0.0,
+        bias_m=bias,
+        bias_sigma_m=bias_sigma,
+        bias_prior_m=heights.common.sigma,
+        shift_m=tuple(shift.tolist()),
+        shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
+        shift_prior_m=heights.shift,
+        shift_chance=heights.common.chance,
+        shift_applied=heights.source.follow,
+        correlation_m=heights.source.correlation,
+        spots=None if heights.spots is None else heights.spots.record(heights.common),
+    )

@@ -1,0 +1,130 @@
+"""The orthos of a block: all images with their adjusted models, on one grid and one surface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.start import Start
+from ortho_pipeline.commands.control.points import no_points
+from ortho_pipeline.commands.rectification import OrthoJob, make_ortho
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
+from ortho_pipeline.commands.results import outputs
+from ortho_pipeline.errors import ReportError
+from ortho_pipeline.geodesy.crs import map_crs
+from ortho_pipeline.geodesy.naming import crs_text
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import SensorModel
+from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
+from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.runtime.process_limits import Progress
+from ortho_pipeline.surface.base import Surface
+from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.footprint import ground_sample_distance, lay, output_crs, two_digits
+
+#: Outputs of `rectify` that a block has already, or has not.
+_NOT_AGAIN = ("model", "rpc", "vrt")
+
+
+def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> dict[str, dict[str, Path]]:
+    """Return the outputs of each image by what they are, called as those of `rectify`."""
+    return {
+        label: {kind: path for kind, path in outputs(folder, label, output).items() if kind not in _NOT_AGAIN}
+        for label in labels
+    }
+
+
+def adjusted_scenes(
+    starts: Mapping[str, Start], fit: BlockFit, models: Mapping[str, SensorModel], files: Mapping[str, Path]
+) -> dict[str, Scene]:
+    """Return the scenes with their adjusted models, which say that they come from the block.
+
+    Parameters
+    ----------
+    models : mapping
+        The adjusted models.
+    files : mapping
+        The model files, ``<image> model``.
+    """
+    images = fit.record.images
+    return {
+        label: replace(
+            start.scene,
+            models={start.name: models[label]},
+            model_source=files[f"{label} model"].name,
+            pieces=(),
+            adjusted={"gauge": fit.gauge, "sigma0": fit.sigma0, **images[label].to_json()},
+        )
+        for label, start in starts.items()
+    }
+
+
+def corrected(surface: Surface, fit: BlockFit) -> Surface:
+    """Return the heights as the block has them: without errors that all share, on request without the shift."""
+    heights = fit.heights
+    if heights is None or not isinstance(surface, DemSurface):
+        return surface
+    east, north = heights.shift_m if heights.shift_applied else (0.0, 0.0)
+    return surface.moved((-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
+
+
+def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOptions) -> OutputOptions:
+    """Return options with the CRS and the resolution of all: the zone of the first image, the finest pixel.
+
+    Raises
+    ------
+    InputError
+        If the heights do not cover an image.
+    """
+    steps, crs = [], None if output.crs is None else map_crs(output.crs)
+    for scene in scenes.values():
+        found = lay(scene.model, surface, scene.width, scene.height)
+        found.require_coverage()
+        crs = crs or output_crs(scene.model, scene.width, scene.height)
+        steps.append(two_digits(ground_sample_distance(scene.model, crs, scene.width, scene.height, found.middle)))
+    if output.like is not None or crs is None:
+        return output
+    resolution = min(steps) if output.resolution is None else output.resolution
+    return replace(output, crs=crs_text(crs), resolution=resolution)
+
+
+@cache_restored()
+def make_orthos(
+    scenes: Mapping[str, Scene],
+    files: Mapping[str, dict[str, Path]],
+    surface: Surface,
+    asked: tuple[SceneOptions, SurfaceOptions, OutputOptions],
+    command: str | None,
+    progress: Progress | None,
+) -> dict[str, ReportError]:
+    """Make the orthos of adjusted scenes, and return why reports could not be made, by image.
+
+    Raises
+    ------
+    InputError
+        As `rectify`.
+    """
+    options, heights, output = asked
+    access = SceneOptions(allow_network=options.allow_network, roots=options.roots)
+    limit_cache(output.memory, 1)
+    failed, shared = dict[str, ReportError](), on_one_grid(scenes, surface, output)
+    for number, (label, scene) in enumerate(scenes.items()):
+
+        def stage(name: str, share: float, begun: int = number) -> None:
+            if progress is not None:
+                progress(name, (begun + share) / len(scenes))
+
+        request = Request(scene, access, surface=heights, output=shared)
+        like = None if shared.like is None else grid_of(shared.like, **access.access)
+        resolved = Resolved(request, scene, surface, no_points(), like, Ledger.of(request, scene, surface))
+        made = make_ortho(resolved, files[label], OrthoJob(stage, command, label))
+        if isinstance(made, ReportError):
+            failed[label] = made
+    return failed

@@ -1,0 +1,1 @@
+"""Known heights at places, and the formats that they are delivered in."""

@@ -1,0 +1,101 @@
+"""Known heights of a GeoParquet file, as tables of laser altimetry are delivered."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.points.delimited import altimetry
+from ortho_pipeline.points.rows import ALTIMETRY, MAX_FILE, OF_HEIGHTS, PointRow, Table, number, sigma_of
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+
+#: How a file begins and how it may be called.
+_MAGIC, _SUFFIXES = b"PAR1", (".parquet", ".geoparquet")
+
+
+def is_parquet(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a file is Parquet, by its name or its first bytes."""
+    if Path(path).suffix.lower() in _SUFFIXES:
+        return True
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
+
+
+def read_parquet(path: str | os.PathLike[str]) -> Table:
+    """Read points with a height: of the geometry, or of a column that is called as in `OF_HEIGHTS`.
+
+    Raises
+    ------
+    InputError
+        If GeoPandas with PyArrow is not installed, or the file is no GeoParquet of points.
+    """
+    frame = _frame(path)
+    geometry, table = frame.geometry, Table("GeoParquet", source=os.fspath(path))
+    if not len(frame):
+        raise InputError("this file holds no points", file=path, remedy="add points to it")
+    if not (geometry.geom_type == "Point").all():
+        raise InputError("the geometries are not all points", file=path, field="geometry", remedy="give points")
+    if frame.crs is not None:
+        table.crs = frame.crs.to_wkt()
+        table.of_ground = "geographic" if frame.crs.is_geographic else "projected"
+    columns: dict[str, Any] = {}
+    for name in frame.columns:
+        plain = str(name).lower().replace("_", "")
+        columns.setdefault({"h": "h", "id": "id", **OF_HEIGHTS.aliases}.get(plain, plain), frame[name])
+        if plain in ALTIMETRY:
+            altimetry(table)
+    if "h" not in columns and not geometry.has_z.all():
+        raise InputError("no column h", file=path, field="h", remedy="name the heights h")
+    heights = columns.get("h", geometry.z if geometry.has_z.all() else None)
+    sigmas = columns.get("sigma_h", [math.nan] * len(frame))
+    for count, values in enumerate(zip(geometry.x, geometry.y, heights, sigmas, strict=True)):
+        where = f"row {count}"
+        x, y, h, sigma = (_float(value, path, where) for value in values)
+        place = number(x, path, where), number(y, path, where), number(h, path, where)
+        known = None if math.isnan(sigma) else sigma_of(sigma, path, where, zero=True)
+        table.rows.append(PointRow(where, None, (math.nan, math.nan), place, "check", sigma_h=known))
+    return table
+
+
+def _frame(path: str | os.PathLike[str]) -> GeoDataFrame:
+    """Return the table of a file."""
+    try:
+        import geopandas
+        import pyarrow  # noqa: F401 -- GeoPandas reads with it
+    except ImportError as error:
+        raise InputError(
+            "reading GeoParquet needs GeoPandas and PyArrow",
+            file=path,
+            remedy="pip install 'ortho-pipeline[parquet]', or give the table as CSV",
+        ) from error
+    if Path(path).is_file() and Path(path).stat().st_size > MAX_FILE:
+        raise InputError(
+            f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path, remedy="thin it out"
+        )
+    try:
+        frame = geopandas.read_parquet(path)
+        len(frame.geometry)
+    # What is raised depends on the part of the file that is damaged.
+    except Exception as error:
+        said = str(error).splitlines()[:1]
+        raise InputError(
+            f"this file cannot be read as GeoParquet ({''.join(said)[:200]})",
+            file=path,
+            remedy="write it with GeoPandas or SlideRule, or give a CSV",
+        ) from error
+    return frame
+
+
+def _float(value: Any, path: str | os.PathLike[str], where: str) -> float:
+    try:
+        return math.nan if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{str(value)[:40]!r} is not a number", file=path, field=where) from error

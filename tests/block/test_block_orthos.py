@@ -1,0 +1,147 @@
+"""`ortho adjust --orthos`: all images on one grid, called and reported as by `ortho rectify`, ready for a mosaic."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+from skimage.registration import phase_cross_correlation
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.surface.writing import write_dem
+
+SIDE, STEP = 64, 32
+
+
+def run(*args: str | Path, code: int = 0) -> str:
+    done = CliRunner().invoke(cli, [str(arg) for arg in args])
+    assert done.exit_code == code, done.output + str(done.exception)
+    return done.stdout
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
+    dataset = gdal.Open(str(path))
+    pixels = np.atleast_3d(dataset.ReadAsArray().astype(float).T).mean(axis=2).T
+    return pixels, dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0, dataset.GetGeoTransform()
+
+
+def shifts(first: Path, second: Path) -> np.ndarray:
+    """Return by how much (px, columns and rows) windows of two orthos on one grid are shifted against each other."""
+    (one, shown, place), (other, shown_too, there) = _read(first), _read(second)
+    right, down = round((there[0] - place[0]) / place[1]), round((there[3] - place[3]) / place[5])
+    found, taper = [], np.outer(np.hanning(SIDE), np.hanning(SIDE))
+    rows = range(max(0, down), min(one.shape[0], other.shape[0] + down) - SIDE, STEP)
+    columns = range(max(0, right), min(one.shape[1], other.shape[1] + right) - SIDE, STEP)
+    for row, column in itertools.product(rows, columns):
+        here = np.s_[row : row + SIDE, column : column + SIDE]
+        far = np.s_[row - down : row - down + SIDE, column - right : column - right + SIDE]
+        if not (shown[here].all() and shown_too[far].all()):
+            continue
+        windows = [(part - part.mean()) * taper for part in (one[here], other[far])]
+        shift, error, _ = phase_cross_correlation(*windows, upsample_factor=50, normalization=None)
+        if error < 0.6 and np.abs(shift).max() < SIDE / 4:
+            found.append(shift[::-1])
+    assert len(found) >= 20
+    return np.array(found)
+
+
+def apart(first: Path, second: Path) -> float:
+    """Return the length (px) of the median shift of windows."""
+    return float(np.hypot(*np.median(shifts(first, second), axis=0)))
+
+
+def adjusted(images: list[Path], out: Path, *more: str | Path) -> dict[str, Any]:
+    words = ["adjust", *images, "-o", out, "--ties", "auto", "--orthos", *more, "--json"]
+    return json.loads(run(*words))
+
+
+def test_the_cartosat_pair_on_one_grid(sample: Path, tmp_path: Path) -> None:
+    """Orthos fit each other with heights; names, reports and the mosaic are as after `ortho rectify`."""
+    folder, out = sample / "cartosat", tmp_path / "block"
+    images = [folder / "BANDA.tif", folder / "BANDF.tif"]
+    document = adjusted(images, out, "--dem", folder / "dem.tif", "--dem-sigma", "2")
+    orthos = [out / "BANDA_ortho.tif", out / "BANDF_ortho.tif"]
+    assert document["files"]["BANDA ortho"] == str(orthos[0])
+    places = [gdal.Open(str(path)).GetGeoTransform() for path in orthos]
+    assert places[0][1] == places[1][1]
+    assert (places[0][0] - places[1][0]) / places[0][1] == pytest.approx(
+        round((places[0][0] - places[1][0]) / places[0][1]), abs=1e-6
+    )
+    assert apart(*orthos) < 0.1
+    report = json.loads((out / "BANDA_report.json").read_text())
+    assert "adjusted in a block" in report["headline"]["what"]
+    assert report["surface"]["raised_m"] == pytest.approx(-document["report"]["adjustment"]["heights"]["mean_error_m"])
+    assert not (out / "BANDA.vrt").exists()
+    run("mosaic", *orthos, "-o", tmp_path / "mosaic.tif")
+    assert (tmp_path / "mosaic.tif").is_file()
+
+
+def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:
+    image = sample / "cartosat" / "BANDA.tif"
+    done = CliRunner().invoke(
+        cli, ["adjust", str(image), str(image), "-o", str(tmp_path / "out"), "--ties", "auto", "-tr", "5"]
+    )
+    assert done.exit_code == 2
+    assert "--orthos" in done.output + done.stderr
+    done = CliRunner().invoke(cli, ["adjust", str(image), "-o", str(tmp_path / "out"), "--points", "x.csv", "--orthos"])
+    assert done.exit_code == 2
+    assert "--dem" in done.output + done.stderr
+
+
+# -- real images -----------------------------------------------------------------------------------------------------
+
+
+def _averaged_dsm(folder: Path, path: Path) -> None:
+    """Write the surface of the other program, averaged to 30 m, 3 m too high."""
+    source = gdal.Open(str(folder / "s2p" / "expected_output" / "triplet" / "dsm.tif"))
+    heights, (left, step, _, top, *_) = source.ReadAsArray().astype(float), source.GetGeoTransform()
+    cells = round(30.0 / step)
+    rows, columns = (size // cells for size in heights.shape)
+    parts = heights[: rows * cells, : columns * cells].reshape(rows, cells, columns, cells)
+    known = np.isfinite(parts)
+    counts = known.sum(axis=(1, 3))
+    means = np.where(counts > 0, np.where(known, parts, 0.0).sum(axis=(1, 3)) / np.maximum(counts, 1) + 3.0, -32768.0)
+    write_dem(path, means, (left, top), 30.0, "EPSG:32631")
+
+
+@pytest.mark.realdata
+def test_pleiades_orthos_fit_by_a_coarse_dem(real: Path, tmp_path: Path) -> None:
+    """Neighbours within 0.3 px; without the heights as observations they are 0.5 px apart."""
+    _averaged_dsm(real, tmp_path / "dem.tif")
+    images = [real / "s2p" / "input_triplet" / f"img_0{k}.tif" for k in (1, 2, 3)]
+    dem = ["--dem", tmp_path / "dem.tif", "--dem-vertical", "ellipsoid", "--dem-fill", "mask"]
+    found = {}
+    for heights in ("on", "off"):
+        out = tmp_path / heights
+        adjusted(images, out, *dem, "--dem-heights", heights)
+        orthos = [out / f"img_0{k}_ortho.tif" for k in (1, 2, 3)]
+        found[heights] = [apart(*pair) for pair in itertools.pairwise(orthos)]
+    assert max(found["on"]) < 0.3
+    assert min(found["off"]) > 0.4
+
+
+@pytest.mark.realdata
+@pytest.mark.slow
+def test_aerial_frames_fit_by_a_dem(real: Path, tmp_path: Path) -> None:
+    folder = real / "orthority" / "ngi"
+    camera, poses = tmp_path / "camera.json", tmp_path / "poses.csv"
+    camera.write_text('{"width": 640, "height": 1152, "focal_length_mm": 120, "sensor_mm": [92.16, 165.888]}')
+    rows = [line.split() for line in (folder / "camera_pos_ori.txt").read_text().splitlines() if line.strip()]
+    poses.write_text(
+        "\n".join(["filename,x,y,z,omega,phi,kappa", *(",".join([f"{row[0]}.tif", *row[1:]]) for row in rows)])
+    )
+    crs = (real / "orthority" / "io" / "ngi_xyz_opk.prj").read_text().strip()
+    options = [f"camera={camera}", f"exterior={poses}", f"crs={crs}", "vertical=egm96"]
+    sensor = [word for option in options for word in ("--sensor-option", option)]
+    dem = ["--dem", folder / "dem.tif", "--dem-vertical", "egm96", "--override-dem-vertical", "--dem-fill", "mask"]
+    images = sorted(folder.glob("*_RGB.tif"))
+    adjusted(images, tmp_path / "out", "--sensor", "frame", *sensor, *dem, "--search", "50")
+    orthos = [tmp_path / "out" / f"{image.stem}_ortho.tif" for image in images]
+    for pair in itertools.combinations(orthos, 2):
+        assert apart(*pair) < 0.3

@@ -1,0 +1,90 @@
+"""Spot heights fix the bias of a DEM: nothing in plan, sigmas that are right, and wrong ones are left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chains import CRS, Block, Chain, apart, dem, fly, neighbours
+
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.heights.source import DemHeights
+from ortho_pipeline.block.local_frame import GroundFrame
+from ortho_pipeline.block.relative.joins import joins_of
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.points.heights.spot_heights import SpotHeights
+
+
+def spots_of(block: Block, part: float, sigma: float, random: np.random.Generator, wrong: int = 0) -> SpotHeights:
+    """Return heights of a part of the ties; some are of clouds."""
+    rows = random.choice(len(block.ground), round(part * len(block.ground)), replace=False)
+    ground = ground_transform(CRS, "EPSG:4979")(block.ground[rows])
+    ground[:, 2] += sigma * random.normal(0, 1, len(rows))
+    ground[:wrong, 2] += 800.0
+    ids = tuple(f"s{k}" for k in range(len(rows)))
+    return SpotHeights(ground, np.full(len(rows), sigma), np.zeros(len(rows)), ids)
+
+
+def errors(block: Block, found: Array) -> Array:
+    """Return found minus true ground ``(N, 3)``, metres east, north, up."""
+    truth = ground_transform(CRS, "EPSG:4979")(block.ground)
+    frame = GroundFrame.about(truth)
+    off = frame.of_geodetic(found) - frame.of_geodetic(truth)
+    return np.asarray(np.einsum("nij,nj->ni", frame.enu_at(truth), off))
+
+
+def test_they_fix_the_bias_of_the_dem(tmp_path: Path) -> None:
+    block = fly(Chain(), 0)
+    surface = dem(block, tmp_path / "dem.tif", 0, white=1.0, bias=12.0).with_sigma(1.0)
+    spots = spots_of(block, 0.1, 0.3, np.random.default_rng(1), wrong=3)
+    fit = adjust(block.start, block.points, heights=DemHeights(surface, spots=spots))
+    assert fit.heights is not None
+    assert fit.heights.bias_m == pytest.approx(12.0, abs=1.0)
+    assert fit.heights.bias_sigma_m < 0.5
+    assert fit.heights.spots is not None
+    assert fit.heights.spots.left_out == ("s0", "s1", "s2")
+    assert fit.heights.spots.used == 17
+    assert any(notice.code == "spot-heights-left-out" for notice in fit.warnings)
+    assert abs(float(np.nanmedian(errors(block, fit.ground)[:, 2]))) < 1.0
+
+
+def test_they_tell_the_sigma_of_the_dem(tmp_path: Path) -> None:
+    """Nearly parallel rays do not."""
+    block = fly(Chain(convergence_deg=0.1), 3)
+    surface = dem(block, tmp_path / "dem.tif", 3, white=2.0)
+    spots = spots_of(block, 0.4, 0.3, np.random.default_rng(1))
+    fit = adjust(block.start, block.points, heights=DemHeights(surface, spots=spots))
+    assert fit.heights is not None
+    assert fit.heights.sigma_is == "estimated"
+    assert 1.4 < fit.heights.sigma_m < 3.0
+
+
+def test_spots_off_the_dem_are_refused(tmp_path: Path) -> None:
+    block = fly(Chain(images=2, ties=40), 0)
+    spots = SpotHeights(np.array([(10.0, 50.0, 100.0)]), np.array([0.3]), np.zeros(1), ("a",))
+    with pytest.raises(InputError, match="no height at any of the spot heights"):
+        adjust(block.start, block.points, heights=DemHeights(dem(block, tmp_path / "dem.tif", 0), spots=spots))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("convergence_deg", [3.0, 10.0])
+def test_sigmas_with_spot_heights_are_kept(tmp_path: Path, convergence_deg: float) -> None:
+    """Heights of 0.3 m at 2 % of the ties; a bias of 5 m and a shift of 5 m that nobody states."""
+    relative, absolute = [], []
+    for seed in range(60):
+        block = fly(Chain(convergence_deg=convergence_deg, normal=True, errors=5.0), seed)
+        random = np.random.default_rng(777 + seed)
+        bias, shift = 5.0 * random.normal(), tuple(5.0 * random.normal(0, 1, 2))
+        surface = dem(block, tmp_path / f"{seed}.tif", seed, white=2.0, bias=bias, shift=shift).with_sigma(2.0)
+        spots = spots_of(block, 0.02, 0.3, random)
+        fit = adjust(block.start, block.points, heights=DemHeights(surface, spots=spots), hold=5.0)
+        covariances = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+        for pair in neighbours(block):
+            relative.append(np.linalg.solve(np.linalg.cholesky(covariances[pair]), apart(block, fit, *pair)))
+        absolute.append(errors(block, fit.ground) / fit.ground_sigmas)
+    assert 0.85 < float(np.sqrt(np.mean(np.square(relative)))) < 1.15
+    for axis in range(3):
+        assert 0.85 < float(np.sqrt(np.nanmean(np.square([one[:, axis] for one in absolute])))) < 1.15
