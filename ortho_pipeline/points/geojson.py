@@ -74,6 +74,7 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
         value = properties.get(name)
         return None if value is None else sigma_of(value, path, f"{where}.properties.{name}", zero=zero)
 
+    assert isinstance(properties, dict)
     for alias, ours in expected.aliases.items():
         value = next((value for key, value in properties.items() if key.lower().replace("_", "") == alias), None)
         if value is not None and ours == "h" and math.isnan(ground[2]):

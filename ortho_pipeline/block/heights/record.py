@@ -9,6 +9,7 @@ import numpy as np
 
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.heights.spots import SpotsRecord
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.files.json.records import Count, Pair, Record
@@ -119,7 +120,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
         sigma_is="stated" if heights.stated is not None else "estimated" if heights.estimated else "assumed",
         rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
-        mean_error_m=float(heights.common.offset[used].mean()) if len(used) else 0.0,
+        mean_error_m=_mean_error(heights, used),
         bias_m=bias,
         bias_sigma_m=bias_sigma,
         bias_prior_m=heights.common.sigma,
@@ -127,7 +128,14 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
         shift_prior_m=heights.shift,
         shift_chance=heights.common.chance,
-        shift_applied=heights.source.follow,
+        shift_applied=heights.source.correct_shift,
         correlation_m=heights.source.correlation,
         spots=None if heights.spots is None else heights.spots.record(heights.common),
     )
+
+
+def _mean_error(heights: Heights, used: Index) -> float:
+    """Return how much too high heights are on average, m, by all that they share but a shift that is applied."""
+    common = heights.common
+    value = common.value - common.undone if heights.source.correct_shift else common.value
+    return float((common.loads[used] @ value).mean()) if len(used) else 0.0

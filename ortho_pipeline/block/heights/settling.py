@@ -155,7 +155,7 @@ class Heights:
             if judged.common.value is not found.common.value:
                 # Points and images follow the shared errors, so that the DEM is read where they will be.
                 state = judged.common.followed(found.common, solved)
-                judged = judged._following(solved.problem)._under(solved.problem, state.local)
+                judged = judged._following()._under(solved.problem, state.local)
             problem = judged.applied(solved.problem)
             planes, before = problem.heights, solved.problem.heights
             assert planes is not None
@@ -194,19 +194,17 @@ class Heights:
             wrong = np.abs(apart) > _WRONG * sigma
         return replace(found, wrong=np.asarray(found.of & wrong), broken=found._breaking(solved))
 
-    def _following(self, problem: BlockProblem) -> Heights:
-        """Return them with the DEM read where the estimate of its shift puts it, if it is to be."""
-        still = self.common.value[1:3] - self.common.undone[1:3]
-        if not self.source.follow or np.abs(still).max() <= _SHARED_STABLE:
-            return self
-        east, north = (-still * self.shift).tolist()
-        moved = self.source.surface.moved((east, north, 0.0), problem.frame.origin[:2])
-        source, undone = replace(self.source, surface=moved), self.common.undone.copy()
+    def _following(self) -> Heights:
+        """Return them with the DEM read where the estimate of its shift puts it."""
+        undone = self.common.undone.copy()
         undone[1:3] = self.common.value[1:3]
+        east, north = (undone[1:3] * self.shift).tolist()
+        source = replace(self.source, read_at=(east, north))
         spots = None if self.spots is None else self.spots.read_again(source, self.sigma, self.shift)
-        read = self.terrain.read + (east, north) / metres_per_degree(problem.frame.origin[None])
-        common, terrain = replace(self.common, undone=undone), replace(self.terrain, read=read)
-        return replace(self, source=source, common=common, terrain=terrain, spots=spots)
+        # Slopes stay that were read at about the same place of the DEM.
+        moved = np.subtract(self.source.read_at, source.read_at) / metres_per_degree(np.nan_to_num(self.terrain.ground))
+        terrain = replace(self.terrain, read=self.terrain.read + moved)
+        return replace(self, source=source, common=replace(self.common, undone=undone), terrain=terrain, spots=spots)
 
     def _apart(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.

@@ -49,8 +49,10 @@ class DemHeights:
         its own error, besides the bias.
     spots : SpotHeights, optional
         Known heights, which tell of the errors that heights share.
-    follow : bool
-        Read the DEM where the estimate of its shift puts it. By default its slope at each tie stands for that.
+    correct_shift : bool
+        Whether what is made with the DEM afterwards has it where the estimate puts it. The adjustment always does.
+    read_at : (float, float)
+        How far (m, east and north) from a place its height is read: the estimated shift of the DEM.
     """
 
     surface: DemSurface
@@ -58,7 +60,8 @@ class DemHeights:
     correlation: float | None = None
     shift: float | None = None
     spots: SpotHeights | None = None
-    follow: bool = False
+    correct_shift: bool = False
+    read_at: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("bias", "correlation", "shift"):
@@ -67,7 +70,8 @@ class DemHeights:
                 raise InputError(
                     f"{value} is no {name} of heights", field=f"points.{_OPTIONS[name]}", remedy="give metres"
                 )
-        object.__setattr__(self, "surface", self.surface.with_fill("mask"))
+        if self.surface.fill != "mask":
+            object.__setattr__(self, "surface", self.surface.with_fill("mask"))
 
     @classmethod
     def of(cls, heights: DemHeights | Surface) -> DemHeights:
@@ -80,7 +84,11 @@ class DemHeights:
 
     def heights(self, ground: Array) -> Array:
         """Return the heights ``(n,)`` at lon, lat ``(n, 2+)``; NaN in voids."""
-        return self.surface.heights(ground[:, :2], GEODETIC)
+        return self.surface.heights(self._read(ground), GEODETIC)
+
+    def _read(self, ground: Array) -> Array:
+        """Return lon, lat ``(n, 2)`` at which the DEM has the heights of places."""
+        return ground[:, :2] + self.read_at / metres_per_degree(np.column_stack([ground[:, :2], np.zeros(len(ground))]))
 
     def spacing(self, sigmas: Array) -> float:
         """Return how far (m) heights for a slope are apart, so that errors of `sigmas` ``(n,)`` are small in it."""
@@ -103,7 +111,7 @@ class DemHeights:
 
     def _around(self, ground: Array, steps: Array, metres: Array) -> Array:
         """Return heights ``(k, n)`` at steps ``(k, 2)`` of so many metres ``(n,)`` from places."""
-        lonlat = ground[:, :2]
+        lonlat = self._read(ground)
         step = metres[:, None] / metres_per_degree(np.column_stack([lonlat, np.zeros(len(lonlat))]))
         places = lonlat + steps[:, None] * step
         return self.surface.heights(places.reshape(-1, 2), GEODETIC).reshape(len(steps), -1)

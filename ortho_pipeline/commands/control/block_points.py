@@ -261,7 +261,7 @@ def observed(options: BlockOptions, surface: SurfaceOptions, heights: Surface | 
         options.dem_correlation,
         options.dem_shift_sigma,
         spots,
-        follow=options.dem_shift == "estimate",
+        correct_shift=options.dem_shift == "estimate",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 from pathlib import Path
@@ -54,9 +55,10 @@ def read_parquet(path: str | os.PathLike[str]) -> Table:
             altimetry(table)
     if "h" not in columns and not geometry.has_z.all():
         raise InputError("no column h", file=path, field="h", remedy="name the heights h")
-    heights = columns.get("h", geometry.z if geometry.has_z.all() else None)
+    if "h" not in columns:
+        columns["h"] = geometry.z
     sigmas = columns.get("sigma_h", [math.nan] * len(frame))
-    for count, values in enumerate(zip(geometry.x, geometry.y, heights, sigmas, strict=True)):
+    for count, values in enumerate(zip(geometry.x, geometry.y, columns["h"], sigmas, strict=True)):
         where = f"row {count}"
         x, y, h, sigma = (_float(value, path, where) for value in values)
         place = number(x, path, where), number(y, path, where), number(h, path, where)
@@ -69,7 +71,8 @@ def _frame(path: str | os.PathLike[str]) -> GeoDataFrame:
     """Return the table of a file."""
     try:
         import geopandas
-        import pyarrow  # noqa: F401 -- GeoPandas reads with it
+
+        importlib.import_module("pyarrow")  # GeoPandas reads with it
     except ImportError as error:
         raise InputError(
             "reading GeoParquet needs GeoPandas and PyArrow",

@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from ortho_pipeline.points.heights.parquet import is_parquet, read_parquet
 from ortho_pipeline.points.rows import OF_HEIGHTS, Table
 
 Array = NDArray[np.float64]
-T = TypeVar("T", bound=str | None)
 
 #: No sigma (m) of a height is less: altimeters and levels are not better.
 _LEAST = 1e-3
@@ -77,7 +76,7 @@ def _of_spots() -> Iterator[None]:
         raise
 
 
-def _renamed(text: T) -> T:
+def _renamed(text: Any) -> Any:
     """Return a text that names the options of spot heights."""
     if not isinstance(text, Text):
         return text
