@@ -73,8 +73,8 @@ def with_datum(
         return problem, "no control points: the datum is that of the priors and constraints of the models"
     missed = 0.0 if control else _missed(linear)
     stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
-    trusted = stated >= missed / _CONTRADICTED
-    sigmas = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
+    trusted = np.asarray(stated >= missed / _CONTRADICTED)
+    sigmas: Array = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
     # Heights of a DEM tell what ties leave to their slow errors.
     by_ties = not control and problem.heights is None
     typical = float(np.sqrt(np.mean(sigmas**2)))

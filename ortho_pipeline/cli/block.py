@@ -64,9 +64,12 @@ def adjust(
             "this describes orthos, and none are made", field="orthos", remedy=Text("give ", Setting("orthos"), " too")
         )
     command = click.get_current_context().meta["command"]
-    asked = {"match": match, "surface": surface, "orthos": output if orthos else None}
+    asked = output if orthos else None
     with progress() as shown:
-        result = blocks.adjust(images, folder, points, scene, models=models, command=command, progress=shown, **asked)
+        result = blocks.adjust(
+            images, folder, points, scene, models=models, match=match, surface=surface, orthos=asked, command=command,
+            progress=shown,
+        )  # fmt: skip
     print_result(result, as_json)
 
 

@@ -93,8 +93,8 @@ class HeightsRecord(Record):
         if self.spots is not None and self.spots.left_out:
             number, named = len(self.spots.left_out), self.spots.left_out[:_NAMED]
             said = f"{counted(number, 'spot height contradicts', 'spot heights contradict')} the DEM and the others: "
-            text = f"{said}not used ({', '.join(named)})"
-            found.append(Notice("spot-heights-left-out", text, count=number, points=list(named)))
+            said += f"not used ({', '.join(named)})"
+            found.append(Notice("spot-heights-left-out", said, count=number, points=list(named)))
         return found
 
 

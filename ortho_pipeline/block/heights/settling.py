@@ -180,8 +180,9 @@ class Heights:
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
             common = replace(common, value=common.value + step)
-        settled = self.spots is None or number > _ROUNDS // 2
-        spots = self.spots if settled else self.spots.judged(common, self.sigma)
+        spots = self.spots
+        if spots is not None and number <= _ROUNDS // 2:
+            spots = spots.judged(common, self.sigma)
         found = replace(self, common=common, spots=spots)
         apart, spread, used = found._apart(solved)
         if self.stated is None:

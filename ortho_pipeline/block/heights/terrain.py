@@ -138,7 +138,7 @@ def expected_slopes(slopes: Array, sigmas: Array, variance: float, images: Index
     weights, of = sigmas[rows] ** -2.0, images[rows]
     sums = np.bincount(of, weights)
     seen = sums > 0
-    means = np.stack([np.bincount(of, weights * slope) for slope in slopes[rows].T], axis=1)
+    means: Array = np.stack([np.bincount(of, weights * slope) for slope in slopes[rows].T], axis=1).astype(np.float64)
     means[seen] /= sums[seen, None]
     apart = slopes[rows] - means[of]
     covariance = (apart * weights[:, None]).T @ apart

@@ -26,7 +26,7 @@ from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cach
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem import DemSurface, moved
 from ortho_pipeline.surface.footprint import ground_sample_distance, lay, output_crs, two_digits
 
 #: Outputs of `rectify` that a block has already, or has not.
@@ -72,7 +72,7 @@ def corrected(surface: Surface, fit: BlockFit) -> Surface:
     if heights is None or not isinstance(surface, DemSurface):
         return surface
     east, north = heights.shift_m if heights.shift_applied else (0.0, 0.0)
-    return surface.moved((-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
+    return moved(surface, (-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
 
 
 def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOptions) -> OutputOptions:

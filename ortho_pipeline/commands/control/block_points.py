@@ -31,7 +31,7 @@ from ortho_pipeline.options.texts import Setting, Text, counted
 from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.points.heights.spot_heights import read_spot_heights
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem import DemSurface, moved
 
 #: Ground of matches is exact (m): what is not known of it stands in the covariances in the image.
 _EXACT = 1e-3
@@ -231,10 +231,10 @@ def _placed(heights: Surface, options: BlockOptions, scene: Scene) -> Surface:
         return heights
     if not scene.models:
         rows, columns = heights.shape
-        return heights.moved((*shift, 0.0), np.concatenate(heights.grid.lonlat(*np.array([[columns], [rows]]) / 2)))
+        return moved(heights, (*shift, 0.0), np.concatenate(heights.grid.lonlat(*np.array([[columns], [rows]]) / 2)))
     middle = np.array([[scene.width / 2, scene.height / 2]])
     ground = scene.model.image_to_ground(middle, scene.model.reference_height)
-    return heights.moved((*shift, 0.0), ground_transform(scene.model.crs, "EPSG:4979")(ground)[0, :2])
+    return moved(heights, (*shift, 0.0), ground_transform(scene.model.crs, "EPSG:4979")(ground)[0, :2])
 
 
 def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
