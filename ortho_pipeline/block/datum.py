@@ -73,8 +73,8 @@ def with_datum(
         return problem, "no control points: the datum is that of the priors and constraints of the models"
     missed = 0.0 if control else _missed(linear)
     stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
-    trusted = stated >= missed / _CONTRADICTED
-    sigmas = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
+    trusted = np.asarray(stated >= missed / _CONTRADICTED)
+    sigmas: Array = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
     # Heights of a DEM tell what ties leave to their slow errors.
     by_ties = not control and problem.heights is None
     typical = float(np.sqrt(np.mean(sigmas**2)))
@@ -91,13 +91,13 @@ def with_datum(
 
 
 def stated_accuracies(models: Mapping[str, SensorModel]) -> dict[str, float]:
-    """Return the standard deviations (m, per axis) that RPCs state of themselves, by image."""
+    """Return the standard deviations (m, per axis) that RPCs state, by image."""
     found = {image: model.stated_accuracy for image, model in models.items()}
     return {image: sigma for image, sigma in found.items() if sigma is not None}
 
 
 def _span(values: Array) -> str:
-    """Return one number, or from where to where several are."""
+    """Return a range of numbers, or the number if all are equal."""
     low, high = f"{values.min():.2g}", f"{values.max():.2g}"
     return low if low == high else f"{low} to {high}"
 
@@ -114,7 +114,7 @@ def _stated(linear: Linear, accuracies: Mapping[str, float]) -> Array:
 
 
 def _why(control: int, by_ties: bool, of: str) -> str:
-    """Say what the datum of a block is whose orientation is held with a sigma."""
+    """Return the datum of a block whose orientation is held with a sigma."""
     if control:
         return f"{counted(control, 'control point')}, and the orientation is held at its start values ({of})"
     if by_ties:

@@ -22,7 +22,7 @@ class Start:
 
     @property
     def accuracy(self) -> float | None:
-        """Standard deviation (m, each axis in plan) that its metadata state; None of a model adjusted before."""
+        """Standard deviation (m, each axis in plan) in its metadata; None of an adjusted model."""
         if self.scene.adjusted is not None:
             return None
         first = self.name.split("+")[0] == next(iter(self.scene.models), None)

@@ -67,12 +67,25 @@ def adjust(
 
     if not orthos and output != OutputOptions():
         raise InputError(
-            "this describes orthos, and none are made", field="orthos", remedy=Text("give ", Setting("orthos"), " too")
+            "this option is for orthos, and none are made",
+            field="orthos",
+            remedy=Text("leave it out, or add ", Setting("orthos")),
         )
     command = click.get_current_context().meta["command"]
-    asked = {"match": match, "surface": surface, "orthos": output if orthos else None}
+    asked = output if orthos else None
     with progress() as shown:
-        result = blocks.adjust(images, folder, points, scene, models=models, command=command, progress=shown, **asked)
+        result = blocks.adjust(
+            images,
+            folder,
+            points,
+            scene,
+            models=models,
+            match=match,
+            surface=surface,
+            orthos=asked,
+            command=command,
+            progress=shown,
+        )
     print_result(result, as_json)
 
 

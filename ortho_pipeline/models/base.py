@@ -115,7 +115,7 @@ class SensorModel(ABC):
 
     @property
     def stated_accuracy(self) -> float | None:
-        """Standard deviation (m, each axis in plan) that the vendor states of the model; None if none is stated."""
+        """Standard deviation (m, each axis in plan) that the vendor states for the model; None if not stated."""
         return None
 
     @property

@@ -116,7 +116,7 @@ class BlockOptions:
         str | None,
         Option(
             "--dem-shift",
-            "Correct the position of the DEM by this (metres east and north), or by the estimate.",
+            "Correct the position of the DEM by metres east and north, or by the estimate.",
             "estimate|E,N",
             unset="the estimate is only reported",
         ),
@@ -135,13 +135,13 @@ class BlockOptions:
         PathLike | None,
         Option(
             "--spot-heights",
-            "Known heights, such as of laser altimetry: CSV, GeoJSON or GeoParquet with x, y, h, sigma. They fix the "
-            "bias of the DEM.",
+            "Known heights, such as laser altimetry, that fix the bias of the DEM: CSV, GeoJSON or GeoParquet with "
+            "x, y, h, sigma.",
             "FILE",
         ),
     ] = None
     spot_crs: Annotated[
-        str | None, Option("--spot-heights-crs", "CRS of the spot heights, where their file has none.", "CRS")
+        str | None, Option("--spot-heights-crs", "CRS of the spot heights, if their file has none.", "CRS")
     ] = None
     spot_vertical: Annotated[
         str | None, Option("--spot-heights-vertical", f"Height datum of the spot heights: {VERTICAL_FORMS}.", "DATUM")

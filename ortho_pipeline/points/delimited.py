@@ -98,7 +98,7 @@ class Header:
 
 
 def altimetry(table: Table) -> None:
-    """State of a table what heights of laser altimeters are above, and the CRS of its longitudes and latitudes."""
+    """Set the height datum of laser altimeters, and the CRS of longitudes and latitudes, in a table."""
     table.assumed_vertical = "ellipsoid"
     if table.of_ground == "geographic" and table.crs is None:
         table.crs = "EPSG:4326"

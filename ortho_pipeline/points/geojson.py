@@ -72,17 +72,12 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
     ):
         raise InputError("this feature is not a Point with properties", file=path, field=where)
     ground = (math.nan,) * 3 if geometry is None else _place(path, where, geometry)
+    properties, ground = _named(path, where, properties, ground, expected)
 
     def sigma(name: str, zero: bool) -> float | None:
         value = properties.get(name)
         return None if value is None else sigma_of(value, path, f"{where}.properties.{name}", zero=zero)
 
-    for alias, ours in expected.aliases.items():
-        value = next((value for key, value in properties.items() if key.lower().replace("_", "") == alias), None)
-        if value is not None and ours == "h" and math.isnan(ground[2]):
-            ground = (*ground[:2], number(value, path, f"{where}.properties, {alias}"))
-        elif value is not None and ours != "h":
-            properties = {ours: value, **properties}
     name = properties.get("id", feature.get("id"))
     if name is not None and not isinstance(name, str | int):
         raise InputError(f"{short(name)} is not an id", file=path, field=f"{where}.properties.id")
@@ -111,6 +106,24 @@ def _feature(path: str | os.PathLike[str], where: str, feature: Any, expected: C
     if "col" not in expected.needed:
         return [row]
     return [replace(row, image=at, image_name=image) for image, at in _measured(path, where, properties, expected)]
+
+
+def _named(
+    path: str | os.PathLike[str],
+    where: str,
+    properties: dict[str, Any],
+    ground: tuple[float, ...],
+    expected: ColumnRules,
+) -> tuple[dict[str, Any], tuple[float, float, float]]:
+    """Return properties by our names, and the ground with a height that is one of them."""
+    x, y, height = ground
+    for alias, ours in expected.aliases.items():
+        value = next((value for key, value in properties.items() if key.lower().replace("_", "") == alias), None)
+        if value is not None and ours != "h":
+            properties = {ours: value, **properties}
+        elif value is not None and math.isnan(height):
+            height = number(value, path, f"{where}.properties, {alias}")
+    return properties, (x, y, height)
 
 
 def _place(path: str | os.PathLike[str], where: str, geometry: dict[str, Any]) -> tuple[float, float, float]:

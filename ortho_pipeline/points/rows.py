@@ -37,7 +37,7 @@ CSV_IMAGE = "image"
 CSV_ERRORS = ("var_col", "var_row", "cov_col_row", "group", "sigma_common", "sigma_alike")
 
 
-#: What laser altimetry calls heights, always above the ellipsoid, and their sigmas: SlideRule, ATL06, ATL08.
+#: Columns of laser altimetry for heights (above the ellipsoid) and their sigmas: SlideRule, ATL06, ATL08.
 ALTIMETRY = {"hmean": "hsigma", "hli": "hlisigma", "htebestfit": "hteuncertainty"}
 
 

@@ -65,9 +65,9 @@ class AbsoluteAccuracy(Record):
 
 
 class RelativeAccuracy(Record):
-    """Standard deviations of the relative positions of images with points in common, where they are largest.
+    """Standard deviations of the relative positions of images with common points, where they are largest.
 
-    The errors of the datum, which all images share, are not in them.
+    They do not include the errors of the datum, which all images share.
     """
 
     pairs: Count

@@ -133,6 +133,24 @@ def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
         )
 
 
+def moved(surface: DemSurface, metres: tuple[float, float, float], place: Array) -> DemSurface:
+    """Return a DEM moved to the east and north, and raised, by metres.
+
+    Parameters
+    ----------
+    place : ndarray (2,)
+        Longitude and latitude at which the metres apply.
+    """
+    east, north, up = metres
+    there = ground_transform("EPSG:4979", surface.crs)(np.array([[*place, 0.0]]))
+    dx, dy, _ = map_from_enu(surface.crs, there)[0] @ (east, north, 0.0)
+    x, a, b, y, c, d = surface.grid.crs_from_pixel
+    grid = replace(surface.grid, crs_from_pixel=(x + float(dx), a, b, y + float(dy), c, d))
+    before, raised = surface.record.get("moved_m", (0.0, 0.0)), surface.raised + up
+    record = {**surface.record, "moved_m": [before[0] + east, before[1] + north], "raised_m": raised}
+    return replace(surface, grid=grid, raised=raised, record=record)
+
+
 class TileCache:
     """Arrays by key, as many of the last used as some bytes hold; shared by threads."""
 
@@ -177,7 +195,7 @@ class DemSurface(Surface):
         Bytes of cached heights.
     sigma : float, Surface or None
     raised : float
-        What is added to the heights, m.
+        Added to the heights, m.
     """
 
     file: Samples
@@ -248,22 +266,6 @@ class DemSurface(Surface):
         sigma = self.sigma.around(lon) if isinstance(self.sigma, Surface) else self.sigma
         grid = self.grid.around(lon)
         return self if grid is self.grid and sigma is self.sigma else replace(self, grid=grid, sigma=sigma)
-
-    def moved(self, metres: tuple[float, float, float], place: Array) -> DemSurface:
-        """Return this DEM moved so far to the east and north, and raised.
-
-        Parameters
-        ----------
-        place : ndarray (2,)
-            Longitude and latitude where these are metres.
-        """
-        east, north, up = metres
-        there = ground_transform("EPSG:4979", self.crs)(np.array([[*place, 0.0]]))
-        dx, dy, _ = map_from_enu(self.crs, there)[0] @ (east, north, 0.0)
-        x, a, b, y, c, d = self.grid.crs_from_pixel
-        grid = replace(self.grid, crs_from_pixel=(x + float(dx), a, b, y + float(dy), c, d))
-        record = {**self.record, "moved_m": [east, north], "raised_m": up}
-        return replace(self, grid=grid, raised=self.raised + up, record=record)
 
     @property
     def nearest_reach(self) -> int:

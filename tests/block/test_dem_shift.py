@@ -22,27 +22,27 @@ def pixels_of_four_metres(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chains, "PIXEL", 4.0)
 
 
-def adjusted(seed: int, part: float, path: Path, *, follow: bool = False) -> tuple[BlockFit, np.ndarray]:
+def adjusted(seed: int, part: float, path: Path, *, move: bool = False) -> tuple[BlockFit, np.ndarray]:
     """Return a block with control in its first image, and by how much (m) its DEM is off: a part of half a sample."""
     block = fly(Chain(images=4, convergence_deg=10.0, normal=True, errors=5.0, ties=600), seed)
     random = np.random.default_rng(5 + seed)
     azimuth, bias = random.uniform(0, 2 * np.pi), 2.0 * random.normal()
     shift = 0.5 * CELL * part * np.array([np.sin(azimuth), np.cos(azimuth)])
     surface = dem(block, path, seed, white=2.0, cell=CELL, bias=bias, shift=(float(shift[0]), float(shift[1])))
-    heights = DemHeights(surface.with_sigma(2.0), follow=follow)
+    heights = DemHeights(surface.with_sigma(2.0), correct_shift=move)
     return adjust(block.start, with_control(block, sigma=0.5, seed=seed), heights=heights), shift
 
 
-@pytest.mark.parametrize("follow", [False, True])
-def test_half_a_sample_is_found(tmp_path: Path, follow: bool) -> None:
-    fit, shift = adjusted(1, 1.0, tmp_path / "dem.tif", follow=follow)
+@pytest.mark.parametrize("move", [False, True])
+def test_half_a_sample_is_found(tmp_path: Path, move: bool) -> None:
+    fit, shift = adjusted(1, 1.0, tmp_path / "dem.tif", move=move)
     assert fit.heights is not None
     assert fit.heights.shift_significant
-    assert fit.heights.shift_applied == follow
+    assert fit.heights.shift_applied == move
     off = np.array(fit.heights.shift_m) - shift
     assert (np.abs(off) < 4 * np.array(fit.heights.shift_sigma_m)).all()
     notice = next(one for one in fit.warnings if one.code == "dem-shifted")
-    assert ("points.dem_shift" in str(notice)) != follow
+    assert ("points.dem_shift" in str(notice)) != move
 
 
 def test_a_dem_in_its_place_is_not_shifted(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ class CommonHeights(CommonUnknown):
     by_params, by_points : ndarray (P, k), (N, 3, k)
         How one standard deviation moves parameters, and points in their east, north, up.
     undone : ndarray (k,)
-        The part of the estimate with which the DEM was moved before it was read, in standard deviations.
+        The part of the estimate by which the DEM is already read elsewhere, in standard deviations.
     """
 
     loads: Array
@@ -89,10 +89,10 @@ class CommonHeights(CommonUnknown):
 
     @property
     def chance(self) -> float | None:
-        """How probable a shift as large as this would seem of a DEM that is not shifted; None where nothing tells."""
+        """Probability of a shift as large as this without a shift; None if the block has no information on it."""
         from scipy.special import chdtrc
 
-        # Without the prior: what the block tells of the shift, with all other unknowns.
+        # The information of the block alone, without the prior.
         precision = np.linalg.inv(self.left[1:3, 1:3])
         told = precision - np.eye(2)
         if np.linalg.eigvalsh(told)[0] < _TOLD:
@@ -141,7 +141,7 @@ class CommonHeights(CommonUnknown):
         return found, units[place[rows]].T @ linear.misfits.ground[rows, 2]
 
     def followed(self, before: CommonHeights, solved: Solved) -> State:
-        """Return the state of a solution with what parameters and points do if these errors are no longer `before`."""
+        """Return the state of a solution after these errors changed from `before`: moved parameters and points."""
         step, frame = self.value - before.value, solved.problem.frame
         enu = frame.enu_at(frame.geodetic(solved.state.local))
         points = np.einsum("nji,nj->ni", enu, self.by_points @ step)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.heights.spots import SpotsRecord
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors.texts import Setting, Text, counted
@@ -17,7 +18,7 @@ from ortho_pipeline.files.json.records import Count, Pair, Record
 if TYPE_CHECKING:
     from ortho_pipeline.block.heights.settling import Heights
 
-#: A shift of the DEM is significant if one as large is less probable without it.
+#: A shift of the DEM is significant if one as large by chance is less probable than this.
 _SIGNIFICANT = 0.001
 #: A notice names so many points.
 _NAMED = 10
@@ -104,7 +105,7 @@ class HeightsRecord(Record):
 
 
 def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
-    """Return what is published of the heights of a solution."""
+    """Return the record of the heights of a solution."""
     rows = solved.linear.ordering.grounded
     planes = solved.problem.heights
     assert planes is not None
@@ -125,7 +126,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
         sigma_is=heights.sigma_is,
         rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
-        mean_error_m=float(heights.common.offset[used].mean()) if len(used) else 0.0,
+        mean_error_m=_mean_error(heights, used),
         bias_m=bias,
         bias_sigma_m=bias_sigma,
         bias_prior_m=heights.common.sigma,
@@ -133,7 +134,14 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
         shift_prior_m=heights.shift,
         shift_chance=heights.common.chance,
-        shift_applied=heights.source.follow,
+        shift_applied=heights.source.correct_shift,
         correlation_m=heights.source.correlation,
         spots=None if heights.spots is None else heights.spots.record(heights.common),
     )
+
+
+def _mean_error(heights: Heights, used: Index) -> float:
+    """Return the mean of the shared errors of heights, m, without a shift that is applied."""
+    common = heights.common
+    value = common.value - common.undone if heights.source.correct_shift else common.value
+    return float((common.loads[used] @ value).mean()) if len(used) else 0.0

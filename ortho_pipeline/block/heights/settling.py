@@ -34,6 +34,8 @@ _SHARED_STABLE = 0.02
 _WRONG, _RIGHT = 4.0, 3.0
 #: A height is at a break if the DEM is more sigmas off its plane within the uncertainty of the place.
 _BREAKS = 4.0
+#: Breaks are looked for again if the DEM is read by more than this part of a sample farther off.
+_MOVED = 0.25
 #: A sigma is estimated from so many heights or more, each of at least this redundancy.
 _ENOUGH, _REDUNDANT = 50, 0.2
 #: Stated sigmas count as too small if residuals are larger by so many standard deviations of their mean square.
@@ -166,20 +168,15 @@ class Heights:
             if judged.common.value is not heights.common.value:
                 # Points and images follow the shared errors, so that the DEM is read where they will be.
                 state = judged.common.followed(heights.common, solved)
-                judged = judged._moved(solved)._under(solved.problem, state.local)
+                judged = judged._following(solved, state.local)
             problem = judged.applied(solved.problem)
-            if judged._same_errors(heights) and _stable(solved, problem):
+            if _same_errors(judged, heights) and _stable(solved, problem):
                 return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
             again = attempt(problem, state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
                 break
             solved, heights = again, judged
         return solved, heights
-
-    def _same_errors(self, other: Heights) -> bool:
-        """Tell whether their sigmas and shared errors are those of others."""
-        same = (self.sigma, self.scale) == (other.sigma, other.scale)
-        return same and np.array_equal(self.common.value, other.common.value)
 
     def _judged(self, solved: Solved, number: int) -> Heights:
         """Return them with sigma, shared errors and wrong heights by a solution."""
@@ -207,21 +204,21 @@ class Heights:
         broken = judged.broken if number else judged._breaking(solved)
         return replace(judged, wrong=np.asarray(judged.of & wrong), broken=broken)
 
-    def _moved(self, solved: Solved) -> Heights:
-        """Return them with the DEM moved by the estimate of its shift, if the source asks for it."""
-        rest = self.common.value[1:3] - self.common.undone[1:3]
-        if not self.source.follow or np.abs(rest).max() <= _SHARED_STABLE:
-            return self
-        east, north = (-rest * self.shift).tolist()
-        origin = solved.problem.frame.origin
-        source = replace(self.source, surface=self.source.surface.moved((east, north, 0.0), origin[:2]))
+    def _following(self, solved: Solved, local: Array) -> Heights:
+        """Return them with the DEM under points at `local` ``(N, 3)``, read where the estimate of its shift puts it."""
         undone = self.common.undone.copy()
         undone[1:3] = self.common.value[1:3]
+        east, north = (undone[1:3] * self.shift).tolist()
+        source = replace(self.source, read_at=(east, north))
         spots = None if self.spots is None else self.spots.read_again(source, self.sigma, self.shift)
-        read = self.terrain.read + (east, north) / metres_per_degree(origin[None])
+        # Slopes stay that were read at about the same place of the DEM.
+        moved = np.subtract(self.source.read_at, source.read_at)
+        read = self.terrain.read + moved / metres_per_degree(np.nan_to_num(self.terrain.ground))
         common, terrain = replace(self.common, undone=undone), replace(self.terrain, read=read)
-        moved = replace(self, source=source, common=common, terrain=terrain, spots=spots)
-        return replace(moved, broken=moved._breaking(solved))
+        heights = replace(self, source=source, common=common, terrain=terrain, spots=spots)
+        heights = heights._under(solved.problem, local)
+        far = np.abs(moved).max() > _MOVED * self.source.surface.sample_size
+        return replace(heights, broken=heights._breaking(solved)) if far else heights
 
     def _residuals(self, solved: Solved) -> tuple[Array, Array, Mask]:
         """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
@@ -296,6 +293,12 @@ class Heights:
         if self.stated is not None:
             return "enlarged" if self.scale > 1.0 else "stated"
         return "estimated" if self.estimated else "assumed"
+
+
+def _same_errors(one: Heights, other: Heights) -> bool:
+    """Tell whether the sigmas and shared errors of heights are those of others."""
+    same = (one.sigma, one.scale) == (other.sigma, other.scale)
+    return same and np.array_equal(one.common.value, other.common.value)
 
 
 def _stable(solved: Solved, problem: BlockProblem) -> bool:

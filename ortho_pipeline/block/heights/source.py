@@ -50,9 +50,18 @@ class DemHeights:
         Distance (m) over which errors are correlated, by exp(-d / correlation). By default each sample of the DEM has
         its own error, besides the bias.
     spots : SpotHeights, optional
-        Known heights, which tell of the errors that heights share.
-    follow : bool
-        Read the DEM where the estimate of its shift puts it. By default its slope at each tie stands for that.
+        Known heights, observations of the errors that heights share.
+    correct_shift : bool
+        Whether later products use the DEM with its shift corrected. The adjustment always corrects it.
+    read_at : (float, float)
+        Distance (m, east and north) from a place to where its height is read: the estimated shift of the DEM.
+
+    Examples
+    --------
+    >>> dem = op.open_dem("sample_data/dem.tif").with_sigma(4.0)
+    >>> heights = op.DemHeights(dem, shift=10.0)
+    >>> heights.sigmas(np.array([[36.0, 39.0]]))
+    array([4.])
     """
 
     surface: DemSurface
@@ -60,7 +69,8 @@ class DemHeights:
     correlation: float | None = None
     shift: float | None = None
     spots: SpotHeights | None = None
-    follow: bool = False
+    correct_shift: bool = False
+    read_at: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("bias", "correlation", "shift"):
@@ -71,7 +81,8 @@ class DemHeights:
                     field=f"points.{_OPTIONS[name]}",
                     remedy="give metres",
                 )
-        object.__setattr__(self, "surface", self.surface.with_fill("mask"))
+        if self.surface.fill != "mask":
+            object.__setattr__(self, "surface", self.surface.with_fill("mask"))
 
     @classmethod
     def of(cls, heights: DemHeights | Surface) -> DemHeights:
@@ -84,7 +95,11 @@ class DemHeights:
 
     def heights(self, ground: Array) -> Array:
         """Return the heights ``(n,)`` at lon, lat ``(n, 2+)``; NaN in voids."""
-        return self.surface.heights(ground[:, :2], GEODETIC)
+        return self.surface.heights(self._read(ground), GEODETIC)
+
+    def _read(self, ground: Array) -> Array:
+        """Return lon, lat ``(n, 2)`` at which the DEM has the heights of places."""
+        return ground[:, :2] + self.read_at / metres_per_degree(np.column_stack([ground[:, :2], np.zeros(len(ground))]))
 
     def spacing(self, sigmas: Array) -> float:
         """Return how far (m) heights for a slope are apart, so that errors of `sigmas` ``(n,)`` are small in it."""
@@ -107,7 +122,7 @@ class DemHeights:
 
     def _around(self, ground: Array, steps: Array, metres: Array) -> Array:
         """Return heights ``(k, n)`` at steps ``(k, 2)`` of so many metres ``(n,)`` from places."""
-        lonlat = ground[:, :2]
+        lonlat = self._read(ground)
         step = metres[:, None] / metres_per_degree(np.column_stack([lonlat, np.zeros(len(lonlat))]))
         places = lonlat + steps[:, None] * step
         return self.surface.heights(places.reshape(-1, 2), GEODETIC).reshape(len(steps), -1)

@@ -19,7 +19,7 @@ from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
 
-#: A spot farther off than so many sigmas is left out.
+#: A spot with a larger difference, in sigmas, is left out.
 _WRONG = 4.0
 #: The sigma of a normal distribution over its median absolute value.
 _NORMAL = 1.4826
@@ -80,10 +80,10 @@ class SpotDifferences:
         known = np.isfinite(apart)
         if not known.any():
             raise InputError(
-                "the DEM has no height at any of the spot heights",
+                "the DEM has no height at any spot height",
                 file=source.spots.source or None,
                 field="points.spot_heights",
-                remedy="check the CRS of the spot heights, and whether they are on the DEM",
+                remedy="check the CRS of the spot heights, and that the DEM covers them",
             )
         found = cls(
             source.spots,
@@ -133,7 +133,7 @@ class SpotDifferences:
         Parameters
         ----------
         shared : bool
-            As they weigh, those of neighbours together as much as one.
+            Larger where neighbours share information, so that together they count as one.
         """
         own = self.own if shared else np.minimum(self.own, 1.0)
         dem = np.full(len(self.apart), sigma) if self.stated is None else self.scale * self.stated
@@ -141,7 +141,7 @@ class SpotDifferences:
         return np.where(np.isfinite(found), found, np.inf)
 
     def residuals(self, common: CommonHeights) -> Array:
-        """Return what shared errors leave of the differences ``(n,)``."""
+        """Return the differences without the shared errors ``(n,)``."""
         return np.asarray(self.apart - self.loads @ (common.value - common.undone))
 
     def standardised(self, common: CommonHeights, sigma: float) -> Array:
@@ -156,14 +156,14 @@ class SpotDifferences:
             return replace(self, wrong=np.abs(self.residuals(common)) > _WRONG * np.sqrt(spread))
 
     def told(self, common: CommonHeights, sigma: float, slope: Array) -> tuple[CommonHeights, Array]:
-        """Return shared errors with what the spots tell of them, and the slope with their part ``(k,)``."""
+        """Return the shared errors with the information of the spots, and the slope with their part ``(k,)``."""
         used = self.used
         weighted = self.loads[used] / self.variances(sigma)[used, None]
         told = common.told + weighted.T @ self.loads[used]
         return replace(common, told=told), slope + weighted.T @ self.residuals(common)[used]
 
     def record(self, common: CommonHeights) -> SpotsRecord:
-        """Return what is published of them."""
+        """Return the published record."""
         used = self.used
         left = self.residuals(common)[used]
         wrong = np.flatnonzero(self.wrong)
@@ -177,9 +177,9 @@ class SpotDifferences:
 
 
 class SpotsRecord(Record):
-    """Spot heights that fixed the bias of a DEM: how many, the mean of DEM minus spot, and what was left of it, metres.
+    """Spot heights that fixed the bias of a DEM: their number, the mean of DEM minus spot, and the RMS that is left, m.
 
-    Those of `left_out` contradict the others; `without` are those at which the DEM has no height.
+    Those in `left_out` contradict the others; `without` counts those where the DEM has no height.
     """
 
     used: Count

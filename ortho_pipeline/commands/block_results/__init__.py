@@ -1,1 +1,1 @@
-"""What comes of a block besides models and report: its ground points as files, and its orthos."""
+"""Other results of a block: files of its ground points, and its orthos."""

@@ -26,15 +26,15 @@ from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cach
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem import DemSurface, moved
 from ortho_pipeline.surface.footprint import ground_sample_distance, lay, output_crs, two_digits
 
-#: Outputs of `rectify` that a block has already, or has not.
+#: Outputs of `rectify` that orthos of a block do not have.
 _NOT_AGAIN = ("model", "rpc", "vrt")
 
 
 def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> dict[str, dict[str, Path]]:
-    """Return the outputs of each image by what they are, called as those of `rectify`."""
+    """Return the outputs of each image by kind, named as those of `rectify`."""
     return {
         label: {kind: path for kind, path in outputs(folder, label, output).items() if kind not in _NOT_AGAIN}
         for label in labels
@@ -44,7 +44,7 @@ def ortho_files(folder: Path, labels: Sequence[str], output: OutputOptions) -> d
 def adjusted_scenes(
     starts: Mapping[str, Start], fit: BlockFit, models: Mapping[str, SensorModel], files: Mapping[str, Path]
 ) -> dict[str, Scene]:
-    """Return the scenes with their adjusted models, which say that they come from the block.
+    """Return the scenes with their adjusted models, marked as adjusted in the block.
 
     Parameters
     ----------
@@ -67,16 +67,16 @@ def adjusted_scenes(
 
 
 def corrected(surface: Surface, fit: BlockFit) -> Surface:
-    """Return the heights as the block has them: without errors that all share, on request without the shift."""
+    """Return the heights without the errors that all share; on request, without the shift."""
     heights = fit.heights
     if heights is None or not isinstance(surface, DemSurface):
         return surface
     east, north = heights.shift_m if heights.shift_applied else (0.0, 0.0)
-    return surface.moved((-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
+    return moved(surface, (-east, -north, -heights.mean_error_m), np.nanmedian(fit.ground[:, :2], axis=0))
 
 
 def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOptions) -> OutputOptions:
-    """Return options with the CRS and the resolution of all: the zone of the first image, the finest pixel.
+    """Return options with one CRS and resolution for all images: the zone of the first, the smallest pixel.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def make_orthos(
     command: str | None,
     progress: Progress | None,
 ) -> dict[str, ReportError]:
-    """Make the orthos of adjusted scenes, and return why reports could not be made, by image.
+    """Make the orthos of adjusted scenes, and return the errors of reports by image.
 
     Raises
     ------

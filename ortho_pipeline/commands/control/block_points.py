@@ -31,7 +31,7 @@ from ortho_pipeline.options import BlockOptions, MatchOptions, SceneOptions, Sur
 from ortho_pipeline.points import Points, assign_roles
 from ortho_pipeline.points.heights.spot_heights import read_spot_heights
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.surface.dem import DemSurface
+from ortho_pipeline.surface.dem import DemSurface, moved
 
 #: Sigma (m) of the ground of matches: its errors are in the covariances in the image.
 _EXACT = 1e-3
@@ -197,7 +197,7 @@ def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
     for name in ("spot_crs", "spot_vertical"):
         if getattr(options, name) is not None and options.spot_heights is None:
             raise InputError(
-                "this describes spot heights, and there are none",
+                Text(Setting(f"points.{name}"), " needs spot heights, and none are given"),
                 field=f"points.{name}",
                 remedy=Text("leave it out, or give ", Setting("points.spot_heights", "FILE")),
             )
@@ -205,19 +205,19 @@ def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:
 
 
 def shift_of(options: BlockOptions) -> tuple[float, float] | None:
-    """Return by how much (m, east and north) the DEM is moved before anything else; None if by nothing stated.
+    """Return the stated shift of the DEM (m, east and north), which is applied first; None if none is stated.
 
     Raises
     ------
     InputError
-        If it is neither two numbers nor the word.
+        If it is neither two numbers nor ``estimate``.
     """
     if options.dem_shift in (None, "estimate"):
         return None
     found = numbers_of(str(options.dem_shift))
     if len(found) != 2 or not np.isfinite(found).all():
         raise InputError(
-            f"{options.dem_shift!r} is no shift",
+            f"{options.dem_shift!r} is not a shift",
             field="points.dem_shift",
             remedy="give estimate, or metres east and north, such as 10,-5",
         )
@@ -225,16 +225,16 @@ def shift_of(options: BlockOptions) -> tuple[float, float] | None:
 
 
 def _placed(heights: Surface, options: BlockOptions, scene: Scene) -> Surface:
-    """Return heights where the user says that they are."""
+    """Return heights with the shift that the options state."""
     shift = shift_of(options)
     if shift is None or not isinstance(heights, DemSurface):
         return heights
     if not scene.models:
         rows, columns = heights.shape
-        return heights.moved((*shift, 0.0), np.concatenate(heights.grid.lonlat(*np.array([[columns], [rows]]) / 2)))
+        return moved(heights, (*shift, 0.0), np.concatenate(heights.grid.lonlat(*np.array([[columns], [rows]]) / 2)))
     middle = np.array([[scene.width / 2, scene.height / 2]])
     ground = scene.model.image_to_ground(middle, scene.model.reference_height)
-    return heights.moved((*shift, 0.0), ground_transform(scene.model.crs, "EPSG:4979")(ground)[0, :2])
+    return moved(heights, (*shift, 0.0), ground_transform(scene.model.crs, "EPSG:4979")(ground)[0, :2])
 
 
 def observes(options: BlockOptions, surface: SurfaceOptions) -> bool:
@@ -261,7 +261,7 @@ def observed(options: BlockOptions, surface: SurfaceOptions, heights: Surface | 
         options.dem_correlation,
         options.dem_shift_sigma,
         spots,
-        follow=options.dem_shift == "estimate",
+        correct_shift=options.dem_shift == "estimate",
     )
 
 

@@ -1,1 +1,1 @@
-"""Known heights at places, and the formats that they are delivered in."""
+"""Known heights of places, and their file formats."""

@@ -1,7 +1,8 @@
-"""Known heights of a GeoParquet file, as tables of laser altimetry are delivered."""
+"""Known heights in GeoParquet, a format of laser altimetry."""
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 from pathlib import Path
@@ -14,12 +15,12 @@ from ortho_pipeline.points.rows import ALTIMETRY, MAX_FILE, OF_HEIGHTS, PointRow
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
 
-#: How a file begins and how it may be called.
+#: The first bytes of a file, and its suffixes.
 _MAGIC, _SUFFIXES = b"PAR1", (".parquet", ".geoparquet")
 
 
 def is_parquet(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a file is Parquet, by its name or its first bytes."""
+    """Return whether a file is Parquet, by its name or its first bytes."""
     if Path(path).suffix.lower() in _SUFFIXES:
         return True
     try:
@@ -30,7 +31,7 @@ def is_parquet(path: str | os.PathLike[str]) -> bool:
 
 
 def read_parquet(path: str | os.PathLike[str]) -> Table:
-    """Read points with a height: of the geometry, or of a column that is called as in `OF_HEIGHTS`.
+    """Read points with a height: that of a column in `OF_HEIGHTS`, else that of the geometry.
 
     Raises
     ------
@@ -40,7 +41,7 @@ def read_parquet(path: str | os.PathLike[str]) -> Table:
     frame = _frame(path)
     geometry, table = frame.geometry, Table("GeoParquet", source=os.fspath(path))
     if not len(frame):
-        raise InputError("this file holds no points", file=path, remedy="add points to it")
+        raise InputError("this file has no points", file=path, remedy="add points")
     if not (geometry.geom_type == "Point").all():
         raise InputError("the geometries are not all points", file=path, field="geometry", remedy="give points")
     if frame.crs is not None:
@@ -54,9 +55,10 @@ def read_parquet(path: str | os.PathLike[str]) -> Table:
             altimetry(table)
     if "h" not in columns and not geometry.has_z.all():
         raise InputError("no column h", file=path, field="h", remedy="name the heights h")
-    heights = columns.get("h", geometry.z if geometry.has_z.all() else None)
+    if "h" not in columns:
+        columns["h"] = geometry.z
     sigmas = columns.get("sigma_h", [math.nan] * len(frame))
-    for count, values in enumerate(zip(geometry.x, geometry.y, heights, sigmas, strict=True)):
+    for count, values in enumerate(zip(geometry.x, geometry.y, columns["h"], sigmas, strict=True)):
         where = f"row {count}"
         x, y, h, sigma = (_float(value, path, where) for value in values)
         place = number(x, path, where), number(y, path, where), number(h, path, where)
@@ -69,7 +71,8 @@ def _frame(path: str | os.PathLike[str]) -> GeoDataFrame:
     """Return the table of a file."""
     try:
         import geopandas
-        import pyarrow  # noqa: F401 -- GeoPandas reads with it
+
+        importlib.import_module("pyarrow")  # GeoPandas reads with it
     except ImportError as error:
         raise InputError(
             "reading GeoParquet needs GeoPandas and PyArrow",
@@ -78,16 +81,16 @@ def _frame(path: str | os.PathLike[str]) -> GeoDataFrame:
         ) from error
     if Path(path).is_file() and Path(path).stat().st_size > MAX_FILE:
         raise InputError(
-            f"a point file of more than {MAX_FILE // 1_000_000} MB is not read", file=path, remedy="thin it out"
+            f"the point file is larger than {MAX_FILE // 1_000_000} MB", file=path, remedy="use fewer points"
         )
     try:
         frame = geopandas.read_parquet(path)
         len(frame.geometry)
     # What is raised depends on the part of the file that is damaged.
     except Exception as error:
-        said = str(error).splitlines()[:1]
+        reason = "".join(str(error).splitlines()[:1])
         raise InputError(
-            f"this file cannot be read as GeoParquet ({''.join(said)[:200]})",
+            f"this file cannot be read as GeoParquet ({reason[:200]})",
             file=path,
             remedy="write it with GeoPandas or SlideRule, or give a CSV",
         ) from error

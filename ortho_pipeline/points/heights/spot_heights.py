@@ -1,4 +1,4 @@
-"""Spot heights: known heights at places, of laser altimetry, maps or lake levels. They do not act in plan."""
+"""Spot heights: known heights of places, from laser altimetry, maps or lake levels. They do not act in plan."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from ortho_pipeline.points.heights.parquet import is_parquet, read_parquet
 from ortho_pipeline.points.rows import OF_HEIGHTS, Table
 
 Array = NDArray[np.float64]
-T = TypeVar("T", bound=str | None)
 
 #: No sigma (m) of a height is less: altimeters and levels are not better.
 _LEAST = 1e-3
@@ -39,10 +38,10 @@ class SpotHeights:
     sigmas : ndarray (N,)
         Standard deviations of the heights, m.
     plan : ndarray (N,)
-        Standard deviations of the places, m, in each axis; 0 where none is stated.
+        Standard deviations of the places, m, per axis; 0 if not stated.
     ids : tuple of str
     source : str
-        Where they come from, for people.
+        The file, for people.
     """
 
     ground: Array
@@ -68,7 +67,7 @@ def read_height_table(path: str | os.PathLike[str]) -> Table:
 
 @contextlib.contextmanager
 def _of_spots() -> Iterator[None]:
-    """Let errors that are raised inside name the options of spot heights."""
+    """Make errors name the options of spot heights."""
     try:
         yield
     except OrthoError as error:
@@ -77,8 +76,8 @@ def _of_spots() -> Iterator[None]:
         raise
 
 
-def _renamed(text: T) -> T:
-    """Return a text that names the options of spot heights."""
+def _renamed(text: Any) -> Any:
+    """Return a text with the options of spot heights."""
     if not isinstance(text, Text):
         return text
     named = (
@@ -95,14 +94,21 @@ def read_spot_heights(path: str | os.PathLike[str], crs: str | None = None, vert
     Parameters
     ----------
     path : path
-        CSV, GeoJSON or GeoParquet with x, y, h and sigma; tables of SlideRule and ICESat-2 (ATL06, ATL08) as they are.
+        CSV, GeoJSON or GeoParquet with x, y, h and sigma; tables of SlideRule and ICESat-2 (ATL06, ATL08) work, too.
     crs, vertical : str, optional
-        What places and heights are in, where the file does not say it.
+        CRS and height datum, if the file does not state them.
 
     Raises
     ------
     InputError, CrsError, DatumError
         For a file that cannot be read, an unknown CRS or height datum, and heights without a sigma.
+
+    Examples
+    --------
+    >>> path = out / "spots.csv"
+    >>> _ = path.write_text("#CRS: EPSG:4326\\n#vertical: ellipsoid\\nx,y,h,sigma\\n36.1,39.2,812.5,0.3\\n")
+    >>> op.read_spot_heights(path).sigmas
+    array([0.3])
     """
     table = read_height_table(path)
     with of_option("points.spot_crs"):
@@ -113,7 +119,7 @@ def read_spot_heights(path: str | os.PathLike[str], crs: str | None = None, vert
         ground, system = ground_of(path, table, plane, datum)
     for row in table.rows:
         if not row.sigma_h:
-            raise InputError("this height has no sigma", file=path, field=row.where, remedy="add a column sigma, m")
+            raise InputError("this height has no sigma", file=path, field=row.where, remedy="add a column sigma (m)")
     return SpotHeights(
         ground=ground_transform(system, "EPSG:4979")(ground),
         sigmas=np.maximum([row.sigma_h or 0.0 for row in table.rows], _LEAST),
