@@ -82,9 +82,9 @@ def with_datum(
     held = _held(linear, sigmas, slow)
     of = f"sigma {_span(sigmas)} px in the image for each parameter ({len(held)} of {problem.size})"
     if trusted.any() and accuracies:
-        known = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
+        stated_m = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
         who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"
-        of += f"; {who} {_span(known)} m"
+        of += f"; {who} {_span(stated_m)} m"
     elif np.isfinite(stated).any():
         of += f"; not the accuracy of the metadata, because rays miss each other by {missed:.3g} px"
     return problem.with_pseudo(held), _why(control, by_ties, of)

@@ -338,7 +338,9 @@ def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) ->
     first = lines.index("Accuracy unknown: there are no check points")
     assert lines[first + 1].startswith("The images agree to 0.")
     assert "tests neither positions nor heights" in lines[first + 1]
-    assert lines[first + 2].startswith("No control points: heights and positions are as accurate as the start values")
+    assert lines[first + 2].startswith(
+        "No control points: heights and positions are as accurate as the delivered models"
+    )
     head = json.loads((tmp_path / "out" / "block_report.json").read_text())["headline"]
     assert (head["figure"], head["height"]) == ("Accuracy unknown", None)
     page = (tmp_path / "out" / "block_report.html").read_text()
