@@ -148,10 +148,9 @@ def adjust(
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
         if orthos is not None:
             under = [start.scene for start in starts.values()]
-            ground = gathered.heights or open_surface(surface, scenes[0], under=under)
-            adjusted = adjusted_scenes(starts, fit, plain, files)
-            options = scenes[0], surface, orthos
-            failed = make_orthos(adjusted, of_orthos, corrected(ground, fit), options, command, progress)
+            ground = corrected(gathered.heights or open_surface(surface, scenes[0], under=under), fit)
+            adjusted, options = adjusted_scenes(starts, fit, plain, files), (scenes[0], surface, orthos)
+            failed = make_orthos(adjusted, of_orthos, ground, options, command, progress)
             failure = failure or next(iter(failed.values()), None)
             files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text])

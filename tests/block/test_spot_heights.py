@@ -65,7 +65,7 @@ def test_they_tell_the_sigma_of_the_dem(tmp_path: Path) -> None:
 def test_spots_off_the_dem_are_refused(tmp_path: Path) -> None:
     block = fly(Chain(images=2, ties=40), 0)
     spots = SpotHeights(np.array([(10.0, 50.0, 100.0)]), np.array([0.3]), np.zeros(1), ("a",))
-    with pytest.raises(InputError, match="no height at any of the spot heights"):
+    with pytest.raises(InputError, match="no height at any spot height"):
         adjust(block.start, block.points, heights=DemHeights(dem(block, tmp_path / "dem.tif", 0), spots=spots))
 
 

@@ -43,6 +43,7 @@ WITHOUT = {
     ("display", "pip install"): "needs the network",
     ("exchange", "pip install"): "needs the network",
     ("ortho_measure", "pip install"): "needs the network",
+    ("points", "pip install"): "needs the network",
     ("report", "pip install"): "needs the network",
     ("commands", "ortho doctor --fetch-grids"): "needs the network",
     ("geodesy", "pyproj sync"): "needs the network",
