@@ -62,6 +62,22 @@ def test_they_tell_the_sigma_of_the_dem(tmp_path: Path) -> None:
     assert 1.4 < fit.heights.sigma_m < 3.0
 
 
+def test_sigmas_that_are_too_small_are_enlarged_at_the_spots_too(tmp_path: Path) -> None:
+    """Heights that are three times worse than stated do not fix the bias better than they can."""
+    block = fly(Chain(ties=400), 0)
+    surface = dem(block, tmp_path / "dem.tif", 0, white=6.0, bias=12.0)
+    spots = spots_of(block, 0.05, 0.3, np.random.default_rng(1))
+    stated, right = (
+        adjust(block.start, block.points, heights=DemHeights(surface.with_sigma(sigma), spots=spots)).heights
+        for sigma in (2.0, 6.0)
+    )
+    assert stated is not None
+    assert right is not None
+    assert stated.sigma_is == "enlarged"
+    assert stated.bias_sigma_m == pytest.approx(right.bias_sigma_m, rel=0.35)
+    assert abs(stated.bias_m - 12.0) < 4 * stated.bias_sigma_m
+
+
 def test_spots_off_the_dem_are_refused(tmp_path: Path) -> None:
     block = fly(Chain(images=2, ties=40), 0)
     spots = SpotHeights(np.array([(10.0, 50.0, 100.0)]), np.array([0.3]), np.zeros(1), ("a",))
