@@ -1,6 +1,7 @@
 """Write a page of each command into docs/commands, from what its help says: ``make docs``.
 
-The help says what an option does; `NEEDS` says when a person needs it. Options appear under the headings of `NEEDS`.
+The help says what an option does; `NEEDS` says when a person needs it, and `OTHERWISE` where a command differs. Options
+appear under the headings of `NEEDS`.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
     "Start here": {
         "output": "Always: it says where the results go.",
         "gcps": "You have points. Without points the model stays as delivered, and its accuracy is unknown.",
-        "points": "You give points of several images (`adjust`, `intersect`), or check heights (`dem-check`).",
-        "dem": "You make an ortho of anything but flat ground. `auto` downloads the Copernicus DEM.",
+        "points": "You have measured the same points in several images.",
+        "dem": "Points without heights take theirs from the DEM, and matching needs it in hilly ground.",
         "dry-run": "You want to check all inputs before anything is written.",
     },
     "Coordinates and heights": {
@@ -36,7 +37,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "height": "You have no DEM, and the ground is flat.",
         "dem-fill": "The DEM has holes or does not cover the scene, and you accept a substitute there.",
         "dem-source": "The cells of `--dem auto` are in your own folder or bucket.",
-        "dem-sigma": "The reported accuracy must include the DEM error, or ties must search further.",
+        "dem-sigma": "You know how accurate the heights are.",
         "dem-heights": "The DEM must help only to find ties, because it is wrong or much coarser than the images.",
         "dem-bias": "You know how far all heights of the DEM may be off together.",
         "dem-correlation": "You know that neighbouring heights of the DEM are off together, and over which distance.",
@@ -60,7 +61,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "significance": "You want another threshold than 5 %.",
         "params": "You want to adjust some parameters of a camera and keep the others.",
         "ridge": "A rational model has too many parameters, and the automatic weight does not suit you.",
-        "models": "`compare` must try only some models; `adjust` and `intersect` must start from saved models.",
+        "models": "An earlier run saved the models of the images as `_model.json`.",
         "units": "You want the table of `compare` in metres.",
         "ground-sigma": "The points file states no accuracy of the ground, and you know it.",
         "hold": "A block has no control, and you know how accurate its delivered orientation is.",
@@ -85,7 +86,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "sensor": "No sensor recognises the image, or two do.",
         "sensor-option": "A sensor needs a value that the files do not state.",
         "rpc": "Tag and side-car differ, or the RPC is elsewhere.",
-        "model": "An earlier run saved the model as `_model.json`; in `adjust`, you choose a model by name.",
+        "model": "An earlier run saved the model as `_model.json`.",
         "crop-offset": "The image is a crop of the image that the model belongs to.",
     },
     "The ortho": {
@@ -95,10 +96,10 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "align": "The extent must fit a grid of whole multiples of the resolution.",
         "like": "Pixels must match those of another raster.",
         "resampling": "Classes: `nearest`. A much coarser grid: `average`. Best appearance: `cubic`.",
-        "band": "You need only some bands, or another order; or `edge` must measure another band.",
+        "band": "You need only some bands, or another order.",
         "output-type": "Another program needs another pixel type.",
         "nodata": "Another program needs a nodata value and cannot read a mask.",
-        "format": "Another program cannot read a COG; in `export`, you choose the kinds of model file.",
+        "format": "Another program cannot read a COG.",
         "creation-option": "You want another compression or another layout.",
         "tolerance": "The warp may be less exact than 0.01 px, or must be more exact.",
         "engine": "You want to compare with the warper of GDAL, pixel by pixel.",
@@ -145,6 +146,51 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "verbose": "You want to see what the program does.",
         "quiet": "A script needs only warnings and errors.",
         "debug": "You report a bug.",
+    },
+}
+
+_SAVED = "You want to keep the result and its plots."
+_NAMED = "The default name does not suit you."
+_GROUND = "The ground coordinates are in another file than the image points."
+_CHOSEN = "The images have several models or none, and you choose one by name."
+#: By command: the options that are for something else there than `NEEDS` says.
+OTHERWISE: Mapping[str, Mapping[str, str]] = {
+    "adjust": {
+        "gcps": _GROUND,
+        "dem": "Ties must be found by matching, or neighbouring orthos must fit without control points.",
+        "dem-sigma": "You know how accurate the heights are: the heights of ties count accordingly.",
+        "reference": "Control points of all images come from an orthoimage of the same place.",
+        "model": _CHOSEN,
+    },
+    "compare": {"output": _SAVED, "models": "Only some models interest you."},
+    "dem-check": {"points": "Always: they are the heights that the DEM is compared with."},
+    "edge": {"output": _SAVED, "band": "The first band is not the one to measure."},
+    "export": {
+        "gcps": "The model must be adjusted to points before it is written.",
+        "dem": "You export grids of points with the heights of the ground, or you match a reference.",
+        "format": "You need other kinds of model files than the default ones.",
+    },
+    "init": {"output": _NAMED, "overwrite": "There is a pipeline file already, and you no longer need it."},
+    "intersect": {"gcps": _GROUND, "model": _CHOSEN, "output": "You want the ground points in a file."},
+    "match": {"dem": "Almost always: in hilly ground, matching fails without it."},
+    "measure": {
+        "output": _NAMED,
+        "gcps": "You have points already, and add more.",
+        "dem": "Reference and image must match in hilly ground, and points need heights.",
+        "reference": "You read the ground coordinates from an orthoimage that is shown beside the image.",
+    },
+    "rectify": {
+        "dem": "You make an ortho of anything but flat ground. `auto` downloads the Copernicus DEM.",
+        "dem-sigma": "The reported accuracy must include the DEM error.",
+    },
+    "register": {"reference": "Another image than the first one must stay in place."},
+    "run": {
+        "output": "The results go to object storage.",
+        "root": "The pipeline file names files outside its own folder, and you trust it.",
+    },
+    "ties": {
+        "dem": "Almost always: with it, matching finds ties in hilly ground.",
+        "dem-sigma": "The DEM may be more than 10 m off: the search for ties must then go further.",
     },
 }
 
@@ -196,8 +242,10 @@ def _tables(context: click.Context, level: int) -> Iterator[str]:
         if options:
             yield _table(("option", "what it does"), [_cells(one, context) for one in options.values()])
         return
+    otherwise = OTHERWISE.get(context.info_name or "", {})
     for heading, needs in NEEDS.items():
-        rows = [(*_cells(options.pop(name), context), need) for name, need in needs.items() if name in options]
+        here = {**needs, **{name: need for name, need in otherwise.items() if name in needs}}
+        rows = [(*_cells(options.pop(name), context), need) for name, need in here.items() if name in options]
         if rows:
             yield f"{'#' * level} {heading}"
             yield _table(("option", "what it does", "you need it when"), rows)

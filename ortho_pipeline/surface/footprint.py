@@ -149,7 +149,9 @@ class Footprint:
                     "give a DEM that covers the whole scene, or ",
                     choice,
                     ", nearest, or an ellipsoidal height in metres",
-                ),
+                )
+                if self.coverage
+                else "check the CRS of the DEM ('ortho info' shows it), or give a DEM of this place",
             )
         if self.coverage == 0.0 and surface.fill == "mask":
             raise CoverageError(

@@ -68,6 +68,12 @@ def test_the_pages_of_commands_say_of_each_option_when_one_needs_it():
         if isinstance(option, click.Option)
     }
     assert found == set(told)
+    by_command: dict[str, set[str]] = {}
+    for words, command in commands(cli):
+        names = {make_commands.long_name(option) for option in command.params if isinstance(option, click.Option)}
+        by_command.setdefault(words[-1], set()).update(names)
+    for command, needs in make_commands.OTHERWISE.items():
+        assert needs.keys() <= by_command[command], command
 
 
 def test_every_yes_of_ours_is_a_command_that_is_run():
