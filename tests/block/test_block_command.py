@@ -427,7 +427,7 @@ def test_geoid_heights_are_brought_to_the_ellipsoid(stereo: Stereo, tmp_path: Pa
         (("--model", "pushbroom"), "has no model 'pushbroom'"),
         (("--model", "affine3d", "--correction", "shift"), "takes no correction"),
         (("--model-crs", "utm"), "only for fitted models"),
-        (("--correction", "model"), "no adjustable parameters"),
+        (("--correction", "model"), "no parameters of its own"),
         (("--check", "every:0"), "not a selection of check points"),
     ],
 )
