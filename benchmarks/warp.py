@@ -41,8 +41,8 @@ from ortho_pipeline.models.rpc_box import RPC_TERMS
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp.engine import rectify
 from ortho_pipeline.warp.job import WarpJob
+from ortho_pipeline.warp.lattice_engine import rectify
 from ortho_pipeline.warp.quality.accuracy import Budget, write_accuracy
 from ortho_pipeline.warp.quality.hiding import Hiding
 from ortho_pipeline.warp.quality.sight import Sight
@@ -225,7 +225,7 @@ from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.exchange.rpc import rpc_of_dataset
-from ortho_pipeline.warp.engine import rectify
+from ortho_pipeline.warp.lattice_engine import rectify
 from ortho_pipeline.warp.job import WarpJob
 image, dem, out, step, *extent = sys.argv[1:]
 grid = Grid.of_extent(pyproj.CRS("EPSG:32735"), [float(value) for value in extent], (float(step), float(step)))

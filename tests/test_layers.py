@@ -366,6 +366,14 @@ def test_messages_name_options_by_their_fields() -> None:
             assert name in known, f"{where}: there is no option {group}.{name}"
 
 
+def test_the_page_on_where_to_change_what_names_files_that_exist() -> None:
+    page = (ROOT / "docs" / "engineering" / "where-to-change.md").read_text(encoding="utf-8")
+    paths = {path for path in re.findall(r"`([\w./]+/[\w.]*|[\w/]+/\w+\.\w+)`", page) if not path.startswith("/")}
+    assert len(paths) > 60
+    missing = [path for path in paths if not any((at / path).exists() for at in (ROOT, PACKAGE))]
+    assert missing == []
+
+
 def test_starting_a_command_loads_nothing_that_few_need() -> None:
     # Each of these takes as long as all the rest.
     heavy = (

@@ -44,7 +44,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp import engine as warp
+from ortho_pipeline.warp import lattice_engine as warp
 
 SEEDS = st.integers(0, 10_000)
 LONGITUDES = st.one_of(st.floats(-180, 180), st.sampled_from([-180.0, 179.99, -1e-9, 0.0, 180.0]))

@@ -98,7 +98,7 @@ def follow(root: Path) -> dict[str, Journey]:
         if event != "call" or not code.co_filename.startswith(package) or code.co_name.startswith("<"):
             return
         file = code.co_filename.removeprefix(package)
-        at["engine"] = at["engine"] or file == "warp/engine.py"
+        at["engine"] = at["engine"] or file == "warp/lattice_engine.py"
         for journey in journeys.values():
             if journey.within_engine == at["engine"] and (not journey.within_engine or file.startswith("warp/")):
                 journey.enter(frame, (file, getattr(code, "co_qualname", code.co_name)))

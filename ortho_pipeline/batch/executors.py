@@ -236,7 +236,7 @@ def start_worker(threads: int) -> None:
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     import ortho_pipeline.commands.rectification
-    import ortho_pipeline.warp.engine  # noqa: F401
+    import ortho_pipeline.warp.lattice_engine  # noqa: F401
 
 
 def _end_with(sentinel: int) -> None:

@@ -1,4 +1,4 @@
-"""All that the host calls: find the plugins, recognise a product, open it.
+"""Plugins: find them, recognise a product, open it.
 
 `ortho_pipeline.hookspecs` is the other side. Host and GDAL are loaded on first use, because the commands of packages
 are found without them.

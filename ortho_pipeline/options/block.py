@@ -21,7 +21,8 @@ class BlockOptions:
         PathLike | None,
         Option(
             "--points",
-            "Image points: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, or ODM gcp_list.txt.",
+            "Image points: CSV (id,image,col,row[,x,y,h,role,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt "
+            "or ASP .gcp.",
             "FILE",
         ),
     ] = None

@@ -33,14 +33,16 @@ from ortho_pipeline.points.rows import (
 class _Format(NamedTuple):
     """A format: its name, its reader, and how to recognise its files.
 
-    `known` takes the suffix, the first characters and the first line. `of_block` lists the tables of blocks that it can
-    hold. `wanted` is the remedy of errors that have no better one.
+    A file has this format if `known` says so of its first characters and its first line, or if it has one of the
+    `suffixes`. `of_block` lists the tables of blocks that it can hold. `wanted` is the remedy of errors that have no
+    better one.
     """
 
     name: str
     reader: Callable[..., Table]
     wanted: str
-    known: Callable[[str, str, str], object]
+    known: Callable[[str, str], object]
+    suffixes: tuple[str, ...] = ()
     of_block: tuple[ColumnRules, ...] = ()
 
 
@@ -50,50 +52,57 @@ _FORMATS = (
         "GeoJSON with 'ji'",
         read_geojson,
         "write a FeatureCollection of Points [lon, lat, height] with the property 'ji' = [column, row]",
-        lambda suffix, start, first: start.startswith(("{", "[")) or suffix in (".geojson", ".json"),
+        lambda start, first: start.startswith(("{", "[")),
+        (".geojson", ".json"),
         (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
     ),
     _Format(
         "QGIS .points",
         read_qgis,
         "write mapX,mapY,sourceX,sourceY,enable and so on, as the georeferencer of QGIS does",
-        lambda suffix, start, first: suffix == ".points" or re.match(r"(?i)mapX\s*,", first),
+        lambda start, first: re.match(r"(?i)mapX\s*,", first),
+        (".points",),
     ),
     _Format(
         "ENVI .pts",
         read_envi,
         "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
-        lambda suffix, start, first: suffix == ".pts" or start.startswith(";"),
+        lambda start, first: start.startswith(";"),
+        (".pts",),
     ),
     _Format(
         "ASP .gcp",
         read_asp,
         "write id lat lon height and three sigmas, then name column row and two sigmas of each image",
-        lambda suffix, start, first: suffix == ".gcp" or re.match(r"#\s*WKT\s*:", start),
+        lambda start, first: re.match(r"#\s*WKT\s*:", start),
+        (".gcp",),
         (OF_BLOCK,),
     ),
     _Format(
         "CSV/TSV (id,col,row,x,y,h,...)",
         read_csv,
         "write one point a line, its numbers under a header such as id,col,row,x,y,h",
-        lambda suffix, start, first: suffix in (".csv", ".tsv") or is_header(first),
+        lambda start, first: is_header(first),
+        (".csv", ".tsv"),
         (OF_BLOCK, OF_GROUND, OF_HEIGHTS),
     ),
     _Format(
         "ODM gcp_list.txt",
         read_odm,
         "write x y z column row image [label], under a line with the CRS",
-        lambda suffix, start, first: odm_crs(first) is not None,
-        (OF_BLOCK,),
+        lambda start, first: odm_crs(first) is not None,
+        of_block=(OF_BLOCK,),
     ),
     _Format(
         "ArcGIS link table",
         read_links,
         "write [id] from-x from-y to-x to-y",
-        lambda suffix, start, first: LINK_TABLE.match(first),
+        lambda start, first: LINK_TABLE.match(first),
     ),
 )
 _NAMES = ", ".join(kind.name for kind in _FORMATS)
+#: Suffixes of files of points. Those of ODM and ArcGIS are `.txt` and known by their content.
+SUFFIXES = (*(suffix for kind in _FORMATS for suffix in kind.suffixes), ".txt")
 
 
 @reads("see docs/formats.md for the formats of point files")
@@ -159,7 +168,7 @@ def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
     lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
     first = lines[0].strip() if lines else ""
     for kind in _FORMATS:
-        if kind.known(suffix, start, first):
+        if suffix in kind.suffixes or kind.known(start, first):
             return kind
     if re.search(r"\d", first) and re.fullmatch(r"[-+.,;\deE\s]+", first):
         raise InputError(

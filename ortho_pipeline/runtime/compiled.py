@@ -1,7 +1,7 @@
 """Functions that are compiled: kernels, made with the two decorators of this module.
 
 A kernel is compiled once per machine where a cache may be kept, in the memory of each process elsewhere; see
-`kernels.compiler`. numba is loaded when a kernel is first called.
+`runtime.compilation.compiler`. numba is loaded when a kernel is first called.
 """
 
 from __future__ import annotations

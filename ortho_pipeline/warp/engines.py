@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.warp import engine, gdal_engine
+from ortho_pipeline.warp import gdal_engine, lattice_engine
 from ortho_pipeline.warp.job import WarpJob, WarpRecord
 from ortho_pipeline.warp.quality.hiding import Hiding
 
@@ -22,14 +22,14 @@ class Engine(Protocol):
     """
 
     @property
-    def tile_maker(self) -> Callable[[WarpJob], engine.TileMaker] | None: ...
+    def tile_maker(self) -> Callable[[WarpJob], lattice_engine.TileMaker] | None: ...
 
     def rectify(self, job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         """Write an ortho; what the engine cannot do is an `InputError`."""
 
 
 #: Engines by the name on the command line.
-_ENGINES: dict[str, Engine] = {"ortho": engine, "gdal": gdal_engine}
+_ENGINES: dict[str, Engine] = {"ortho": lattice_engine, "gdal": gdal_engine}
 
 
 def engine_of(name: str) -> Engine:

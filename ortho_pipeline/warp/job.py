@@ -20,18 +20,18 @@ from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Resources, require_memory, startable_threads
 from ortho_pipeline.surface.base import Surface
-from ortho_pipeline.warp import kernels
+from ortho_pipeline.warp import resampling_kernel
 
 #: The stage of a job that makes pixels, for its progress.
 WARPING = "Warping"
 #: Kernels by the name on the command line, with the source pixels that each reads around the one that holds the point
 #: ('average': plus half of its box).
 KERNELS = {
-    "nearest": (kernels.NEAREST, 0),
-    "bilinear": (kernels.BILINEAR, 1),
-    "cubic": (kernels.CUBIC, 2),
-    "lanczos": (kernels.LANCZOS, 3),
-    "average": (kernels.AVERAGE, 1),
+    "nearest": (resampling_kernel.NEAREST, 0),
+    "bilinear": (resampling_kernel.BILINEAR, 1),
+    "cubic": (resampling_kernel.CUBIC, 2),
+    "lanczos": (resampling_kernel.LANCZOS, 3),
+    "average": (resampling_kernel.AVERAGE, 1),
 }
 #: What GDAL's warper takes for each pixel of an ortho whose image points are geolocation arrays: 1.4 GB for 13.7 Mpx.
 _ARRAYS_BYTES = 100

@@ -49,7 +49,7 @@ from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface, Window
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp import lattice_kernel
-from ortho_pipeline.warp.block_kernel import DemWindow, Lattice, heights_at
+from ortho_pipeline.warp.tile_kernel import DemWindow, Lattice, heights_at
 
 #: Side of a block in output pixels.
 BLOCK = 256

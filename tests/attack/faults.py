@@ -623,7 +623,7 @@ def load() -> None:
     import ortho_pipeline.commands.control.ties
     import ortho_pipeline.commands.mosaic.assembly
     import ortho_pipeline.commands.rectification
-    import ortho_pipeline.warp.engine  # noqa: F401
+    import ortho_pipeline.warp.lattice_engine  # noqa: F401
     from ortho_pipeline import host
 
     host.Host.discover()

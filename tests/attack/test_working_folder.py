@@ -33,7 +33,7 @@ PLANTED: dict[str, dict[str, str]] = {
     "this package": {"ortho_pipeline/__init__.py": _CODE, "ortho_pipeline/cli/__init__.py": _CODE},
     "plugins": {"evil-1.0.dist-info/entry_points.txt": "[ortho_pipeline]\nevil = evil\n", "evil.py": _CODE},
     "path files": {"evil.pth": "import os; open('EXECUTED', 'a')\n", "pyvenv.cfg": "home = .\n"},
-    "numba's caches": {"__pycache__/block_kernel.warp_block-1.py311.nbi": "cos\nsystem\n(S'touch EXECUTED'\ntR."},
+    "numba's caches": {"__pycache__/tile_kernel.warp_block-1.py311.nbi": "cos\nsystem\n(S'touch EXECUTED'\ntR."},
     "matplotlib": {"matplotlibrc": "backend: module://evil\n", ".config/matplotlib/matplotlibrc": "backend: agg\n"},
     "dask": {".config/dask/evil.yaml": "distributed: {worker: {preload: evil.py}}\n", "dask.yaml": "a: 1\n"},
     "pip": {"pip.conf": "[global]\nindex-url = http://127.0.0.1:1/\n", ".config/pip/pip.conf": "[global]\n"},

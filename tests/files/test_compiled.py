@@ -67,12 +67,12 @@ def test_a_command_runs_where_no_cache_can_be_written() -> None:
 def test_every_kernel_is_made_without_a_cache_and_computes_the_same() -> None:
     done = run(
         "import numpy as np\n"
-        "from ortho_pipeline.warp import block_kernel\n"
+        "from ortho_pipeline.warp import tile_kernel\n"
         "from ortho_pipeline.warp import lattice_kernel\n"
         "from ortho_pipeline.surface import ray_kernel\n"
         "out = np.empty((1, 1))\n"
-        "dem = block_kernel.DemWindow(np.array([[0.0, 4.0], [8.0, 12.0]]), 0, 0, False)\n"
-        "block_kernel.heights_at(np.array([[[0.5, 0.25]]]), dem, out)\n"
+        "dem = tile_kernel.DemWindow(np.array([[0.0, 4.0], [8.0, 12.0]]), 0, 0, False)\n"
+        "tile_kernel.heights_at(np.array([[[0.5, 0.25]]]), dem, out)\n"
         "print(out[0, 0])"
     )
     assert done.returncode == 0, done.stderr

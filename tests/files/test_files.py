@@ -62,7 +62,7 @@ def test_sha256(tmp_path):
 
 RECTIFY = """
 import resource, signal, sys
-from ortho_pipeline.warp import engine as warp
+from ortho_pipeline.warp import lattice_engine as warp
 from ortho_pipeline.warp.job import WarpJob
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.flat import FlatSurface

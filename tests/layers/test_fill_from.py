@@ -21,7 +21,7 @@ from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.writing import write_dem
-from ortho_pipeline.warp import engine
+from ortho_pipeline.warp import lattice_engine as engine
 from ortho_pipeline.warp.quality.hiding import Hiding
 
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (30, 150, 150, 162, 18.0)))

@@ -235,7 +235,7 @@ def test_the_error_is_that_of_the_transformer_at_the_ortho(tmp_path):
 
 def test_where_nothing_stands_for_the_model_the_remedy_is_our_engine(tmp_path, monkeypatch):
     monkeypatch.setattr(Transformer, "limit", -1.0)
-    with pytest.raises(InputError, match=r"RPC: .* px off; GEOLOC_ARRAY: ") as caught:
+    with pytest.raises(InputError, match=r"RPC: .* px error; GEOLOC_ARRAY: ") as caught:
         both(frame(k1=-0.05), FlatSurface(80.0), tmp_path)
     assert "`output.engine=ortho`" in str(caught.value.remedy)
     assert [path.name for path in tmp_path.iterdir() if "gdal" in path.name] == []

@@ -29,8 +29,8 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
-from ortho_pipeline.warp import engine as warp
-from ortho_pipeline.warp import kernels
+from ortho_pipeline.warp import lattice_engine as warp
+from ortho_pipeline.warp import resampling_kernel
 
 UTM = pyproj.CRS.from_epsg(32735)
 WIDTH, HEIGHT, GSD = 700, 620, 0.5
@@ -795,7 +795,7 @@ def test_pixels_whose_neighbours_are_all_valid_are_known(reach):
     valid = np.random.default_rng(reach).random((2, 60, 80)) > 0.004
     valid[:, 3, 70:] = False
     whole = np.empty(valid.shape[1:], dtype=bool)
-    kernels.find_whole(valid, reach, whole)
+    resampling_kernel.find_whole(valid, reach, whole)
     np.testing.assert_array_equal(whole, minimum_filter(valid.all(axis=0), 2 * reach + 1, mode="constant", cval=True))
     assert 0.1 < whole.mean() < 0.99
 

@@ -31,8 +31,8 @@ from ortho_pipeline.surface.base import Surface
 if TYPE_CHECKING:
     import xarray
 
-    from ortho_pipeline.warp.engine import TileMaker
     from ortho_pipeline.warp.job import WarpJob
+    from ortho_pipeline.warp.lattice_engine import TileMaker
 
 #: Options of files, and of other rasters than the ortho.
 _IDLE = ("accuracy_raster", "visibility", "angles", "stac", "fill_from")
@@ -97,8 +97,8 @@ def ortho_array(
 
 
 def _side(chunks: int | None) -> int:
-    from ortho_pipeline.warp.engine import TILE
     from ortho_pipeline.warp.lattice import BLOCK
+    from ortho_pipeline.warp.lattice_engine import TILE
 
     side = TILE if chunks is None else chunks
     if not isinstance(side, int) or side < BLOCK or side % BLOCK:

@@ -18,6 +18,7 @@ from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import read_points
+from ortho_pipeline.points.formats import SUFFIXES
 from ortho_pipeline.raster.source import open_dataset
 
 Kind = Literal["scene", "dem", "map image", "image", "points"]
@@ -43,7 +44,6 @@ IMAGES = (
 NO_DATUM = "no height datum declared"
 #: Those of them that hold pixels and nothing else: such a file that does not open is damaged.
 _PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img")
-POINTS = (".csv", ".geojson", ".points", ".pts", ".txt")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
 
@@ -129,7 +129,8 @@ def _looked_at(path: Path, folder: Path, options: SceneOptions) -> SurveyedFile 
     suffix, name = path.suffix.lower(), str(path.relative_to(folder))
     if suffix in IMAGES:
         return _image(path, name, options)
-    return _points(path, name) if suffix in POINTS else None
+    # JSON files are mostly reports and models.
+    return _points(path, name) if suffix in SUFFIXES and suffix != ".json" else None
 
 
 def _is_ours(path: Path) -> bool:

@@ -35,11 +35,11 @@ from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
-from ortho_pipeline.warp.block_kernel import DemWindow
 from ortho_pipeline.warp.quality import accuracy_kernel
 from ortho_pipeline.warp.quality.accuracy_kernel import Heights, Nodes
 from ortho_pipeline.warp.quality.error_ellipse import circular_error, circular_error_of_all, radii
 from ortho_pipeline.warp.quality.sight import Sight
+from ortho_pipeline.warp.tile_kernel import DemWindow
 
 #: Bands of the layer.
 BANDS = ("sigma_e", "sigma_n", "rho", "ce90")

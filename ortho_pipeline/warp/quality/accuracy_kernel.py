@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ortho_pipeline.runtime.compiled import compiled, inlined
-from ortho_pipeline.warp.block_kernel import DemWindow, dem_height_at
+from ortho_pipeline.warp.tile_kernel import DemWindow, dem_height_at
 
 #: Fields of a node: model (ee, nn, en), displacement (e, n), interpolation (ee, nn, en), image (column, row).
 _FIELDS = 10

@@ -14,7 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ortho_pipeline.runtime.compiled import compiled, inlined
-from ortho_pipeline.warp.kernels import Resampling, Scratch, SourceWindow, cubic_weights, row_inside, row_with_edges
+from ortho_pipeline.warp.resampling_kernel import (
+    Resampling,
+    Scratch,
+    SourceWindow,
+    cubic_weights,
+    row_inside,
+    row_with_edges,
+)
 
 #: From this many output pixels per DEM sample on, pixels are taken together that lie between the same samples.
 _RUN = 6.0

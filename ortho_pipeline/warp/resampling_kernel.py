@@ -1,7 +1,7 @@
 """Compiled resampling kernels: values of the source at image points of one row of output pixels.
 
 A new kernel is a number here, a function of a row, a case in `row_inside`, its case and `span` in `_edge_value`;
-then its name and reach in `engine`.
+then its name and reach in `job`.
 """
 
 from __future__ import annotations

@@ -34,11 +34,11 @@ from ortho_pipeline.raster.ortho import (
 )
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.runtime.process_limits import thread_pool
-from ortho_pipeline.warp import kernels
-from ortho_pipeline.warp.block_kernel import DemWindow, OutputWindow, warp_block
+from ortho_pipeline.warp import resampling_kernel
 from ortho_pipeline.warp.job import KERNELS, WARPING, WarpJob, WarpRecord
 from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, TileHeights, block_cells
 from ortho_pipeline.warp.quality.hiding import Hiding, Looked
+from ortho_pipeline.warp.tile_kernel import DemWindow, OutputWindow, warp_block
 
 #: Side of a tile, the piece of work of a thread, of few bands (`square_side`). What a tile is may not depend on memory
 #: or threads, which the order of blocks in a file would tell.
@@ -185,7 +185,9 @@ class TileMaker:
             averages=job.resampling == "average",
         )
         self.cubic_dem = job.dem_interpolation == "cubic"
-        self.resampling = kernels.Resampling(kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None)
+        self.resampling = resampling_kernel.Resampling(
+            kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None
+        )
         self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
@@ -268,24 +270,24 @@ class TileMaker:
                 self._warp_block(block, self._window(*window, block.reach), dem, tile.target(block, cell))
 
     def _warp_block(
-        self, block: OutputBlock, window: kernels.SourceWindow, dem: DemWindow, target: OutputWindow
+        self, block: OutputBlock, window: resampling_kernel.SourceWindow, dem: DemWindow, target: OutputWindow
     ) -> None:
         # An array that threads shared would have them wait for each other's counts of its references.
-        real = kernels.mixing(self.source.dtype)
+        real = resampling_kernel.mixing(self.source.dtype)
         resampling = self.resampling._replace(reach=block.reach, box=block.box, real=real)
         empty = target.first_row >= target.last_row or target.first_column >= target.last_column
         while not empty and warp_block(window, block.lattice, dem, resampling, target):
             window = self._wider(window, block.reach)
 
-    def _window(self, left: int, top: int, right: int, bottom: int, reach: int) -> kernels.SourceWindow:
+    def _window(self, left: int, top: int, right: int, bottom: int, reach: int) -> resampling_kernel.SourceWindow:
         source = self.source
         pixels = source.read(left, top, right - left, bottom - top)
         valid = source.read_valid(left, top, pixels)
         masked = valid is not None
         fully_valid = np.ones(pixels.shape[1:] if masked else (1, 1), dtype=bool)
         if valid is not None:
-            kernels.find_whole(valid, reach, fully_valid)
-        return kernels.SourceWindow(
+            resampling_kernel.find_whole(valid, reach, fully_valid)
+        return resampling_kernel.SourceWindow(
             pixels,
             np.ones((1, 1, 1), dtype=bool) if valid is None else valid,
             fully_valid,
@@ -296,7 +298,7 @@ class TileMaker:
             source.height,
         )
 
-    def _wider(self, window: kernels.SourceWindow, reach: int) -> kernels.SourceWindow:
+    def _wider(self, window: resampling_kernel.SourceWindow, reach: int) -> resampling_kernel.SourceWindow:
         """Return a window larger by 64 pixels all around (terrain between the nodes reached beyond this one)."""
         _, height, width = window.pixels.shape
         left, top = max(0, window.left - 64), max(0, window.top - 64)
