@@ -77,6 +77,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "sensor-option": "A sensor needs a value that the files do not state.",
         "rpc": "Tag and side-car differ, or the RPC is elsewhere.",
         "model": "An earlier run saved the model as `_model.json`; in `adjust`, you choose a model by name.",
+        "ortho": "The image is a finished ortho, such as Sentinel-2 or a national mosaic, and you treat it as a scene.",
         "crop-offset": "The image is a crop of the image that the model belongs to.",
     },
     "The ortho": {

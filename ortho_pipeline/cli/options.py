@@ -247,7 +247,7 @@ def _scenes(
     return scenes
 
 
-_OF_IMAGES = ("sensor", "sensor_options", "allow_network", "roots")
+_OF_IMAGES = ("sensor", "sensor_options", "ortho", "allow_network", "roots")
 _RPC_OF_EACH = "Which RPC: 'tag' or 'sidecar' of all images, or a file of one; may be repeated."
 _OFFSET_OF_EACH = "First pixel of an image in the one that its model belongs to, where it is a crop; may be repeated."
 #: All options of a scene, as `SceneOptions`.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline import host
+from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange import crop
@@ -42,10 +43,10 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
     """
     if isinstance(image, Scene):
         if dataclasses.replace(options, allow_network=False, roots=()) != SceneOptions():
-            raise InputError(
-                "this scene is open already", file=image, field="scene", remedy="give its path, or open it so"
-            )  # fmt: skip
+            raise InputError("this scene is open already", file=image, field="scene", remedy="give its path")
         return image
+    if options.ortho:
+        return open_ortho(image, options, only=False)
     if options.model is None:
         given: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
@@ -104,7 +105,9 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
     Scene
         Without models and of the sensor "points only" where no sensor recognises the image.
     """
-    asked = isinstance(image, Scene) or bool(options.model or options.rpc or options.sensor or options.sensor_options)
+    asked = isinstance(image, Scene) or bool(
+        options.model or options.rpc or options.sensor or options.sensor_options or options.ortho
+    )
     if needs_model or asked:
         return open_scene(image, options)
     plugins = host.Host.discover()

@@ -288,6 +288,8 @@ def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> In
     names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
     hint = f" (for images in general: {general})" if general else ""
+    on_map = dataset.GetProjection() and dataset.GetGeoTransform(can_return_null=True) is not None
+    finished = Text(", or if it is a finished ortho ", Setting("scene.ortho")) if on_map else Text("")
     return InputError(
         f"no sensor recognises it (installed: {names})",
         file=path,
@@ -296,5 +298,6 @@ def _not_one(found: list[Sensor], sensors: Iterable[Sensor], dataset: Any) -> In
             Setting("scene.sensor", "NAME"),
             f", which says what it needs{hint}, or give the RPC file with ",
             Setting("scene.rpc", "FILE"),
+            finished,
         ),
     )

@@ -44,6 +44,7 @@ class SceneOptions:
         Mapping[str, str],
         Option("--sensor-option", "Option of the sensor (see 'ortho sensors').", "K=V", kind="keys"),
     ] = field(default_factory=dict)
+    ortho: Annotated[bool, Option("--ortho", "An image that no sensor knows is a finished ortho.")] = False
     allow_network: Annotated[
         bool, Option("--allow-network", "Open URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
     ] = False
