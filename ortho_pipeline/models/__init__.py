@@ -12,16 +12,13 @@ from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.map_plane import MapPlane
 from ortho_pipeline.models.mosaicked import Cropped, Pieces
 from ortho_pipeline.models.orthos.map_grid import MapGrid
+from ortho_pipeline.models.orthos.smooth_field import SmoothField
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC, Rational
 from ortho_pipeline.models.rational_start import model_crs, start_model
 
-KINDS.update(
-    {
-        cls.kind: cls
-        for cls in (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapGrid, MapPlane, Pieces, Pushbroom)
-    }
-)
+_OWN = (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapGrid, MapPlane, Pieces, Pushbroom, SmoothField)
+KINDS.update({cls.kind: cls for cls in _OWN})
 
 
 def require_view(model: SensorModel) -> None:
@@ -55,6 +52,7 @@ __all__ = [
     "Pushbroom",
     "Rational",
     "SensorModel",
+    "SmoothField",
     "families",
     "family_of",
     "model_crs",

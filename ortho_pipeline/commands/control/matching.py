@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -228,6 +228,7 @@ def match_scene(
     opened: SceneOptions = SceneOptions(),
     threads: int | None = None,
     memory: int = OutputOptions.memory,
+    intensity: Intensity | None = None,
 ) -> Matched:
     """Match a scene with the references of the options.
 
@@ -241,6 +242,8 @@ def match_scene(
         As many as there are processors without; no result depends on it.
     memory : int
         Bytes.
+    intensity : Intensity, optional
+        Of the scene, where some of its pixels or bands take no part.
 
     Raises
     ------
@@ -251,6 +254,7 @@ def match_scene(
     from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 
     view, references = open_reference_views(scene, options, surface, opened)
+    view = view if intensity is None else replace(view, intensity=intensity)
     pixel = metres_per_pixel(view)
     search = search_of(scene, options, pixel)
     settings = MatchSettings(
