@@ -271,6 +271,7 @@ COMMANDS = [
     "match a.tif --reference b.tif --height 5 -o c.csv", "ties a.tif b.tif --height 5 -o c.csv",
     "measure a.tif --reference b.tif --height 5 -o c.geojson", "mosaic a.tif b.tif -o c.tif",
     "cache list",
+    "verify a.tif --reference b.tif", "align a.tif --reference b.tif -o out",
 ]  # fmt: skip
 
 

@@ -93,6 +93,18 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
             "ortho register red.tif nir.tif -o bands",
         ),
     ),
+    "verify": (
+        (
+            "How accurate is an ortho, relative to another one of the place?",
+            "ortho verify out/scene_ortho.tif --reference reference.tif -o verified",
+        ),
+    ),
+    "align": (
+        (
+            "Move an ortho onto another one, resampled once:",
+            "ortho align out/scene_ortho.tif --reference reference.tif -o aligned",
+        ),
+    ),
     "dem-check": (("A DEM against surveyed heights:", "ortho dem-check dem.tif --points gcps.csv"),),
     "sensors": (("Which products are recognised?", "ortho sensors"),),
     "models": (("Which families can be fitted to points, and from how many on?", "ortho models"),),

@@ -39,6 +39,7 @@ _LOOK: dict[str, str] = {
         Setting("match.reference_bands"),
         "): visible bands for a panchromatic scene.",
     ),
+    "ortho-tested-in-part": "Give references that show the rest, or do not use the ortho there.",
     "left-out": "Look at it in the image and at its coordinates: measure it again, or delete it from the file of "
     "points.",
     "more-left-out": "So many gross errors mean that the points or the model do not suit the scene: see both.",
@@ -84,6 +85,8 @@ _KNOW: dict[str, str] = {
     "unstated-sigma": "State how accurate the points are, if you know it.",
     "parameters-removed": "Nothing: what the points could not tell was left out.",
     "relative-to-reference": "Measure some check points if the position has to be right, and not only consistent.",
+    "ortho-relative": Text("State how accurate the reference is (", Setting("match.reference_sigma"), ")."),
+    "ortho-local-changes": "Look at the places that the file of displacements marks as local.",
     "dem-sigma-by-default": "State how accurate the DEM is, if you know it.",
     "correction-by-matches": "Nothing, unless you know which correction suits the sensor.",
     "dem-datum-overridden": "Make sure that the datum stated is the right one.",
