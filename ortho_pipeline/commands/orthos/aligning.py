@@ -158,7 +158,7 @@ def _choose(measured: MeasuredOrtho, wanted: str | None, bending: float) -> Chos
     cells = tested_cells(kept)
     affine = affine_of(kept)
     left = kept.image - affine.ground_to_image(kept.ground)
-    field = DisplacementField.of(kept.image, left, kept.sigma)
+    field = DisplacementField.of(kept.image, left, kept.sigma, kept.chip)
     if wanted is None:
         wanted, reason = _justified(kept, field, cells)
     else:
@@ -197,7 +197,7 @@ def _of_most(measured: MeasuredOrtho) -> NDArray[np.bool_]:
     length = np.hypot(*left.T)
     limit = max(_SIGMAS * 0.85 * float(np.median(length)), _LEAST * measured.matched.matches.factor)
     apart = length > limit
-    field = DisplacementField.of(measured.image, left, measured.sigma)
+    field = DisplacementField.of(measured.image, left, measured.sigma, measured.chip)
     # Where many are apart, the displacement as a whole bends: then only single matches are of no use.
     return ~field.local if apart.mean() > _MOST else ~(apart | field.local)
 

@@ -105,7 +105,7 @@ def height_dependence(measured: MeasuredOrtho, surface: Surface) -> HeightDepend
     sigmas = np.zeros(2)
     for _ in range(2):
         # The field without what heights explain says how the rest is correlated.
-        field = DisplacementField.of(place, value - about[:, None] * rates, measured.sigma[good])
+        field = DisplacementField.of(place, value - about[:, None] * rates, measured.sigma[good], measured.chip)
         rates, sigmas, level = field.regressed(place, value, about)
     rate = float(np.hypot(*rates))
     unit = rates / max(rate, 1e-12)

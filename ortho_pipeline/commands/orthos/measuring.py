@@ -20,6 +20,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.imaging.matching.chip_search import SIDE
 from ortho_pipeline.models import ImageCorrection, SensorModel, SmoothField
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.models.orthos.smooth_field import bending_of
@@ -90,9 +91,14 @@ class MeasuredOrtho:
         """Columns and rows."""
         return self.scene.width, self.scene.height
 
+    @property
+    def chip(self) -> float:
+        """Side (px) of the chips that were matched."""
+        return float(SIDE * self.matched.matches.factor)
+
     def field(self) -> DisplacementField:
         """Return the field of the displacement (m) over the image (px)."""
-        return DisplacementField.of(self.image, self.displacement, self.sigma)
+        return DisplacementField.of(self.image, self.displacement, self.sigma, self.chip)
 
     @property
     def residuals(self) -> Array:
@@ -220,7 +226,7 @@ def following(measured: MeasuredOrtho) -> SensorModel | None:
     """Return the map grid with the correction that the matches follow; None if it is no better than the last one."""
     affine = affine_of(measured)
     left = measured.image - affine.ground_to_image(measured.ground)
-    field = DisplacementField.of(measured.image, left, measured.sigma)
+    field = DisplacementField.of(measured.image, left, measured.sigma, measured.chip)
     bends = np.abs(field.mean(measured.image)).max()
     reason = measured.matched.matches.reason
     contradict = float((reason == "contradicts").sum()) / max(1, int((reason != "hidden").sum()))

@@ -30,6 +30,8 @@ _CELLS, _REACH = 16, 2.0
 _LEVELS = 0.025, 0.975
 #: Fewer points say nothing of a covariance.
 FEWEST_POINTS = 4
+#: Pixels of a coarser reference in one of a chip.
+_COARSER = 1.5
 #: Part of what roughness that is not certain adds to CE90, by which its interval is wider downwards.
 _ROUGH = 1.0
 #: Draws of means and covariances of points, and of errors for each.
@@ -149,8 +151,10 @@ class Verified:
         cells = tested_cells(measured)
         draws = field.draws(cells, seed)
         # What all matches err alike no residual shows.
-        alike = np.maximum(float(measured.matched.matches.points.sigma_alike.max(initial=0.0)), MATCHED_ALIKE)
-        common = np.random.default_rng([seed, 1]).normal(0.0, alike * measured.pixel, (len(draws), 1, 2))
+        matches = measured.matched.matches
+        bands = float(matches.points.sigma_alike.max(initial=0.0)) * measured.pixel
+        alike = max(bands, MATCHED_ALIKE * measured.pixel * (_COARSER * matches.factor if matches.factor > 1 else 1.0))
+        common = np.random.default_rng([seed, 1]).normal(0.0, alike, (len(draws), 1, 2))
         return cls(measured, field, cells, draws + common, len(cells) / _CELLS**2)
 
     @property

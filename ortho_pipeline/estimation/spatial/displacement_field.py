@@ -1,9 +1,10 @@
 r"""The displacement field of an image, from displacements that matches measured: what it is likely to be everywhere.
 
 Along each of two axes, :math:`d(x) = F(x) b + s(x) + n`: an affine trend, a smooth field with
-:math:`\mathrm{cov}(s_i, s_j) = \sigma_s^2 k(d_{ij} / c)`, and noise of single matches with the variances
-:math:`\sigma_n^2 w_i`. What neighbouring matches share is the field, and counts as displacement; what they do not share
-is the noise of matching, and does not.
+:math:`\mathrm{cov}(s_i, s_j) = \sigma_s^2 k(d_{ij} / c)`, and noise of matching with the variances
+:math:`\sigma_n^2 w_i`. Chips that overlap share the noise of the pixels that they share: their noise is correlated by
+the part of its area that one shares with the other. So what neighbours err together within a chip is noise and makes
+intervals wider; what they share over longer distances is the field, and counts as displacement.
 
 How smooth the field is, over which range and how strong, nobody knows beforehand. So all the functions that
 `shared_errors` tries are weighted by their restricted likelihood, with the same weights beforehand, and fields are
@@ -37,6 +38,8 @@ _RANGES, _RATIOS, _LARGEST = 8, 16, 1e4
 _FUNCTIONS, _OF_EACH = 50, 20
 #: A displacement is local if it is so many sigmas from what its neighbours say.
 _LOCAL = 4.5
+#: Part of the noise that chips share where they overlap; the rest is of each alone.
+_OF_PIXELS = 0.9
 #: Rounds of leaving local displacements out.
 _ROUNDS = 3
 
@@ -68,6 +71,8 @@ class DisplacementField:
         Where displacements were measured, in units of the extent, and the displacements.
     weight : (n,)
         Variances of the noise, relative to each other.
+    side : float
+        Of chips, in units of the extent.
     scale : float
         Units of `place` in the extent.
     origin : (2,)
@@ -78,13 +83,14 @@ class DisplacementField:
     place: Array
     value: Array
     weight: Array
+    side: float
     scale: float
     origin: Array
     local: NDArray[np.bool_]
     axes: tuple[_Axis, _Axis]
 
     @classmethod
-    def of(cls, place: Array, value: Array, sigma: Array | None = None) -> DisplacementField:
+    def of(cls, place: Array, value: Array, sigma: Array | None = None, side: float = 0.0) -> DisplacementField:
         """Return the field of displacements.
 
         Parameters
@@ -93,6 +99,8 @@ class DisplacementField:
             In any units.
         sigma : (N,), optional
             Standard deviations of the displacements, relative to each other.
+        side : float
+            Side of the chips that were matched, in units of places: those that overlap share noise.
 
         Raises
         ------
@@ -109,8 +117,8 @@ class DisplacementField:
             index = np.flatnonzero(~local)
             if len(index) > _MOST_POINTS:
                 index = np.sort(np.random.default_rng(0).permutation(index)[:_MOST_POINTS])
-            axes = _likely(inside[index], value[index], weight[index])
-            found = cls(inside[index], value[index], weight[index], scale, origin, local, axes)
+            axes = _likely(inside[index], value[index], weight[index], side / scale)
+            found = cls(inside[index], value[index], weight[index], side / scale, scale, origin, local, axes)
             if turn == _ROUNDS - 1:
                 break
             apart = found._apart()
@@ -185,7 +193,8 @@ class DisplacementField:
         rates, sigmas, level = np.zeros(2), np.zeros(2), np.zeros(2)
         for axis, one in enumerate(self.axes):
             kernel, ratio = one.best
-            variance = np.eye(len(inside)) + one.ratios[ratio] * self._covariance(one.kernels[kernel], inside, inside)
+            noise = _noise(inside, np.ones(len(inside)), self.side)
+            variance = noise + one.ratios[ratio] * self._covariance(one.kernels[kernel], inside, inside)
             root = linalg.cholesky(variance, lower=True)
             columns = np.column_stack([_design(inside), along, value[:, axis]])
             white = linalg.solve_triangular(root, columns, lower=True)
@@ -208,6 +217,7 @@ class DisplacementField:
                     self.place[~out],
                     self.value[~out],
                     self.weight[~out],
+                    self.side,
                     self.scale,
                     self.origin,
                     self.local,
@@ -229,7 +239,7 @@ class DisplacementField:
 
     def _whitened(self, kernel: tuple[int, float], ratio: float) -> Callable[[Array], Array]:
         """Return the function that whitens columns."""
-        variance = np.diag(self.weight) + ratio * self._covariance(kernel, self.place, self.place)
+        variance = _noise(self.place, self.weight, self.side) + ratio * self._covariance(kernel, self.place, self.place)
         root = linalg.cholesky(variance, lower=True)
         return lambda columns: np.asarray(linalg.solve_triangular(root, columns, lower=True))
 
@@ -270,14 +280,26 @@ def _design(place: Array) -> Array:
     return np.column_stack([np.ones(len(place)), place])
 
 
-def _likely(place: Array, value: Array, weight: Array) -> tuple[_Axis, _Axis]:
+def _noise(place: Array, weight: Array, side: float) -> Array:
+    """Return the covariance ``(n, n)`` of the noise: chips share that of the pixels that they share."""
+    root = np.sqrt(weight)
+    if not side > 0:
+        return np.diag(weight)
+    apart = np.abs(place[:, None] - place) / side
+    shared = np.maximum(1.0 - apart, 0.0).prod(axis=2)
+    return np.asarray((_OF_PIXELS * shared + (1.0 - _OF_PIXELS) * np.eye(len(place))) * root[:, None] * root)
+
+
+def _likely(place: Array, value: Array, weight: Array, side: float) -> tuple[_Axis, _Axis]:
     """Return how likely each function is along both axes, by restricted likelihood."""
     count = len(place)
     if count > _TRIED:
         some = np.sort(np.random.default_rng(0).permutation(count)[:_TRIED])
         place, value, weight = place[some], value[some], weight[some]
-    root = np.sqrt(weight)
-    design, seen = _design(place) / root[:, None], value / root[:, None]
+    inverse = linalg.solve_triangular(
+        linalg.cholesky(_noise(place, weight, side), lower=True), np.eye(len(place)), lower=True
+    )
+    design, seen = inverse @ _design(place), inverse @ value
     basis = np.linalg.qr(design, mode="complete")[0][:, design.shape[1] :]
     left, freedom = basis.T @ seen, len(seen) - design.shape[1]
     whole = np.maximum((left**2).sum(axis=0) / freedom, 1e-300)
@@ -288,7 +310,7 @@ def _likely(place: Array, value: Array, weight: Array) -> tuple[_Axis, _Axis]:
     kernels = tuple((family, float(length)) for family in range(len(FAMILIES)) for length in ranges)
     logs, squares = (np.empty((2, len(kernels), len(ratios))) for _ in range(2))
     for number, (family, length) in enumerate(kernels):
-        kernel = FAMILIES[family](distance / length) / (root[:, None] * root)
+        kernel = inverse @ FAMILIES[family](distance / length) @ inverse.T
         values, vectors = np.linalg.eigh(basis.T @ kernel @ basis)
         each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
         squares[:, number] = ((vectors.T @ left) ** 2).T @ (1.0 / each).T
