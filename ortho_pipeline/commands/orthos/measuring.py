@@ -6,6 +6,7 @@ the smooth field that the first ones say, so that what bends is not taken for a 
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -96,8 +97,9 @@ class MeasuredOrtho:
         """Side (px) of the chips that were matched."""
         return float(SIDE * self.matched.matches.factor)
 
+    @functools.cached_property
     def field(self) -> DisplacementField:
-        """Return the field of the displacement (m) over the image (px)."""
+        """The field of the displacement (m) over the image (px)."""
         return DisplacementField.of(self.image, self.displacement, self.sigma, self.chip)
 
     @property

@@ -147,7 +147,7 @@ class Verified:
     @classmethod
     def of(cls, measured: MeasuredOrtho, seed: int = 0) -> Verified:
         """Return what the matches of an ortho say of its displacement."""
-        field = measured.field()
+        field = measured.field
         cells = tested_cells(measured)
         draws = field.draws(cells, seed)
         # What all matches err alike no residual shows.

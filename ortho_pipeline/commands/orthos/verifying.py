@@ -355,7 +355,7 @@ def _written(
 def displacements(measured: MeasuredOrtho) -> dict[str, Any]:
     """Return the matches of an ortho as GeoJSON, with the displacement of each."""
     lon_lat = ground_transform(measured.scene.model.crs, "EPSG:4979")(measured.ground)[:, :2]
-    local = measured.field().local
+    local = measured.field.local
     rows = zip(
         measured.matched.matches.points.ids, lon_lat.tolist(), measured.image.tolist(), measured.displacement.tolist(),
         measured.sigma.tolist(), local.tolist(), strict=True,
