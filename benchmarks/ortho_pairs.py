@@ -49,10 +49,8 @@ def trial(seed: int, *, elsewhere: bool) -> dict[str, Any]:
         except OrthoError as error:
             return row | {"refused": error.message, "seconds": time.monotonic() - begin}
         row["seconds"] = time.monotonic() - begin
-    # A metre of the map is not quite one of the ground.
-    scale = document["pixel_m"] / pair.ortho.gsd
     cells = np.array([one["image"] for one in document["field"]["cells"]])
-    true = pair.displacement()(cells) * scale
+    true = pair.on_the_ground(cells)
     found = np.array([[one["east_m"], one["north_m"]] for one in document["field"]["cells"]])
     length = np.hypot(*true.T)
     truth = {

@@ -78,10 +78,9 @@ def ours(ortho: Path, reference: Path, pair: Pair) -> dict[str, Any]:
     document = json.loads(done.stdout)
     if "error" in document:
         return {"failed": document["error"]["message"]}
-    scale = document["pixel_m"] / pair.ortho.gsd
     cells = np.array([one["image"] for one in document["field"]["cells"]])
     found = np.array([[one["east_m"], one["north_m"]] for one in document["field"]["cells"]])
-    left = pair.displacement()(cells) * scale - found
+    left = pair.on_the_ground(cells) - found
     return {
         "points": document["matches"]["kept"], "tried": document["matches"]["tried"], "seconds": seconds,
         "mb": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3,

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from osgeo import gdal, osr
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.distortion import east_north_from_map
+
 Array = NDArray[np.float64]
 UTM, CORNER = 32735, (512_000.0, 7_123_000.0)
 KINDS = ("country", "woods", "town", "real")
@@ -103,6 +106,15 @@ class Pair:
             return found + inside[:, None] * np.array(self.patch)
 
         return at
+
+    def on_the_ground(self, image: Array) -> Array:
+        """Return the displacement ``(n, 2)`` at places in the ortho, metres to true east and north.
+
+        North of the map is not true north, and its metre not one of the ground: 40 px off by 0.04 px matter here.
+        """
+        middle = np.array([[CORNER[0] + self.extent / 2, CORNER[1] - self.extent / 2, 0.0]])
+        turned = east_north_from_map(parse_crs(f"EPSG:{UTM}"), middle)[0]
+        return self.displacement()(image) @ turned.T
 
     def write(self, folder: Path) -> tuple[Path, Path]:
         """Write ortho and reference."""

@@ -39,6 +39,8 @@ _AGAIN, _NEAR, _NEAR_CHIPS = 2, 6.0, 3.0
 _BENDS, _CONTRADICT = 0.3, 0.1
 #: Knots of the field along the longer side, at most; and what it may change per pixel.
 _KNOTS, _BENDING = 14, 0.02
+#: Matches share noise up to so many sides of their chips: calibrated with drawn pairs.
+_SHARED = 1.5
 #: Bands that are tried alone where all of them together do not match.
 _SINGLE = 3
 
@@ -94,8 +96,8 @@ class MeasuredOrtho:
 
     @property
     def chip(self) -> float:
-        """Side (px) of the chips that were matched."""
-        return float(SIDE * self.matched.matches.factor)
+        """Distance (px) up to which matches share noise: the side of their chips, and what images are blurred by."""
+        return _SHARED * SIDE * self.matched.matches.factor
 
     @functools.cached_property
     def field(self) -> DisplacementField:

@@ -22,7 +22,6 @@ from scipy import spatial, stats
 
 from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
-from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
 from ortho_pipeline.models.base import Array
 
 #: Cells per side in which the field is looked at; a cell is tested if a match is nearer than so many of their spacings.
@@ -30,8 +29,8 @@ _CELLS, _REACH = 16, 2.0
 _LEVELS = 0.025, 0.975
 #: Fewer points say nothing of a covariance.
 FEWEST_POINTS = 4
-#: Pixels of a coarser reference in one of a chip.
-_COARSER = 1.5
+#: What all matches of an ortho err alike (px of the coarser image, per axis), and such pixels in one of a chip.
+_ALIKE, _COARSER = 0.005, 1.5
 #: Part of what roughness that is not certain adds to CE90, by which its interval is wider downwards.
 _ROUGH = 1.0
 #: Draws of means and covariances of points, and of errors for each.
@@ -153,7 +152,7 @@ class Verified:
         # What all matches err alike no residual shows.
         matches = measured.matched.matches
         bands = float(matches.points.sigma_alike.max(initial=0.0)) * measured.pixel
-        alike = max(bands, MATCHED_ALIKE * measured.pixel * (_COARSER * matches.factor if matches.factor > 1 else 1.0))
+        alike = max(bands, _ALIKE * measured.pixel * _COARSER * matches.factor)
         common = np.random.default_rng([seed, 1]).normal(0.0, alike, (len(draws), 1, 2))
         return cls(measured, field, cells, draws + common, len(cells) / _CELLS**2)
 
