@@ -1,4 +1,4 @@
-"""AROSICS on the same drawn pairs as `ortho verify`: what remains displaced, what is claimed, time and memory.
+"""AROSICS on the same drawn pairs as `ortho verify`: what remains displaced, and the time.
 
     python -m venv peers && peers/bin/pip install arosics     # an environment of its own
     python benchmarks/ortho_peers.py --arosics peers/bin/python --seeds 0:20 --out peers.jsonl
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -27,7 +26,7 @@ from pairs import Pair, drawn  # noqa: E402
 
 #: Runs in the environment of AROSICS; prints tie points (metres) as JSON.
 AROSICS = """
-import json, resource, sys, time
+import json, sys, time
 from arosics import COREG_LOCAL
 reference, ortho, step, shift = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 begin = time.monotonic()
@@ -37,8 +36,7 @@ table = made.CoRegPoints_table
 good = table[(table.ABS_SHIFT > -9999) & (table.OUTLIER == False)]
 print("RESULT" + json.dumps({
     "image": good[["X_IM", "Y_IM"]].values.tolist(), "metres": good[["X_SHIFT_M", "Y_SHIFT_M"]].values.tolist(),
-    "tried": len(table), "seconds": time.monotonic() - begin,
-    "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3}))
+    "tried": len(table), "seconds": time.monotonic() - begin}))
 """
 
 
@@ -59,7 +57,7 @@ def arosics(python: Path, ortho: Path, reference: Path, pair: Pair) -> dict[str,
     # Its shifts correct the ortho: the opposite of the displacement.
     left = pair.displacement()(image + 0.5) + metres
     return {
-        "points": len(image), "tried": found["tried"], "seconds": found["seconds"], "mb": found["mb"],
+        "points": len(image), "tried": found["tried"], "seconds": found["seconds"],
         "bias": float(np.hypot(*left.mean(axis=0))) / coarse,
         "median": float(np.median(np.hypot(*left.T))) / coarse,
     }  # fmt: skip
@@ -83,7 +81,6 @@ def ours(ortho: Path, reference: Path, pair: Pair) -> dict[str, Any]:
     left = pair.on_the_ground(cells) - found
     return {
         "points": document["matches"]["kept"], "tried": document["matches"]["tried"], "seconds": seconds,
-        "mb": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e3,
         "bias": float(np.hypot(*left.mean(axis=0))) / coarse,
         "median": float(np.median(np.hypot(*left.T))) / coarse,
     }  # fmt: skip
