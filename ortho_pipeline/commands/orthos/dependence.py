@@ -184,7 +184,7 @@ def causes_of(
     ):
         text = (
             f"the displacement bends over the ortho by {size_m(rest)} (RMS), which no shift, rotation or scale "
-            "explains: wrong heights, or a sensor model that was not adjusted; `--dem` shows whether heights do"
+            "explains: wrong heights, or a sensor model that was not adjusted; a DEM shows whether heights do"
         )
         found.append(Cause("smooth", text))
     return found

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options.texts import Setting, Text
 
 _FORM = re.compile(
     r"\s*(?:(?P<of>relative|absolute|points)\.)?(?P<name>bias|rmse|ce90)\s*<=?\s*(?P<limit>[0-9.eE+-]+)\s*(?P<unit>m|px)?\s*"
@@ -69,7 +70,13 @@ class Requirement:
             raise InputError(
                 f"the requirement {self.text!r} asks for {self.of} accuracy, which is not known",
                 field="require",
-                remedy="give points (--gcps), or state the accuracy of the reference (--reference-sigma)",
+                remedy=Text(
+                    "give points (",
+                    Setting("points.gcps"),
+                    "), or state the accuracy of the reference (",
+                    Setting("match.reference_sigma"),
+                    ")",
+                ),  # fmt: skip
             )
         estimate = part[self.name]
         return {
