@@ -76,7 +76,7 @@ class Requirement:
                     "), or state the accuracy of the reference (",
                     Setting("match.reference_sigma"),
                     ")",
-                ),  # fmt: skip
+                ),
             )
         estimate = part[self.name]
         return {
