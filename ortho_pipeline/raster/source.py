@@ -1,7 +1,6 @@
 """Rasters that are read: what may be opened, grids, and windows of pixels.
 
-Files are opened through the `gate`: by a list of drivers, and with every file that they lead to seen before. One
-`gdal.Dataset` is used by one thread only; `RasterSource` opens one per thread.
+The `gate` opens files by a list of drivers and checks linked files. `RasterSource` opens one dataset per thread.
 """
 
 from __future__ import annotations
