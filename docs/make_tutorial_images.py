@@ -326,6 +326,7 @@ def save(figure: plt.Figure, path: Path) -> None:
 FIGURES: dict[str, dict[str, Callable[[Path], None]]] = {
     "first-ortho.md": {"first-residuals.jpg": first_residuals, "first-ortho.jpg": first_ortho},
     "without-control.md": {"matches.jpg": matches, "reference-off.jpg": reference_off},
+    "is-my-ortho-right.md": {},
     "which-model.md": {"compared.png": compared},
     "stereo-and-blocks.md": {"block.png": network, "heights.png": heights},
     "sensor-of-your-own.md": {"panoramic.png": panoramic},

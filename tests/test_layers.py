@@ -99,6 +99,7 @@ GDAL_MODULES |= {
     "surface.writing",
     "exchange.rpc",
     "exchange.gcp",
+    "exchange.moved_grid",
     "exchange.export",
     "imaging.band_stack",
     "warp.mosaic.writing",

@@ -249,7 +249,7 @@ def _scenes(
     return scenes
 
 
-_OF_IMAGES = ("sensor", "sensor_options", "allow_network", "roots")
+_OF_IMAGES = ("sensor", "sensor_options", "ortho", "allow_network", "roots")
 _RPC_OF_EACH = "Which RPC to use: 'tag' or 'sidecar' for all images, or a file for one. May be repeated."
 _OFFSET_OF_EACH = "If an image is a crop: position of its first pixel in the full image. May be repeated."
 #: All options of a scene, as `SceneOptions`.

@@ -27,6 +27,7 @@ FAILED, CORRECTABLE, INTERRUPTED = 1, 2, 130
 GROUPS = {
     "Make orthos": {
         "rectify": ("scene.rectifying", "Make the ortho of IMAGE, with its accuracy report."),
+        "align": ("orthos", "Align a finished ORTHO with an orthoimage."),
         "mosaic": ("batch", "Combine ORTHOs on one grid into one raster."),
         "export": ("scene.rectifying", "Write the model of IMAGE for other programs."),
         "register": ("scene.bands", "Align the bands of separate cameras in one image."),
@@ -43,6 +44,7 @@ GROUPS = {
     },
     "Inspect": {
         "info": ("survey.first_use", "Describe an image, a DEM, an ortho or a folder."),
+        "verify": ("orthos", "Measure how accurate a finished ORTHO is."),
         "dem-check": ("scene.heights", "Compare a DEM with check heights."),
         "edge": ("scene.bands", "Measure how sharp IMAGE is, from straight edges."),
         "report": ("scene.rectifying", "Write the plots of a report as pictures."),
@@ -249,7 +251,8 @@ def _begin() -> None:
 def cli(ctx: click.Context) -> None:
     """Orthorectify satellite images and report how accurate the result is.
 
-    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done, 130 interrupted.
+    Exit codes: 0 done, 1 failed, 2 you can correct it (the message says how), 3 partly done, 4 a
+    requirement is not met ('ortho verify'), 130 interrupted.
     """
     if ctx.invoked_subcommand is None:
         from ortho_pipeline.cli.survey.first_use import print_steps

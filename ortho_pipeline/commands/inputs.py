@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline import host
+from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
@@ -49,6 +50,8 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
                 remedy="give its path, or open it with these options",
             )
         return image
+    if options.ortho:
+        return open_ortho(image, options, only=False)
     if options.model is None:
         sensor_options: dict[str, Any] = dict(options.sensor_options)
         if options.rpc is not None:
@@ -126,7 +129,7 @@ def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_mo
         Without models and of the sensor "points only" where no sensor recognises the image.
     """
     has_options = isinstance(image, Scene) or bool(
-        options.model or options.rpc or options.sensor or options.sensor_options
+        options.model or options.rpc or options.sensor or options.sensor_options or options.ortho
     )
     if needs_model or has_options:
         return open_scene(image, options)

@@ -292,6 +292,8 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
     names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
     hint = f" (general ones: {general})" if general else ""
+    on_map = dataset.GetProjection() and dataset.GetGeoTransform(can_return_null=True) is not None
+    finished = Text("; for a finished ortho add ", Setting("scene.ortho")) if on_map else Text("")
     return InputError(
         f"no sensor recognises this image (installed: {names})",
         file=path,
@@ -300,5 +302,6 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
             Setting("scene.sensor", "NAME"),
             f"{hint}; its error message then says what is missing. Or give an RPC file with ",
             Setting("scene.rpc", "FILE"),
+            finished,
         ),
     )

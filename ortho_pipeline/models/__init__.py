@@ -11,13 +11,14 @@ from ortho_pipeline.models.families import Family, families, family_of
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.map_plane import MapPlane
 from ortho_pipeline.models.mosaicked import Cropped, Pieces
+from ortho_pipeline.models.orthos.map_grid import MapGrid
+from ortho_pipeline.models.orthos.smooth_field import SmoothField
 from ortho_pipeline.models.pushbroom.scanner import Pushbroom
 from ortho_pipeline.models.rational import RPC, Rational
 from ortho_pipeline.models.rational_start import model_crs, start_model
 
-KINDS.update(
-    {cls.kind: cls for cls in (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapPlane, Pieces, Pushbroom)}
-)
+_OWN = (RPC, Rational, ImageCorrection, Cropped, FrameCamera, MapGrid, MapPlane, Pieces, Pushbroom, SmoothField)
+KINDS.update({cls.kind: cls for cls in _OWN})
 
 
 def require_view(model: SensorModel) -> None:
@@ -49,11 +50,13 @@ __all__ = [
     "Family",
     "FrameCamera",
     "ImageCorrection",
+    "MapGrid",
     "MapPlane",
     "Pieces",
     "Pushbroom",
     "Rational",
     "SensorModel",
+    "SmoothField",
     "families",
     "family_of",
     "model_crs",

@@ -46,6 +46,7 @@ class SceneOptions:
         Mapping[str, str],
         Option("--sensor-option", "Option of the sensor; 'ortho sensors' lists them.", "K=V", kind="keys"),
     ] = field(default_factory=dict)
+    ortho: Annotated[bool, Option("--ortho", "If no sensor recognises the image, open it as a finished ortho.")] = False
     allow_network: Annotated[
         bool, Option("--allow-network", "Allow URLs (http, https, s3, gs, az) and /vsi paths.", in_file=False)
     ] = False

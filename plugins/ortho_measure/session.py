@@ -18,8 +18,9 @@ from ortho_measure.proposals import proposal_of
 from ortho_measure.solution import LiveAdjustment, figures, solve
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.crops import open_by_evidence
-from ortho_pipeline.commands.control.matching import open_reference_views, search_of
+from ortho_pipeline.commands.control.matching import open_reference_views
 from ortho_pipeline.commands.control.points import read_control, with_heights
+from ortho_pipeline.commands.control.search import search_of
 from ortho_pipeline.commands.fitting import compare
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request

@@ -27,8 +27,10 @@ from ortho_pipeline import commands, open_dem, open_scene
 from ortho_pipeline.batch.plan import plan
 from ortho_pipeline.batch.runner import run as run_pipeline
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options import OutputOptions, PointOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.opening import gate
 from ortho_pipeline.raster.source import RasterSource, open_dataset, open_pixels
 
@@ -407,6 +409,21 @@ def _fit(printed: Printed, folder: Path) -> None:
     image, gcps = str(SAMPLE / "scene.tif"), str(SAMPLE / "gcps.csv")
     remedy = refused(commands.compare, image, PointOptions(gcps=gcps, prune=True))
     assert "RMSE" in printed.paste(remedy, image, "--gcps", gcps, "--prune")
+
+
+@case("commands", "ortho rectify")
+def _raw(printed: Printed, folder: Path) -> None:
+    reference = MatchOptions(reference=[SAMPLE / "reference.tif"])
+    printed.paste(refused(verify, SAMPLE / "scene.tif", match=reference), DEM=str(SAMPLE / "dem.tif"))
+    assert (folder / "out" / "scene_ortho.tif").exists()
+
+
+@case("commands", "gdal_edit.py -a_srs")
+def _ortho(printed: Printed, folder: Path) -> None:
+    path = tiff(folder / "ortho.tif", GREY)
+    reference = MatchOptions(reference=[SAMPLE / "reference.tif"])
+    printed.paste(refused(verify, path, match=reference), CODE="32636", **BOX)
+    assert open_ortho(path, SceneOptions()).model.map_crs
 
 
 # -- the command line ------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from scenes import UTM, Case, Setting, View, write_raster
 
 import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.commands.control.search import search_of
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
 

@@ -15,7 +15,7 @@ from trials import run, to_refuse, tried
 
 import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.control.matching import rotation_of
+from ortho_pipeline.commands.control.search import rotation_of
 from ortho_pipeline.imaging.turns import orientations, renderings
 
 #: Little relief: an affine correction of the image takes a rotation up but for the relief that it turns.

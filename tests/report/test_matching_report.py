@@ -17,7 +17,8 @@ from ortho_studies.simulation.scanner import LineScanner, simulate_points
 from ortho_studies.simulation.terrain import Terrain
 from osgeo import gdal
 
-from ortho_pipeline.commands.control.matching import Matched, Search
+from ortho_pipeline.commands.control.matching import Matched
+from ortho_pipeline.commands.control.search import Search
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching import REASONS, Matches

@@ -93,6 +93,18 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
             "ortho register red.tif nir.tif -o bands",
         ),
     ),
+    "verify": (
+        (
+            "Measure the accuracy of an ortho relative to another ortho:",
+            "ortho verify out/scene_ortho.tif --reference reference.tif -o verified",
+        ),
+    ),
+    "align": (
+        (
+            "Move an ortho onto another ortho, with one resampling:",
+            "ortho align out/scene_ortho.tif --reference reference.tif -o aligned",
+        ),
+    ),
     "dem-check": (("Compare a DEM with surveyed heights:", "ortho dem-check dem.tif --points gcps.csv"),),
     "sensors": (("List the supported products:", "ortho sensors"),),
     "models": (("List the models, with the number of points that each needs:", "ortho models"),),

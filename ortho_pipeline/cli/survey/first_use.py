@@ -102,6 +102,7 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
         "Pixel": "{:.6g} x {:.6g} ".format(*document["pixel"]) + document["unit"],
         "Extent": " ".join(f"{value:.10g}" for value in document["extent"]),
         "Use it as": f"{option} {document['image']}" + (" --dem-vertical DATUM" * (dem and not document["vertical"])),
+        **({} if dem else {"Check it": f"ortho verify {document['image']} --reference REFERENCE -o out"}),
     }
     for name, value in lines.items():
         say(f"{name:<10} {value}")

@@ -1,4 +1,4 @@
-"""Matching in a command: opens the scene and its references, chooses the search radius, and records the result."""
+"""Matching in a command: opens the scene and its references, and records the result."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ortho_pipeline.commands.control.search import Search, default_search, rotation_of, search_of
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
@@ -42,12 +43,6 @@ if TYPE_CHECKING:
     # What matches takes a while to load, and few commands match.
     from ortho_pipeline.imaging.matching import Matches, Reference, SceneView
 
-#: Search radius (m) for a model of unknown accuracy, and its limit as a share of the scene's shorter side.
-DEFAULT_SEARCH, _PART = 100.0, 0.25
-#: Search radius in sigmas that a scene states, and its lower limit in pixels.
-_SIGMAS, _LEAST = 3.0, 8.0
-#: Largest rotation (degrees) of a pose that only metadata give.
-POSE_DEG = 5.0
 #: A reference that covers a smaller share of a scene gives a notice.
 _COVERS = 0.5
 #: A reference was probably made from the scene itself if the median correlation of chips is this high and the matches
@@ -55,24 +50,6 @@ _COVERS = 0.5
 _SAME, _EXACT = 0.97, 0.01
 #: Fields of the image in which matches are counted hold about so many that were tried; at most so many per side.
 _PER_FIELD, _FIELDS = 5, 10
-
-
-@dataclass(frozen=True)
-class Search:
-    """The search radius for a scene, and its source.
-
-    Parameters
-    ----------
-    distance : float
-        Metres on the ground.
-    source : str
-    known : bool
-        Whether the user or the scene states it.
-    """
-
-    distance: float
-    source: str
-    known: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +207,7 @@ def match_scene(
     opened: SceneOptions = SceneOptions(),
     threads: int | None = None,
     memory: int = OutputOptions.memory,
+    intensity: Intensity | None = None,
 ) -> Matched:
     """Match a scene with the references of the options.
 
@@ -246,6 +224,8 @@ def match_scene(
         What may be opened.
     threads, memory : int
         Default: as many threads as processors; memory in bytes. No result depends on them.
+    intensity : Intensity, optional
+        Replaces the intensity of the scene, to leave out pixels or bands.
 
     Raises
     ------
@@ -256,6 +236,7 @@ def match_scene(
     from ortho_pipeline.imaging.matching.targets import metres_per_pixel
 
     view, references = open_reference_views(scene, options, surface, opened)
+    view = view if intensity is None else replace(view, intensity=intensity)
     pixel = metres_per_pixel(view)
     search = search_of(scene, options, pixel)
     settings = MatchSettings(
@@ -271,7 +252,7 @@ def match_scene(
         matches = match(view, references, settings)
     paths = tuple(reference.path for reference in references)
     notices = [
-        *_default_search(search),
+        *default_search(search),
         *_made_of_scene(scene, references, matches),
         *_partial(matches),
         *_bands_apart(matches),
@@ -332,65 +313,6 @@ def _of_references() -> Iterator[None]:
 
 
 # -- how far to search -----------------------------------------------------------------------------------------------
-
-
-def search_of(scene: Scene, options: MatchOptions, pixel: float) -> Search:
-    """Return the search radius (m): of the user, from the accuracy that the scene states, or a default.
-
-    Parameters
-    ----------
-    pixel : float
-        Size (m) of a pixel on the ground.
-    """
-    if options.search is not None:
-        least = 2.0 * pixel  # as far as chips are moved in any case
-        return Search(options.search, "as requested") if options.search >= least else Search(least, "two pixels")
-    stated = _stated(scene, pixel)
-    if stated is not None:
-        sigma, source = stated
-        return Search(max(_SIGMAS * sigma, _LEAST * pixel), f"{_SIGMAS:.0f} times {metres(sigma)}, {source}")
-    part = _PART * min(scene.width, scene.height) * pixel
-    if part < DEFAULT_SEARCH:
-        return Search(part, f"default, as the scene states no accuracy; {_PART:.0%} of its side", known=False)
-    return Search(DEFAULT_SEARCH, "default, as the scene states no accuracy", known=False)
-
-
-def rotation_of(scene: Scene, options: MatchOptions) -> float:
-    """Return the largest rotation (degrees) of the model: of the user, or `POSE_DEG` if it is a pose.
-
-    An RPC comes from an adjusted pose, so no rotation is assumed.
-    """
-    if options.search_rotation is not None:
-        return options.search_rotation
-    return POSE_DEG if set(scene.model.param_names) & set(scene.priors) else 0.0
-
-
-def _stated(scene: Scene, pixel: float) -> tuple[float, str] | None:
-    """Return the standard deviation (m) of a scene's model and its source; None if it is not stated."""
-    model = scene.model
-    sigma = model.stated_accuracy
-    if sigma is not None:
-        return sigma, "the errors that the RPC states (ERR_BIAS, ERR_RAND)"
-    if scene.accuracy is not None:
-        return scene.accuracy * math.sqrt(2), "the accuracy in the metadata"
-    names = model.param_names
-    known = {name: prior.sigma for name, prior in scene.priors.items() if math.isfinite(prior.sigma)}
-    if names and set(names) <= set(known):
-        centre = model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), model.reference_height)
-        spread = model.param_partials(centre)[0] * np.array([known[name] for name in names])
-        if np.isfinite(spread).all():
-            return float(np.linalg.norm(spread)) * pixel, "the sigmas of the parameters in the metadata"
-    return None
-
-
-def _default_search(search: Search) -> list[Notice]:
-    if search.known:
-        return []
-    text = Text(
-        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change this with ",
-        Setting("match.search"),
-    )
-    return [Notice("search-by-default", text, search_m=search.distance)]
 
 
 def _partial(matches: Matches) -> list[Notice]:

@@ -17,7 +17,7 @@ from ortho_pipeline.block.points import BlockPoints, shape_of
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of
 from ortho_pipeline.commands.control.crops import settled_options
-from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.commands.control.search import search_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolving import on_surface

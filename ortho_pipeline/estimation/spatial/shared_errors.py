@@ -47,7 +47,7 @@ _HEAP = 0.005
 #: (1 + x) e^-x is 1/e there.
 _MATERN = 2.1461932206
 #: Correlations by distance over range, 1/e at 1: exponential, Matern of order 3/2, Gaussian.
-_FAMILIES: tuple[Callable[[Array], Array], ...] = (
+FAMILIES: tuple[Callable[[Array], Array], ...] = (
     lambda x: np.exp(-x),
     lambda x: (1.0 + _MATERN * x) * np.exp(-_MATERN * x),
     lambda x: np.exp(-(x**2)),
@@ -212,7 +212,7 @@ class Neighbours:
         left = means @ residuals
         left = left - explained @ (explained.T @ left)
         # The axes with the largest difference of errors shared over the middle range.
-        near = means @ _FAMILIES[1](distance / ranges[_RANGES // 2]) @ means.T
+        near = means @ FAMILIES[1](distance / ranges[_RANGES // 2]) @ means.T
         axes = np.linalg.eigh(left.T @ near @ left)[1].T[::-1]
         inside = np.einsum("np,nik->pik", span, np.einsum("ij,njk->nik", axes, design))
         return cls(distance, ranges, span, means, explained, left @ axes.T, inside, total / n)
@@ -222,7 +222,7 @@ class Neighbours:
         freedom = self.explained.shape[0] - self.explained.shape[1]
         ratios = np.geomspace(1.0 / len(self.span), _LARGEST, _RATIOS)
         logs, scales, inner = [], [], []
-        for family in _FAMILIES:
+        for family in FAMILIES:
             for distance in self.ranges:
                 kernel = family(self.distance / distance)
                 inner.append(self.span.T @ kernel @ self.span)
@@ -250,7 +250,7 @@ class Neighbours:
             own = noise[axis] + shared[:, axis].sum() - variance
             excess += self.weight * own * rows.T @ rows + self.weight**2 * rows.T @ between @ rows
         share = shared / np.maximum(shared.sum(axis=0), 1e-300)
-        mean = np.exp(share.T @ np.log(np.tile(self.ranges, len(_FAMILIES))))
+        mean = np.exp(share.T @ np.log(np.tile(self.ranges, len(FAMILIES))))
         return excess, {"noise": np.sqrt(noise), "shared": np.sqrt(shared.sum(axis=0)), "range_px": mean}
 
 

@@ -25,8 +25,8 @@ from ortho_pipeline.surface.base import Surface
 SAMPLES = 32
 #: Pixels of a chip are smaller by this factor than those of a coarser target.
 _FINER = 1.5
-#: Resolutions of scene and target differ by at most this factor.
-_RATIO = 8.0
+#: Resolutions of scene and target differ by at most this factor: 10, and what a map projection changes.
+_RATIO = 10.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +275,7 @@ def chip_factor(view: SceneView, targets: Sequence[Target], shown: Array) -> int
             f"a pixel of {os.path.basename(view.intensity.source.path)} is {ratio:.3g} pixels of {first.called}",
             file=first.path,
             field=first.field,
-            remedy=f"match images whose resolutions differ by at most {_RATIO:.0f} times",
+            remedy=f"match images whose resolutions differ by at most {int(_RATIO)} times",
         )
     # Averaged to the pixels of a target half as fine, a real scene was off by half a pixel; in its own pixels by a
     # twentieth. An enlarged scene needs two by two: its single pixels would show noise as structure.

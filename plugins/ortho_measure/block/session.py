@@ -24,7 +24,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
 from ortho_pipeline.commands.control.block_points import observed, read_points, settled_scenes
-from ortho_pipeline.commands.control.matching import search_of
+from ortho_pipeline.commands.control.search import search_of
 from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
 from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
 from ortho_pipeline.commands.resolved.request import Request

@@ -1,0 +1,314 @@
+"""`ortho align`: move a finished ortho onto references, with one resampling."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from ortho_pipeline.commands.inputs import check_paths
+from ortho_pipeline.commands.orthos.masks import ClassMask
+from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, affine_of, measure_ortho, smooth_field
+from ortho_pipeline.commands.orthos.statistics import tested_cells
+from ortho_pipeline.commands.orthos.verifying import displacements, document_of
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.results import Result, to_store
+from ortho_pipeline.commands.scene_fit import by_matches
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
+from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
+from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
+from ortho_pipeline.files import together, write_json
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.imaging.matching.matcher import held_out
+from ortho_pipeline.models import ImageCorrection, MapGrid, SensorModel, SmoothField
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.raster.caching.block_cache import cache_restored
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
+from ortho_pipeline.report.orthos.page import write_page
+from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread
+from ortho_pipeline.surface.flat import FlatSurface
+
+#: The corrections, from simple to flexible.
+CORRECTIONS = ("shift", "affine", "field")
+#: How much the displacement may change per pixel.
+BENDING = 0.02
+#: A field is justified if it predicts held-out matches better: by this part of the variance, at this chance, and if it
+#: bends by so many pixels (RMS).
+_BETTER, _CHANCE, _BENDS = 0.2, 1e-3, 0.05
+#: Matches count as of a local change if they are so many sigmas, and so many px, from what most say.
+_SIGMAS, _LEAST, _MOST = 4.0, 0.5, 0.25
+
+
+class Chosen(NamedTuple):
+    """The correction that the matches justify, and why."""
+
+    kind: str
+    model: SensorModel
+    shift: Array
+    reason: str
+
+
+@to_store(folder="align")
+@one_blas_thread()
+@cache_restored()
+def align(
+    ortho: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    match: MatchOptions,
+    scene: SceneOptions = SceneOptions(),
+    output: OutputOptions = OutputOptions(resampling="cubic"),
+    masks: Sequence[str | os.PathLike[str]] = (),
+    band: int | None = None,
+    correction: str | None = None,
+    bending: float = BENDING,
+    resample: bool = True,
+    progress: Progress | None = None,
+) -> Result:
+    """Move a finished ortho onto references, with one resampling on its own grid.
+
+    Parameters
+    ----------
+    correction : {'shift', 'affine', 'field'}, optional
+        Kind of correction. Default: what the matches justify.
+    bending : float
+        Largest change of a field's displacement per pixel.
+    resample : bool
+        If False, keep the pixels and move the map grid: a VRT, or a copy with the format GTiff. Only for a shift.
+
+    Raises
+    ------
+    InputError
+        If the image is not an ortho, options contradict each other, or matching fails.
+    """
+    _refuse_contradictions(match, correction, bending, resample)
+    hidden = [ClassMask.parse(text) for text in masks]
+    measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
+    before = document_of(measured, match)
+    chosen = _choose(measured, "shift" if not resample else correction, bending)
+    stem = Path(ortho).stem
+    as_vrt = not resample and output.format != "GTiff"
+    files = {"ortho": Path(folder) / f"{stem}_aligned{'.vrt' if as_vrt else '.tif'}"}
+    for name, ending in (("model", "_aligned_model.json"), ("json", "_align.json"), ("html", "_align.html"),
+                         ("displacements", "_displacements.geojson")):  # fmt: skip
+        files[name] = Path(folder) / f"{stem}{ending}"
+    check_paths(files, Request(ortho, scene, match=match, output=output))
+    # The ortho gets its name first: what is left is measured in it.
+    if resample:
+        _resampled(measured, chosen, files["ortho"], output, scene, progress)
+    else:
+        dataset = open_dataset(ortho, **scene.access)
+        moved = moved_geotransform(_grid_of(measured).geotransform, chosen.shift)
+        write_moved(dataset, moved, files["ortho"])
+    document = _after(files["ortho"], measured, match, scene, output, band) | {"before": before["relative"]}
+    document["correction"] = _described(chosen)
+    document["resampled"] = resample
+    with together(folder, stem):
+        write_json(files["json"], document)
+        write_json(files["displacements"], displacements(measured))
+        size = measured.size
+        write_model_file(SavedModel(chosen.model, measured.scene.sensor, str(ortho), size, {}), files["model"])
+        write_page(
+            document, files["html"], files["ortho"], scene.access | {"roots": (Path(ortho).parent, *scene.roots)}
+        )
+    return Result(files, document, _summary(document, before))
+
+
+def _refuse_contradictions(match: MatchOptions, correction: str | None, bending: float, resample: bool) -> None:
+    if not match.reference:
+        raise InputError(
+            "no reference to align the ortho with",
+            field="match.reference",
+            remedy=Text("give an orthoimage of the same place with ", Setting("match.reference", "FILE")),
+        )
+    if correction not in (None, *CORRECTIONS):
+        raise InputError(
+            f"unknown correction {correction!r}",
+            field="correction",
+            remedy=f"choose one of: {', '.join(CORRECTIONS)}",
+        )
+    if not resample and correction not in (None, "shift"):
+        raise InputError(
+            "only a shift can be corrected without resampling", field="correction", remedy="choose shift, or resample"
+        )
+    if not 0 < bending <= 0.2:
+        raise InputError(
+            f"the bending must be above 0 and at most 0.2 px per pixel, not {bending:g}",
+            field="bending",
+            remedy="give 0.02",
+        )
+
+
+# -- which correction ------------------------------------------------------------------------------------------------
+
+
+def _choose(measured: MeasuredOrtho, wanted: str | None, bending: float) -> Chosen:
+    """Return the correction that is wanted, or the one that the matches justify."""
+    most = _of_most(measured)
+    kept = _selected(measured, most)
+    cells = tested_cells(kept)
+    affine = affine_of(kept)
+    left = kept.image - affine.ground_to_image(kept.ground)
+    field = DisplacementField.of(kept.image, left, kept.sigma, kept.chip)
+    if wanted is None:
+        wanted, reason = _justified(kept, field, cells)
+    else:
+        reason = "as requested"
+    # Of the whole displacement, in px, what an area of the ortho has in the mean, whatever the places of matches.
+    whole = affine.ground_to_image(_unmoved(kept, cells)) - cells + field.mean(cells)
+    shift = np.median(whole, axis=0) if wanted != "shift" else _middle(whole)
+    origin = (measured.size[0] / 2, measured.size[1] / 2)
+    if wanted == "shift":
+        coefficients = np.array([shift[0], 0.0, 0.0, shift[1], 0.0, 0.0])
+        return Chosen("shift", ImageCorrection(kept.scene.model, "shift", origin, coefficients), shift, reason)
+    if wanted == "affine":
+        return Chosen("affine", affine, shift, reason)
+    return Chosen("field", smooth_field(affine, field, measured.size, bending), shift, reason)
+
+
+def _unmoved(measured: MeasuredOrtho, cells: Array) -> Array:
+    """Return the ground that the map grid puts at cells."""
+    return measured.scene.model.image_to_ground(cells, 0.0)
+
+
+def _middle(values: Array) -> Array:
+    """Return the mean ``(2,)`` of values in which large deviations count little."""
+    middle = np.median(values, axis=0)
+    for _ in range(20):
+        length = np.hypot(*(values - middle).T)
+        scale = max(2.0 * float(np.median(length)), 1e-9)
+        weight = np.minimum(1.0, scale / np.maximum(length, 1e-12))[:, None]
+        middle = (weight * values).sum(axis=0) / weight.sum()
+    return np.asarray(middle)
+
+
+def _of_most(measured: MeasuredOrtho) -> NDArray[np.bool_]:
+    """Tell which matches ``(n,)`` move with most others; a landslide or a harvest does not."""
+    left = measured.image - affine_of(measured).ground_to_image(measured.ground)
+    length = np.hypot(*left.T)
+    limit = max(_SIGMAS * 0.85 * float(np.median(length)), _LEAST * measured.matched.matches.factor)
+    apart = length > limit
+    field = DisplacementField.of(measured.image, left, measured.sigma, measured.chip)
+    # Where many are apart, the displacement as a whole bends: then only single matches are of no use.
+    return ~field.local if apart.mean() > _MOST else ~(apart | field.local)
+
+
+def _selected(measured: MeasuredOrtho, index: NDArray[np.bool_]) -> MeasuredOrtho:
+    return dataclasses.replace(
+        measured,
+        image=measured.image[index],
+        ground=measured.ground[index],
+        displacement=measured.displacement[index],
+        sigma=measured.sigma[index],
+    )
+
+
+def _justified(kept: MeasuredOrtho, field: DisplacementField, cells: Array) -> tuple[str, str]:
+    """Return the correction with the fewest parameters that predicts held-out matches as well as any other."""
+    groups, _ = held_out(field.origin + field.place * field.scale)
+    with_field, without = field.held_out(groups)
+    chance = float(stats.ttest_rel(with_field, without, alternative="less").pvalue) if len(without) > 2 else 1.0
+    better = 1.0 - float(with_field.sum() / max(without.sum(), 1e-300))
+    bends = float(np.sqrt((field.mean(cells) ** 2).sum(axis=1).mean()))
+    if chance < _CHANCE and better > _BETTER and bends > _BENDS:
+        return "field", f"a smooth field reduces the variance of held-out matches by {better:.0%}"
+    points = kept.matched.matches.points
+    inside = np.isin(np.round(points.image, 6).view("c16").ravel(), np.round(kept.image, 6).view("c16").ravel())
+    correction, _ = by_matches(kept.scene, points.select(inside))
+    if correction == "shift":
+        return "shift", "rotation, scale and bending are not significant"
+    return "affine", "rotation or scale is significant; bending is not"
+
+
+# -- pixels ----------------------------------------------------------------------------------------------------------
+
+
+def _grid_of(measured: MeasuredOrtho) -> MapGrid:
+    model = measured.scene.model
+    assert isinstance(model, MapGrid)
+    return model
+
+
+def _output_grid(measured: MeasuredOrtho) -> Grid:
+    """Return the grid of the ortho; of one that is not north-up, a north-up grid about it with its pixel size."""
+    model, size = _grid_of(measured), measured.size
+    left, dx, skew, top, other, dy = model.geotransform
+    crs = parse_crs(model.map_crs)
+    if skew == other == 0 and dx > 0 > dy:
+        return Grid(crs, left, top, dx, -dy, *size)
+    low, high = model.corners[:, :2].min(axis=0), model.corners[:, :2].max(axis=0)
+    return Grid.of_extent(crs, (*low, *high), (float(np.hypot(dx, other)), float(np.hypot(skew, dy))))
+
+
+def _resampled(
+    measured: MeasuredOrtho,
+    chosen: Chosen,
+    path: Path,
+    output: OutputOptions,
+    scene: SceneOptions,
+    progress: Progress | None,
+) -> None:
+    from ortho_pipeline.warp.engines import engine_of
+    from ortho_pipeline.warp.job import WarpJob
+
+    source = RasterSource(measured.scene.path, **scene.access)
+    profile = Profile.of(source, output.dtype, output.nodata)
+    own = source.dataset.GetMetadata() or {}
+    kept = {key: value for key, value in own.items() if not key.startswith(("AREA_OR_POINT", "STATISTICS_"))}
+    resampling = "nearest" if source.palette else output.resampling
+    job = WarpJob(
+        chosen.model, source, FlatSurface(0.0), _output_grid(measured), resampling, "bilinear", output.tolerance,
+        Resources(output.memory, output.threads, progress), output.format, dict(output.creation_options),
+        dataclasses.replace(profile, metadata={**profile.metadata, **kept}),
+    )  # fmt: skip
+    engine_of("ortho").rectify(job, path)
+
+
+def _after(
+    path: Path,
+    measured: MeasuredOrtho,
+    match: MatchOptions,
+    scene: SceneOptions,
+    output: OutputOptions,
+    band: int | None,
+) -> dict[str, Any]:
+    """Return the document of the aligned ortho, measured in its own pixels."""
+    opened = dataclasses.replace(scene, roots=(Path(measured.scene.path).parent, *scene.roots))
+    # What is left is small.
+    again = dataclasses.replace(match, search=min(match.search or np.inf, 30.0 * measured.pixel), search_rotation=None)
+    found = measure_ortho(path, again, scene=opened, band=band or measured.band, output=output)
+    return document_of(found, match)
+
+
+def _described(chosen: Chosen) -> dict[str, Any]:
+    inner = chosen.model.model if isinstance(chosen.model, SmoothField) else chosen.model
+    assert isinstance(inner, ImageCorrection)
+    return {
+        "kind": chosen.kind,
+        "reason": chosen.reason,
+        "shift_px": chosen.shift.tolist(),
+        "coefficients": inner.coefficients.tolist(),
+        "bending_px_per_px": chosen.model.bending if isinstance(chosen.model, SmoothField) else 0.0,
+    }
+
+
+def _summary(document: Mapping[str, Any], before: Mapping[str, Any]) -> str:
+    correction = document["correction"]
+    called = {"shift": "a shift", "affine": "an affine transformation", "field": "a smooth field"}
+    lines = [f"Corrected by {called[correction['kind']]}: {correction['reason']}"]
+    for title, found in (("Before", before["relative"]), ("After", document["relative"])):
+        numbers = ", ".join(
+            f"{name} {found[f'{key}_m']['value']:.2f} m" for key, name in (("ce90", "CE90"), ("bias", "bias"))
+        )
+        lines.append(f"{title}: {numbers}, relative to the reference")
+    return "\n".join(lines)

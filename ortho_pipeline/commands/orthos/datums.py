@@ -1,0 +1,59 @@
+"""Find a geodetic datum whose difference from the datum of an ortho explains its shift."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pyproj
+from pyproj import aoi, transformer
+from pyproj.database import query_crs_info
+from pyproj.enums import PJType
+
+from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
+from ortho_pipeline.models.base import Array
+
+#: A shorter shift (m) is no datum's; a datum explains one to this part of it, or to so many metres.
+_SHORTEST, _PART, _METRES = 10.0, 0.1, 6.0
+#: Transformations that are less certain (m) explain nothing.
+_CERTAIN = 30.0
+
+
+def datum_of(crs: pyproj.CRS, place: Array, shift: Array, interval: float) -> str | None:
+    """Return the name of the datum that explains a shift (m to east and north) at a place of a map; None if none does.
+
+    Parameters
+    ----------
+    place : (3,)
+        x, y in `crs`.
+    interval : float
+        How certain the shift is, metres.
+    """
+    length = float(np.hypot(*shift))
+    own = crs.geodetic_crs
+    if length < _SHORTEST or own is None:
+        return None
+    own = own.to_2d()
+    to_own = pyproj.Transformer.from_crs(crs, own, always_xy=True)
+    lon, lat = to_own.transform(place[0], place[1])
+    if not (np.isfinite(lon) and np.isfinite(lat)):
+        return None
+    scale = metres_per_degree(np.array([[lon, lat, 0.0]]))[0]
+    tolerance, best = max(_PART * length, interval, _METRES), None
+    box = lon - 0.1, lat - 0.1, lon + 0.1, lat + 0.1
+    near = transformer.AreaOfInterest(*box)
+    for info in query_crs_info(
+        "EPSG", pj_types=[PJType.GEOGRAPHIC_2D_CRS], area_of_interest=aoi.AreaOfInterest(*box), contains=True
+    ):
+        with contextlib.suppress(pyproj.exceptions.ProjError, pyproj.exceptions.CRSError):
+            way = pyproj.Transformer.from_crs(
+                own, f"EPSG:{info.code}", always_xy=True, area_of_interest=near, allow_ballpark=False
+            )
+            if not 0 <= way.accuracy <= _CERTAIN:
+                continue
+            there = np.array(way.transform(lon, lat, errcheck=True))
+            moved = (there - (lon, lat)) * scale
+            apart = min(float(np.hypot(*(moved - shift))), float(np.hypot(*(moved + shift))))
+            if apart < tolerance:
+                tolerance, best = apart, info.name
+    return best

@@ -1,0 +1,279 @@
+"""The displacement of a finished ortho from references: match, correct, and match again with the correction.
+
+The first matching finds the displacement of the whole ortho. If the displacement bends, chips are matched again under
+the smooth field of the first matches. So matches that bend with their neighbours are not left out.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from ortho_pipeline.commands.control.matching import Matched, match_scene
+from ortho_pipeline.commands.orthos.masks import ClassMask
+from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.estimation.ground_residuals import metre_partials
+from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.imaging.matching.chip_search import SIDE
+from ortho_pipeline.models import ImageCorrection, SensorModel, SmoothField
+from ortho_pipeline.models.base import Array, solve_2x2
+from ortho_pipeline.models.orthos.smooth_field import bending_of
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.raster.intensity import Intensity
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.surface.flat import FlatSurface
+
+#: Default search radius: metres, pixels, and part of the shorter side.
+_METRES, _PIXELS, _PART = 100.0, 30.0, 0.25
+#: Matchings after the first, at most, and how far (px, and chip px) they search.
+_AGAIN, _NEAR, _NEAR_CHIPS = 2, 6.0, 3.0
+#: The field of a matching is followed by another one if it bends by so many px (and chip px), or if so many matches
+#: contradicted the others.
+_BENDS, _CONTRADICT = 0.3, 0.1
+#: Knots of the field along the longer side, at most; and what it may change per pixel.
+_KNOTS, _BENDING = 14, 0.02
+#: Matches share noise up to so many sides of their chips: calibrated with drawn pairs.
+_SHARED = 1.5
+#: Number of bands that are tried alone if all of them together do not match.
+_SINGLE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredOrtho:
+    """The displacement of an ortho at its matches: position in the ortho minus position in the references.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its model is the map grid.
+    matched : Matched
+        The last matching.
+    searched : Matched
+        The first one.
+    image : (n, 2)
+        Places of matches in the ortho, px.
+    ground : (n, 3)
+        Their positions in the references.
+    displacement : (n, 2)
+        Metres to true east and north.
+    sigma : (n,)
+        Standard deviation (px) of each match alone.
+    metres : (2, 2)
+        Metres to east and north of a pixel along columns and rows, in the middle.
+    opened : SceneOptions
+        What may be opened.
+    band : int, optional
+        The band that was compared, if only one was.
+    """
+
+    scene: Scene
+    matched: Matched
+    searched: Matched
+    image: Array
+    ground: Array
+    displacement: Array
+    sigma: Array
+    metres: Array
+    opened: SceneOptions
+    band: int | None = None
+
+    @property
+    def pixel(self) -> float:
+        """Size (m) of a pixel."""
+        return self.matched.pixel
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return self.scene.width, self.scene.height
+
+    @property
+    def chip(self) -> float:
+        """Distance (px) up to which matches share noise: the side of their chips, and what images are blurred by."""
+        return _SHARED * SIDE * self.matched.matches.factor
+
+    @functools.cached_property
+    def field(self) -> DisplacementField:
+        """The field of the displacement (m) over the image (px)."""
+        return DisplacementField.of(self.image, self.displacement, self.sigma, self.chip)
+
+    @property
+    def residuals(self) -> Array:
+        """Displacement ``(n, 2)`` in px: measured minus the map grid."""
+        return np.asarray(self.image - self.scene.model.ground_to_image(self.ground))
+
+
+def measure_ortho(
+    image: str | os.PathLike[str] | Scene,
+    match: MatchOptions,
+    *,
+    scene: SceneOptions = SceneOptions(),
+    masks: Sequence[ClassMask] = (),
+    band: int | None = None,
+    output: OutputOptions = OutputOptions(),
+) -> MeasuredOrtho:
+    """Match an ortho with references.
+
+    Raises
+    ------
+    InputError
+        If the image is not an ortho, or matching fails.
+    """
+    opened = open_ortho(image, scene)
+    options = replace(match, search=match.search or default_search(opened))
+    bands: list[int | None] = [band]
+    if band is None:
+        bands += _single_bands(opened, scene)
+    first: InputError | None = None
+    for one in bands:
+        try:
+            found = _matched(opened, options, scene, masks, one, output)
+        except InputError as error:
+            # Of several bands, one may be more like the reference than their mean.
+            first = first or error
+            continue
+        return replace(found, band=one)
+    assert first is not None
+    raise first
+
+
+def default_search(scene: Scene) -> float:
+    """Return the default search radius (m) of an ortho: 100 m or 30 pixels, at most a quarter of its shorter side."""
+    pixel = _pixel(scene)
+    return min(max(_METRES, _PIXELS * pixel), _PART * min(scene.width, scene.height) * pixel)
+
+
+def _pixel(scene: Scene) -> float:
+    middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), 0.0)
+    plan, _ = metre_partials(scene.model, middle)
+    return float(1.0 / np.sqrt(abs(np.linalg.det(plan[0]))))
+
+
+def _single_bands(scene: Scene, options: SceneOptions) -> list[int | None]:
+    averaged = Intensity(RasterSource(scene.path, **options.access)).averaged
+    return list(averaged[:_SINGLE]) if len(averaged) > 1 else []
+
+
+def _matched(
+    scene: Scene,
+    options: MatchOptions,
+    opened: SceneOptions,
+    masks: Sequence[ClassMask],
+    band: int | None,
+    output: OutputOptions,
+) -> MeasuredOrtho:
+    """Match with one band or all, again until the correction follows the displacement."""
+
+    def matching(model: SensorModel, again: MatchOptions) -> Matched:
+        view = replace(scene, models={model.kind: model})
+        source = RasterSource(scene.path, **opened.access)
+        intensity = _intensity(source, () if band is None else (band,), masks, opened)
+        return match_scene(
+            view, again, FlatSurface(0.0), opened, output.threads, output.memory, intensity=intensity
+        )  # fmt: skip
+
+    searched = matched = matching(scene.model, options)
+    found = _measured(scene, matched, searched, opened)
+    for _ in range(_AGAIN):
+        model = following(found)
+        if model is None:
+            break
+        radius = max(_NEAR, _NEAR_CHIPS * matched.matches.factor) * found.pixel
+        try:
+            matched = matching(model, replace(options, search=radius, search_rotation=None))
+        except InputError:
+            break
+        better = _measured(scene, matched, searched, opened)
+        if len(better.image) < len(found.image):
+            break
+        found = better
+    return found
+
+
+def _intensity(
+    source: RasterSource, bands: Sequence[int], masks: Sequence[ClassMask], opened: SceneOptions
+) -> Intensity:
+    if not masks:
+        return Intensity(source, bands)
+    from ortho_pipeline.commands.orthos.masks import Masked
+
+    return Masked(source, bands, masks, opened)
+
+
+def _measured(scene: Scene, matched: Matched, searched: Matched, opened: SceneOptions) -> MeasuredOrtho:
+    points = matched.matches.points
+    plan, _ = metre_partials(scene.model, points.ground)
+    off = points.image - scene.model.ground_to_image(points.ground)
+    middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), 0.0)
+    metres = np.linalg.inv(metre_partials(scene.model, middle)[0][0])
+    return MeasuredOrtho(
+        scene,
+        matched,
+        searched,
+        points.image,
+        points.ground,
+        solve_2x2(plan, off),
+        points.sigma_image,
+        metres,
+        opened,
+    )
+
+
+def following(measured: MeasuredOrtho) -> SensorModel | None:
+    """Return the map grid with the correction that the matches follow; None if it is no better than the last one."""
+    affine = affine_of(measured)
+    left = measured.image - affine.ground_to_image(measured.ground)
+    field = DisplacementField.of(measured.image, left, measured.sigma, measured.chip)
+    bends = np.abs(field.mean(measured.image)).max()
+    reason = measured.matched.matches.reason
+    contradict = float((reason == "contradicts").sum()) / max(1, int((reason != "hidden").sum()))
+    if bends < _BENDS * measured.matched.matches.factor and contradict < _CONTRADICT:
+        return None
+    return smooth_field(affine, field, measured.size, _BENDING)
+
+
+def affine_of(measured: MeasuredOrtho) -> ImageCorrection:
+    """Return the map grid with an affine correction, fitted robustly to the matches."""
+    model, origin = measured.scene.model, (measured.size[0] / 2, measured.size[1] / 2)
+    predicted = model.ground_to_image(measured.ground)
+    design = np.column_stack([np.ones(len(predicted)), predicted - origin])
+    off, weight = measured.image - predicted, np.ones(len(predicted))
+    found = np.zeros((3, 2))
+    for _ in range(15):
+        root = np.sqrt(weight)[:, None]
+        found = np.linalg.lstsq(root * design, root * off, rcond=None)[0]
+        length = np.hypot(*(off - design @ found).T)
+        weight = np.minimum(1.0, max(1.5 * float(np.median(length)), 1e-9) / np.maximum(length, 1e-12))
+    return ImageCorrection(model, "affine", origin, np.concatenate([found[:, 0], found[:, 1]]))
+
+
+def smooth_field(model: SensorModel, field: DisplacementField, size: tuple[int, int], bending: float) -> SmoothField:
+    """Return a model under a field that bends by no more than so many px per px, smoothed until it does.
+
+    Parameters
+    ----------
+    field : DisplacementField
+        In px, of what the model leaves.
+    """
+    columns, rows = (max(3, round(_KNOTS * side / max(size)) + 1) for side in size)
+    across, down = (np.linspace(0, side, 3 * count) for side, count in zip(size, (columns, rows), strict=True))
+    places = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    low, high = (field.origin + bound * field.scale for bound in (field.place.min(axis=0), field.place.max(axis=0)))
+    # Outside the area of the matches the field keeps its value at the edge.
+    values = field.mean(np.clip(places, low, high)).reshape(len(down), len(across), 2)
+    flat = SmoothField(model, size, np.zeros((rows, columns, 2)))
+    for smoothing in range(40):
+        blurred = gaussian_filter(values, (smoothing, smoothing, 0), mode="nearest") if smoothing else values
+        found = np.einsum(
+            "ri,ijk,cj->rck", np.linalg.pinv(flat.splines(1, down)), blurred, np.linalg.pinv(flat.splines(0, across))
+        )
+        if bending_of(found, flat.spacing) <= bending:
+            break
+    return SmoothField(model, size, found)

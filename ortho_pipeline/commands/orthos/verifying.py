@@ -1,0 +1,452 @@
+"""`ortho verify`: measure the accuracy of a finished ortho with references or points, and name the likely cause."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ortho_pipeline.commands.control.points import read_control
+from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.orthos.dependence import HeightDependence, Step, causes_of, height_dependence, steps_of
+from ortho_pipeline.commands.orthos.masks import ClassMask
+from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, measure_ortho
+from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.requirement import Requirement
+from ortho_pipeline.commands.orthos.statistics import FEWEST_POINTS, Accuracy, Verified, profile
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.results import SCHEMA_VERSION, Result, to_store
+from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.display.numbers import class_size, size_m
+from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.estimation.ground_residuals import metre_partials, with_reference_height
+from ortho_pipeline.files import together, write_json
+from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.imaging.band_shifts import BandShift
+from ortho_pipeline.models.base import Array, solve_2x2
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.report.orthos.page import interval_text, write_page, write_table
+from ortho_pipeline.runtime.process_limits import one_blas_thread
+from ortho_pipeline.surface.base import Surface
+
+#: Endings of rasters that a folder of orthos may have.
+RASTERS = (".tif", ".tiff", ".jp2", ".vrt", ".img", ".png")
+#: ASPRS 2023 asks for so many check points.
+_ENOUGH = 30
+
+
+@to_store(folder="verify")
+@one_blas_thread()
+def verify(
+    ortho: str | os.PathLike[str],
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    match: MatchOptions = MatchOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    scene: SceneOptions = SceneOptions(),
+    output: OutputOptions = OutputOptions(),
+    masks: Sequence[str | os.PathLike[str]] = (),
+    band: int | None = None,
+    require: Sequence[str] = (),
+) -> Result:
+    """Measure how accurate a finished ortho is: relative to references, and at points on the ground.
+
+    Parameters
+    ----------
+    ortho : path
+        A finished ortho, or a folder of them, of which one table is made.
+    folder : path, optional
+        For the report, its numbers and the displacements. Default: write nothing.
+    masks : sequence of str
+        ``FILE`` or ``FILE=values``: classes that hide the ground.
+    band : int, optional
+        The band of the ortho to compare.
+    require : sequence of str
+        Such as ``ce90<5``; the document says in `requirements` whether they are met.
+
+    Raises
+    ------
+    InputError
+        If the image is not an ortho, there is neither reference nor point, or matching fails.
+    """
+    if not match.reference and points.gcps is None:
+        raise InputError(
+            "no reference and no points to compare the ortho with",
+            field="match.reference",
+            remedy=Text(
+                "give an orthoimage of the same place with ", Setting("match.reference", "FILE"), ", or points with ",
+                Setting("points.gcps", "FILE"),
+            ),
+        )  # fmt: skip
+    required = [Requirement.parse(text) for text in require]
+    hidden = [ClassMask.parse(text) for text in masks]
+    one = _Job(match, points, surface, scene, output, hidden, band, required)
+    if os.path.isdir(ortho):
+        return _verify_folder(Path(ortho), folder, one)
+    document, measured = one.document(ortho)
+    return _written(document, measured, folder, scene)
+
+
+class _Job:
+    """What is asked of each ortho."""
+
+    def __init__(
+        self,
+        match: MatchOptions,
+        points: PointOptions,
+        surface: SurfaceOptions,
+        scene: SceneOptions,
+        output: OutputOptions,
+        masks: Sequence[ClassMask],
+        band: int | None,
+        required: Sequence[Requirement],
+    ) -> None:
+        self.match, self.points, self.surface, self.scene, self.output = match, points, surface, scene, output
+        self.masks, self.band, self.required = masks, band, required
+
+    def document(self, ortho: str | os.PathLike[str]) -> tuple[dict[str, Any], MeasuredOrtho | None]:
+        """Return the document of one ortho, and its matches."""
+        opened = open_ortho(ortho, self.scene)
+        measured = None
+        if self.match.reference:
+            measured = measure_ortho(
+                opened, self.match, scene=self.scene, masks=self.masks, band=self.band, output=self.output
+            )
+        errors = self._point_errors(opened)
+        document = document_of(measured or opened, self.match, self._heights(opened), errors)
+        document["requirements"] = [one.judged(document) for one in self.required]
+        return document, measured
+
+    def _heights(self, opened: Scene) -> Surface | None:
+        if not has_surface(self.surface):
+            return None
+        surface = open_surface(self.surface, self.scene, self.output.memory, [opened])
+        return surface.with_fill("mask")
+
+    def _point_errors(self, opened: Scene) -> PointErrors | None:
+        """Return where the ortho shows points minus where they are; None without points."""
+        if self.points.gcps is None:
+            return None
+        points = read_control(opened, Request(opened, self.scene, points=self.points))
+        ground = with_reference_height(opened.model, points.ground)
+        ground = ground_transform(points.crs, opened.model.crs)(ground)
+        plan, _ = metre_partials(opened.model, ground)
+        errors = solve_2x2(plan, points.image - opened.model.ground_to_image(ground))
+        good = np.isfinite(errors).all(axis=1)
+        return PointErrors(tuple(np.array(points.ids)[good].tolist()), errors[good])
+
+
+class PointErrors(NamedTuple):
+    """Names of points, and where the ortho shows them minus where they are: metres to east and north ``(n, 2)``."""
+
+    ids: tuple[str, ...]
+    errors: Array
+
+
+def document_of(
+    found: MeasuredOrtho | Scene,
+    match: MatchOptions,
+    surface: Surface | None = None,
+    points: PointErrors | None = None,
+) -> dict[str, Any]:
+    """Return what is published of an ortho: of its matches, or of points alone where it was not matched."""
+    opened = found if isinstance(found, Scene) else found.scene
+    pixel = _pixel(opened)
+    document: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "ortho": str(opened.path),
+        "size": [opened.width, opened.height],
+        "crs": opened.model.crs,
+        "pixel_m": pixel,
+        "references": [str(path) for path in match.reference],
+    }
+    notices: list[Notice] = []
+    if isinstance(found, MeasuredOrtho):
+        document |= _of_matches(found, surface, match.reference_sigma)
+        notices += [one for one in found.searched.notices if one.code != "search-by-default"]
+    else:
+        document |= {"relative": None, "absolute": None, "causes": [], "steps": []}
+    document["points"] = None if points is None else _of_points(points, pixel)
+    document["asprs"] = _asprs(document)
+    document["requirements"] = []
+    document["stac"] = _stac(document)
+    if isinstance(found, MeasuredOrtho):
+        notices += _notices(document, found, match.reference_sigma)
+    return document | to_document(notices)
+
+
+def _pixel(opened: Scene) -> float:
+    middle = opened.model.image_to_ground(np.array([[opened.width / 2, opened.height / 2]]), 0.0)
+    plan, _ = metre_partials(opened.model, middle)
+    return float(1.0 / np.sqrt(abs(np.linalg.det(plan[0]))))
+
+
+def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigma: float | None) -> dict[str, Any]:
+    """Return what matches say of an ortho."""
+    verified = Verified.of(measured)
+    pixel, field = measured.pixel, verified.field
+    relative = verified.relative()
+    heights: HeightDependence | None = None if surface is None else height_dependence(measured, surface)
+    steps: list[Step] = steps_of(measured, field)
+    matched = measured.searched.record
+    bands = _bands(measured)
+    cells = [
+        {"image": place, "east_m": east, "north_m": north}
+        for place, (east, north) in zip(verified.cells.tolist(), verified.mean.tolist(), strict=True)
+    ]
+    return {
+        "matches": {
+            "tried": matched.tried,
+            "kept": len(measured.image),
+            "local": int(field.local.sum()),
+            "reasons": measured.matched.record.reasons,
+            "tested_share": verified.tested,
+            "band": measured.band,
+            "noise_px": json_value(field.noise / pixel),
+        },
+        "relative": relative.to_json(pixel),
+        "absolute": None if reference_sigma is None else verified.absolute(reference_sigma).to_json(pixel),
+        "field": {"shared_m": json_value(field.shared), "range_m": json_value(field.range * pixel), "cells": cells},
+        "heights": None if heights is None else heights.to_json(pixel),
+        "columns": profile(verified, 0),
+        "rows": profile(verified, 1),
+        "steps": [one.to_json() for one in steps],
+        "bands": bands,
+        "causes": [
+            {"code": one.code, "text": one.text} for one in causes_of(verified, relative, heights, steps)
+        ] + _band_causes(bands),
+    }  # fmt: skip
+
+
+def _bands(measured: MeasuredOrtho) -> list[dict[str, Any]]:
+    """Return where single bands of the ortho show the ground, relative to all of them together, in px."""
+    from ortho_pipeline.imaging.matching import open_references
+    from ortho_pipeline.imaging.matching.chip_search import SIDE, in_each_band
+    from ortho_pipeline.imaging.matching.targets import SceneView
+    from ortho_pipeline.raster.intensity import Intensity
+    from ortho_pipeline.raster.source import RasterSource
+    from ortho_pipeline.surface.flat import FlatSurface
+
+    matches, scene = measured.matched.matches, measured.scene
+    access = measured.opened.access
+    source = RasterSource(scene.path, **access)
+    if source.count < 2:
+        return []
+    kept = np.flatnonzero(matches.reason == "")
+    own = open_references([scene.path], **access)
+    view = SceneView(Intensity(source), scene.model, FlatSurface(0.0))
+    origins = np.round(matches.image[kept] - SIDE * matches.factor / 2).astype(int)
+    found: Sequence[BandShift] = in_each_band(
+        view, own, origins, matches.scene[kept], np.zeros((len(kept), 2)), matches.factor, 1
+    )
+    # The move of the model is against that of what the band shows.
+    return [
+        {"band": one.band, "column_px": -one.shift[0], "row_px": -one.shift[1], "sigma_px": max(one.sigma)}
+        for one in found
+    ]
+
+
+def _band_causes(bands: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    apart = [
+        (float(np.hypot(one["column_px"] - other["column_px"], one["row_px"] - other["row_px"])), one, other)
+        for one in bands
+        for other in bands
+        if one["band"] < other["band"]
+    ]
+    most, one, other = max(apart, key=lambda found: found[0], default=(0.0, {}, {}))
+    if most < 0.3 or most < 4 * np.hypot(one["sigma_px"], other["sigma_px"]):
+        return []
+    return [{"code": "bands", "text": f"bands {one['band']} and {other['band']} are displaced by {most:.2f} px"}]
+
+
+def _of_points(points: PointErrors, pixel: float) -> dict[str, Any]:
+    """Return what points say of an ortho."""
+    ids, errors = points
+    if len(errors) < FEWEST_POINTS:
+        raise InputError(
+            f"too few points ({len(errors)}) to estimate the accuracy of an ortho",
+            field="points.gcps",
+            remedy=f"give at least {FEWEST_POINTS} points, preferably {_ENOUGH}",
+        )
+    residuals = [
+        {"id": name, "east_m": east, "north_m": north} for name, (east, north) in zip(ids, errors.tolist(), strict=True)
+    ]
+    return {"count": len(errors)} | Accuracy.of_points(errors).to_json(pixel) | {"residuals": residuals}
+
+
+def _asprs(document: Mapping[str, Any]) -> str:
+    """Return what ASPRS 2023 lets people say of the accuracy."""
+    points = document["points"]
+    if points is not None:
+        rmse, count = points["rmse_m"]["value"], points["count"]
+        said = (
+            f"Horizontal RMSE_H {size_m(rmse)} at {counted(count, 'check point')}: ASPRS 2023 class "
+            f"{class_size(max(1, int(np.ceil(rmse * 100 - 1e-9))))}"
+        )
+        return said if count >= _ENOUGH else f"{said}. Indicative: ASPRS 2023 asks for {_ENOUGH} check points"
+    rmse = document["relative"]["rmse_m"]["value"]
+    return f"Horizontal RMSE_H {size_m(rmse)} relative to the reference. ASPRS 2023 classes need check points"
+
+
+def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sigma: float | None) -> list[Notice]:
+    found = []
+    share = document["matches"]["tested_share"]
+    if share < 0.5:
+        text = f"matches test {share:.0%} of the ortho; accuracy elsewhere is unknown"
+        found.append(Notice("ortho-tested-in-part", text, tested_share=share))
+    if reference_sigma is None and document["points"] is None:
+        text = "this accuracy is relative to the reference; the error of the reference is not included"
+        found.append(Notice("ortho-relative", text))
+    local = document["matches"]["local"]
+    if local > 0.02 * len(measured.image) and local > 2:
+        text = f"{counted(local, 'match differs', 'matches differ')} from the neighbouring matches"
+        found.append(Notice("ortho-local-changes", text, matches=local))
+    return found
+
+
+def _stac(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of STAC's extension for accuracy."""
+    best = document["points"] or document["absolute"] or document["relative"]
+    if best is None:
+        return {}
+    return {
+        "accuracy:geometric_rmse": best["rmse_m"]["value"],
+        "accuracy:geometric_x_bias": best["bias_east_m"]["value"],
+        "accuracy:geometric_y_bias": best["bias_north_m"]["value"],
+    }
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+def _written(
+    document: dict[str, Any],
+    measured: MeasuredOrtho | None,
+    folder: str | os.PathLike[str] | None,
+    scene: SceneOptions,
+) -> Result:
+    files: dict[str, Path] = {}
+    if folder is not None:
+        stem = Path(document["ortho"]).stem
+        files = {"html": Path(folder) / f"{stem}_verify.html", "json": Path(folder) / f"{stem}_verify.json"}
+        if measured is not None:
+            files["displacements"] = Path(folder) / f"{stem}_displacements.geojson"
+        with together(folder, stem):
+            write_json(files["json"], document)
+            write_page(document, files["html"], document["ortho"], scene.access)
+            if measured is not None:
+                write_json(files["displacements"], displacements(measured))
+    return Result(files, document, summary(document))
+
+
+def displacements(measured: MeasuredOrtho) -> dict[str, Any]:
+    """Return the matches of an ortho as GeoJSON, with the displacement of each."""
+    lon_lat = ground_transform(measured.scene.model.crs, "EPSG:4979")(measured.ground)[:, :2]
+    local = measured.field.local
+    rows = zip(
+        measured.matched.matches.points.ids, lon_lat.tolist(), measured.image.tolist(), measured.displacement.tolist(),
+        measured.sigma.tolist(), local.tolist(), strict=True,
+    )  # fmt: skip
+    features = [
+        {
+            "type": "Feature",
+            "id": name,
+            "geometry": {"type": "Point", "coordinates": place},
+            "properties": {
+                "column": image[0],
+                "row": image[1],
+                "east_m": east_north[0],
+                "north_m": east_north[1],
+                "length_m": float(np.hypot(*east_north)),
+                "sigma_px": sigma,
+                "local": alone,
+            },
+        }
+        for name, place, image, east_north, sigma, alone in rows
+    ]
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _verify_folder(folder: Path, out: str | os.PathLike[str] | None, job: _Job) -> Result:
+    """Verify all orthos of a folder; what cannot be verified is a row with its error."""
+    own = {os.path.realpath(path) for path in job.match.reference}
+    images = sorted(path for path in folder.iterdir() if path.suffix.lower() in RASTERS)
+    images = [path for path in images if os.path.realpath(path) not in own]
+    if not images:
+        raise InputError(
+            "this folder has no raster", file=folder, remedy=f"give a folder with orthos ({', '.join(RASTERS)})"
+        )
+    rows: list[dict[str, Any]] = []
+    done: list[Result] = []
+    for image in images:
+        try:
+            document, measured = job.document(image)
+        except OrthoError as error:
+            rows.append({"ortho": str(image), "error": error.message, "remedy": error.remedy})
+            continue
+        done.append(_written(document, measured, out, job.scene))
+        kept = ("ortho", "pixel_m", "relative", "absolute", "points", "causes", "requirements")
+        rows.append({name: document[name] for name in kept})
+    table = {"schema_version": SCHEMA_VERSION, "folder": str(folder), "orthos": rows, "failed": len(images) - len(done)}
+    table["requirements"] = [one for row in rows for one in row.get("requirements") or ()]
+    table |= to_document([])
+    files: dict[str, Path] = {}
+    if out is not None:
+        files = {"html": Path(out) / "verify.html", "json": Path(out) / "verify.json"}
+        write_json(files["json"], table)
+        write_table(table, files["html"])
+    return Result(files, table, table_text(table))
+
+
+# -- words -----------------------------------------------------------------------------------------------------------
+
+
+def summary(document: Mapping[str, Any]) -> str:
+    """Return what people read of a verified ortho."""
+    lines = []
+    for part, title in (
+        ("points", "At points"),
+        ("absolute", "On the ground"),
+        ("relative", "Relative to the reference"),
+    ):
+        found = document[part]
+        if found is not None:
+            lines.append(f"{title}:")
+            for name, called in (("ce90", "CE90"), ("rmse", "RMSE"), ("bias", "bias")):
+                both = interval_text(found[f"{name}_m"]), interval_text(found[f"{name}_px"], "px")
+                lines.append(f"  {called:<5} {both[0]}, {both[1]}")
+            lines.append("  bias  east {:+.2f} m, north {:+.2f} m".format(
+                *(found[f"bias_{axis}_m"]["value"] for axis in ("east", "north"))
+            ))  # fmt: skip
+    if "matches" in document:
+        found = document["matches"]
+        tested = f"they test {found['tested_share']:.0%} of the ortho"
+        lines.append(f"Matches: {found['kept']} of {found['tried']} places; {tested}")
+    lines += [f"Cause: {one['text']}" for one in document["causes"]]
+    lines.append(document["asprs"])
+    for one in document["requirements"]:
+        word = "met" if one["met"] else "NOT met"
+        lines.append(f"Required {one['requirement']}: {word} (upper limit {one['upper']:.3g})")
+    return "\n".join(lines)
+
+
+def table_text(table: Mapping[str, Any]) -> str:
+    """Return the table of a folder as text."""
+    lines = [f"{'ortho':<32} {'CE90 m':>18} {'RMSE m':>18}  cause"]
+    for row in table["orthos"]:
+        name = Path(row["ortho"]).name
+        if "error" in row:
+            lines.append(f"{name:<32} {row['error']}")
+            continue
+        best = row["relative"] or row["points"]
+        numbers = (interval_text(best[f"{one}_m"], "").replace("  ", " ") for one in ("ce90", "rmse"))
+        causes = ", ".join(one["code"] for one in row["causes"]) or "none found"
+        lines.append(f"{name:<32} {next(numbers):>18} {next(numbers):>18}  {causes}")
+    return "\n".join(lines)

@@ -1,0 +1,324 @@
+r"""The displacement field of an image, from displacements that matches measured: its most likely value at every place.
+
+Along each of two axes, :math:`d(x) = F(x) b + s(x) + n`: an affine trend, a smooth field with
+:math:`\mathrm{cov}(s_i, s_j) = \sigma_s^2 k(d_{ij} / c)`, and noise of matching with the variances
+:math:`\sigma_n^2 w_i`. Chips that overlap share the noise of the pixels that they share: their noise is correlated by
+the part of its area that one shares with the other. So errors that neighbours share within a chip are noise and make
+the intervals wider. What they share over longer distances is the field, and counts as displacement.
+
+Smoothness, range and strength of the field are unknown. So all functions of `shared_errors` have the same prior weight
+and are weighted by their restricted likelihood. Fields are drawn from all of them (conditional simulation by universal
+kriging). A statistic of the field (its mean, its RMSE, a percentile of its length) is computed from each draw. Its
+spread includes the errors that neighbours share, places without matches, and the unknown function.
+
+Source: Cressie 1993, sections 3.4 (universal kriging) and 3.6.2 (conditional simulation); Handcock and Stein 1993.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, spatial
+
+from ortho_pipeline.errors import TooFewPoints
+from ortho_pipeline.estimation.spatial.shared_errors import FAMILIES
+from ortho_pipeline.models.base import Array
+
+#: Minimum number of displacements for a field.
+FEWEST_POINTS = 12
+#: Maximum numbers of displacements: for the field, and to weight the functions. More cost time and change little.
+_MOST_POINTS, _TRIED = 500, 200
+#: Ranges and ratios of variances, field over noise, that are tried.
+_RANGES, _RATIOS, _LARGEST = 8, 16, 1e4
+#: Functions that are drawn for one set of fields, and the fields of each.
+_FUNCTIONS, _OF_EACH = 50, 20
+#: A displacement is local if it differs by so many sigmas from the prediction of its neighbours.
+_LOCAL = 4.5
+#: Part of the noise that chips share where they overlap; the rest is of each alone.
+_OF_PIXELS = 0.9
+#: Rounds of leaving local displacements out.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class _Axis:
+    """The likely functions of one axis, with noise in units of the axis."""
+
+    kernels: tuple[tuple[int, float], ...]  # family and range
+    ratios: Array
+    chance: Array  # (kernels, ratios)
+    squares: Array  # (kernels, ratios): weighted sum of squares of what is left
+    freedom: int
+
+    @property
+    def best(self) -> tuple[int, int]:
+        """The likeliest function."""
+        kernel, ratio = np.unravel_index(int(self.chance.argmax()), self.chance.shape)
+        return int(kernel), int(ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementField:
+    """What the displacement of an image is likely to be at each place.
+
+    Parameters
+    ----------
+    place, value : (n, 2)
+        Where displacements were measured, in units of the extent, and the displacements.
+    weight : (n,)
+        Variances of the noise, relative to each other.
+    side : float
+        Of chips, in units of the extent.
+    scale : float
+        Units of `place` in the extent.
+    origin : (2,)
+    local : (N,) of bool
+        Which of all given displacements contradict their neighbours; they are not among the n.
+    """
+
+    place: Array
+    value: Array
+    weight: Array
+    side: float
+    scale: float
+    origin: Array
+    local: NDArray[np.bool_]
+    axes: tuple[_Axis, _Axis]
+
+    @classmethod
+    def of(cls, place: Array, value: Array, sigma: Array | None = None, side: float = 0.0) -> DisplacementField:
+        """Return the field of displacements.
+
+        Parameters
+        ----------
+        place, value : (N, 2)
+            In any units.
+        sigma : (N,), optional
+            Standard deviations of the displacements, relative to each other.
+        side : float
+            Side of the chips that were matched, in units of places: those that overlap share noise.
+
+        Raises
+        ------
+        TooFewPoints
+            If there are fewer than 12, or they are all at one place.
+        """
+        if len(place) < FEWEST_POINTS or not np.ptp(place, axis=0).min() > 0:
+            raise TooFewPoints(f"{len(place)} displacements do not determine a field", remedy="give more matches")
+        weight = np.ones(len(place)) if sigma is None else (sigma / np.median(sigma)) ** 2
+        weight = np.clip(weight, 0.25, 16.0)
+        origin, scale = place.mean(axis=0), float(np.ptp(place, axis=0).max())
+        inside, local = (place - origin) / scale, np.zeros(len(place), dtype=bool)
+        for turn in range(_ROUNDS):
+            index = np.flatnonzero(~local)
+            if len(index) > _MOST_POINTS:
+                index = np.sort(np.random.default_rng(0).permutation(index)[:_MOST_POINTS])
+            axes = _likely(inside[index], value[index], weight[index], side / scale)
+            found = cls(inside[index], value[index], weight[index], side / scale, scale, origin, local, axes)
+            if turn == _ROUNDS - 1:
+                break
+            apart = found._apart()
+            if not (apart > _LOCAL**2).any():
+                break
+            again = local.copy()
+            again[index[apart > _LOCAL**2]] = True
+            if len(place) - again.sum() < max(FEWEST_POINTS, len(place) / 2):
+                break
+            local = again
+        return found
+
+    @property
+    def noise(self) -> Array:
+        """Standard deviation ``(2,)`` of single matches of weight one."""
+        return np.array([np.sqrt(one.squares[one.best] / one.freedom) for one in self.axes])
+
+    @property
+    def shared(self) -> Array:
+        """Standard deviation ``(2,)`` of the field about its trend, by the likeliest function."""
+        return self.noise * np.sqrt([one.ratios[one.best[1]] for one in self.axes])
+
+    @property
+    def range(self) -> Array:
+        """Distance ``(2,)`` over which the field keeps 1/e of its correlation, in the units of places."""
+        return np.array([one.kernels[one.best[0]][1] for one in self.axes]) * self.scale
+
+    def mean(self, place: Array) -> Array:
+        """Return the likeliest field ``(m, 2)`` at places ``(m, 2)``."""
+        inside = (place - self.origin) / self.scale
+        found = np.empty((len(place), 2))
+        for axis, one in enumerate(self.axes):
+            kernel, ratio = one.best
+            found[:, axis] = self._kriged(axis, one.kernels[kernel], one.ratios[ratio], inside)[0]
+        return found
+
+    def trend(self) -> Array:
+        """Return the affine trend ``(3, 2)`` of the likeliest function: at the origin, per unit of x and of y."""
+        found = np.empty((3, 2))
+        for axis, one in enumerate(self.axes):
+            kernel, ratio = one.best
+            inverse = self._whitened(one.kernels[kernel], one.ratios[ratio])
+            found[:, axis] = np.linalg.lstsq(inverse(_design(self.place)), inverse(self.value[:, axis]), rcond=None)[0]
+        return found / np.array([1.0, self.scale, self.scale])[:, None]
+
+    def draws(self, place: Array, seed: int = 0) -> Array:
+        """Return fields ``(draws, m, 2)`` at places ``(m, 2)``, each as likely as any other."""
+        random = np.random.default_rng(seed)
+        inside = (place - self.origin) / self.scale
+        found = np.empty((_FUNCTIONS * _OF_EACH, len(place), 2))
+        for axis, one in enumerate(self.axes):
+            chosen = random.choice(one.chance.size, _FUNCTIONS, p=one.chance.ravel())
+            rows = random.permutation(len(found)).reshape(_FUNCTIONS, _OF_EACH)
+            kriged: dict[int, tuple[Array, Array]] = {}
+            for number, part in zip(chosen.tolist(), rows, strict=True):
+                kernel, ratio = divmod(number, len(one.ratios))
+                if number not in kriged:
+                    kriged[number] = self._kriged(axis, one.kernels[kernel], one.ratios[ratio], inside, root=True)
+                middle, root = kriged[number]
+                variance = one.squares[kernel, ratio] / random.chisquare(one.freedom, _OF_EACH)
+                noise = random.standard_normal((_OF_EACH, len(place)))
+                found[part, :, axis] = middle + np.sqrt(variance)[:, None] * (noise @ root.T)
+        return found
+
+    def regressed(self, place: Array, value: Array, along: Array) -> tuple[Array, Array, Array]:
+        """Return how values ``(n, 2)`` change with a quantity ``(n,)`` besides their trend, and the sigmas, ``(2,)``.
+
+        Errors are correlated as the likeliest function of this field says. The third is the level of the values at the
+        middle of their places where the quantity is 0.
+        """
+        inside = (place - self.origin) / self.scale
+        rates, sigmas, level = np.zeros(2), np.zeros(2), np.zeros(2)
+        for axis, one in enumerate(self.axes):
+            kernel, ratio = one.best
+            noise = _noise(inside, np.ones(len(inside)), self.side)
+            variance = noise + one.ratios[ratio] * self._covariance(one.kernels[kernel], inside, inside)
+            root = linalg.cholesky(variance, lower=True)
+            columns = np.column_stack([_design(inside), along, value[:, axis]])
+            white = linalg.solve_triangular(root, columns, lower=True)
+            inverse = np.linalg.pinv(white[:, :-1])
+            found = inverse @ white[:, -1]
+            left = white[:, -1] - white[:, :-1] @ found
+            rates[axis], level[axis] = found[3], found[0]
+            sigmas[axis] = np.linalg.norm(left) / np.sqrt(len(left) - 4) * np.linalg.norm(inverse[3])
+        return rates, sigmas, level
+
+    def held_out(self, groups: NDArray[np.int_]) -> tuple[Array, Array]:
+        """Return squared errors ``(groups, 2)`` of field and trend where each group of displacements takes no part."""
+        found = []
+        for group in np.unique(groups):
+            out = groups == group
+            errors = np.zeros(2)
+            for axis, one in enumerate(self.axes):
+                kernel, ratio = one.best
+                rest = DisplacementField(
+                    self.place[~out],
+                    self.value[~out],
+                    self.weight[~out],
+                    self.side,
+                    self.scale,
+                    self.origin,
+                    self.local,
+                    self.axes,
+                )
+                here = rest._kriged(axis, one.kernels[kernel], one.ratios[ratio], self.place[out])[0]
+                plain = np.linalg.lstsq(_design(rest.place), rest.value[:, axis], rcond=None)[0]
+                errors += [
+                    ((self.value[out, axis] - here) ** 2).mean(),
+                    ((self.value[out, axis] - _design(self.place[out]) @ plain) ** 2).mean(),
+                ]
+            found.append(errors)
+        both = np.array(found)
+        return both[:, 0], both[:, 1]
+
+    def _covariance(self, kernel: tuple[int, float], one: Array, other: Array) -> Array:
+        family, length = kernel
+        return np.asarray(FAMILIES[family](spatial.distance.cdist(one, other) / length))
+
+    def _whitened(self, kernel: tuple[int, float], ratio: float) -> Callable[[Array], Array]:
+        """Return the function that whitens columns."""
+        variance = _noise(self.place, self.weight, self.side) + ratio * self._covariance(kernel, self.place, self.place)
+        root = linalg.cholesky(variance, lower=True)
+        return lambda columns: np.asarray(linalg.solve_triangular(root, columns, lower=True))
+
+    def _kriged(
+        self, axis: int, kernel: tuple[int, float], ratio: float, place: Array, *, root: bool = False
+    ) -> tuple[Array, Array]:
+        """Return the mean ``(m,)`` of the field of an axis at places, and a root of its covariance over the noise's."""
+        white = self._whitened(kernel, ratio)
+        design, value = white(_design(self.place)), white(self.value[:, axis])
+        across = white(ratio * self._covariance(kernel, self.place, place))
+        normal = linalg.cho_factor(design.T @ design)
+        trend = linalg.cho_solve(normal, design.T @ value)
+        left = _design(place) - across.T @ design
+        mean = across.T @ value + left @ trend
+        if not root:
+            return mean, np.zeros((0, 0))
+        covariance = ratio * self._covariance(kernel, place, place) - across.T @ across
+        covariance += left @ linalg.cho_solve(normal, left.T)
+        values, vectors = np.linalg.eigh(covariance)
+        return mean, vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def _apart(self) -> Array:
+        """Return squared distances ``(n,)`` of displacements from what the others say, in sigmas."""
+        found = np.zeros(len(self.place))
+        for axis, one in enumerate(self.axes):
+            kernel, ratio = one.best
+            white = self._whitened(one.kernels[kernel], one.ratios[ratio])
+            inverse = white(np.eye(len(self.place)))
+            design = np.linalg.qr(white(_design(self.place)))[0]
+            inverse = inverse - design @ (design.T @ inverse)
+            precision = (inverse**2).sum(axis=0)
+            alone = inverse.T @ (inverse @ self.value[:, axis]) / precision
+            found += alone**2 * precision / (one.squares[one.best] / one.freedom)
+        return found
+
+
+def _design(place: Array) -> Array:
+    return np.column_stack([np.ones(len(place)), place])
+
+
+def _noise(place: Array, weight: Array, side: float) -> Array:
+    """Return the covariance ``(n, n)`` of the noise: chips share that of the pixels that they share."""
+    root = np.sqrt(weight)
+    if not side > 0:
+        return np.diag(weight)
+    apart = np.abs(place[:, None] - place) / side
+    shared = np.maximum(1.0 - apart, 0.0).prod(axis=2)
+    return np.asarray((_OF_PIXELS * shared + (1.0 - _OF_PIXELS) * np.eye(len(place))) * root[:, None] * root)
+
+
+def _likely(place: Array, value: Array, weight: Array, side: float) -> tuple[_Axis, _Axis]:
+    """Return how likely each function is along both axes, by restricted likelihood."""
+    count = len(place)
+    if count > _TRIED:
+        some = np.sort(np.random.default_rng(0).permutation(count)[:_TRIED])
+        place, value, weight = place[some], value[some], weight[some]
+    inverse = linalg.solve_triangular(
+        linalg.cholesky(_noise(place, weight, side), lower=True), np.eye(len(place)), lower=True
+    )
+    design, seen = inverse @ _design(place), inverse @ value
+    basis = np.linalg.qr(design, mode="complete")[0][:, design.shape[1] :]
+    left, freedom = basis.T @ seen, len(seen) - design.shape[1]
+    whole = np.maximum((left**2).sum(axis=0) / freedom, 1e-300)
+    distance = spatial.distance.cdist(place, place)
+    near = float(np.median(np.partition(distance, 1, axis=1)[:, 1]))
+    ranges = np.geomspace(np.clip(near, 0.01, 0.5), 1.0, _RANGES)
+    ratios = np.concatenate([[0.0], np.geomspace(1.0 / count, _LARGEST, _RATIOS)])
+    kernels = tuple((family, float(length)) for family in range(len(FAMILIES)) for length in ranges)
+    logs, squares = (np.empty((2, len(kernels), len(ratios))) for _ in range(2))
+    for number, (family, length) in enumerate(kernels):
+        kernel = inverse @ FAMILIES[family](distance / length) @ inverse.T
+        values, vectors = np.linalg.eigh(basis.T @ kernel @ basis)
+        each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
+        squares[:, number] = ((vectors.T @ left) ** 2).T @ (1.0 / each).T
+        logs[:, number] = -0.5 * (np.log(each).sum(axis=1) + freedom * np.log(np.maximum(squares[:, number], 1e-300)))
+    # As in `shared_errors`: the part of the variance that residuals show is as likely to be any from none to all.
+    logs -= np.log(np.maximum(squares / freedom * (1.0 + ratios) / whole[:, None, None], 1.0))
+    # Beforehand there is as likely no field as one of any strength.
+    logs[:, :, 0] += np.log(_RATIOS)
+    chance = np.exp(logs - logs.max(axis=(1, 2), keepdims=True))
+    chance /= chance.sum(axis=(1, 2), keepdims=True)
+    first, second = (_Axis(kernels, ratios, chance[axis], squares[axis], freedom) for axis in (0, 1))
+    return first, second

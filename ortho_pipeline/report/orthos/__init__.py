@@ -1,0 +1,1 @@
+"""Pages of finished orthos that were verified or aligned."""

@@ -1,0 +1,134 @@
+"""`ortho align`: an ortho comes to lie where its reference does; its pixels, type and mask stay what they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from osgeo import gdal
+from pairs import BENT, SHIFTED, Pair
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.exchange.model_file import read_model_file
+from ortho_pipeline.exchange.moved_grid import moved_geotransform
+
+gdal.UseExceptions()
+
+
+def run(*words: Any) -> Result:
+    return CliRunner().invoke(cli, list(map(str, words)))
+
+
+def aligned(ortho: Path, reference: Path, folder: Path, *words: Any) -> dict[str, Any]:
+    done = run("align", ortho, "--reference", reference, "-o", folder, "--json", *words)
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def left_by(pair: Pair, folder: Path, name: str = "ortho") -> np.ndarray:
+    """Return what the model that was found leaves of the true displacement, px, inside of the ortho."""
+    model = read_model_file(folder / f"{name}_aligned_model.json").model
+    image = np.random.default_rng(0).uniform(0.06, 0.94, (400, 2)) * pair.pixels
+    ground = np.asarray(gdal_ground(pair, image)) - pair.displacement()(image)
+    place = model.ground_to_image(np.column_stack([ground, np.zeros(400)]))
+    return place - image
+
+
+def gdal_ground(pair: Pair, image: np.ndarray) -> np.ndarray:
+    return np.array([512_000.0, 7_123_000.0]) + image * [pair.ortho.gsd, -pair.ortho.gsd]
+
+
+def test_a_bent_ortho_is_aligned_by_a_field(bent, tmp_path):
+    document = aligned(*bent, tmp_path)
+    assert document["correction"]["kind"] == "field"
+    assert 0 < document["correction"]["bending_px_per_px"] <= 0.02
+    assert np.sqrt((left_by(BENT, tmp_path) ** 2).sum(axis=1).mean()) < 0.1
+    assert document["before"]["rmse_m"]["value"] > 5
+    assert document["relative"]["rmse_m"]["value"] < 0.15
+    assert "Before and after" in (tmp_path / "ortho_align.html").read_text()
+
+
+def test_a_shifted_ortho_is_aligned_by_a_shift(shifted, tmp_path):
+    document = aligned(*shifted, tmp_path)
+    assert document["correction"]["kind"] == "shift"
+    np.testing.assert_allclose(document["correction"]["shift_px"], np.array(SHIFTED.shift) * (1, -1), atol=0.03)
+    assert np.abs(left_by(SHIFTED, tmp_path)).max() < 0.05
+
+
+def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
+    source = gdal.Open(str(shifted[0]))
+    pixels = source.ReadAsArray()
+    three = tmp_path / "three.tif"
+    made = gdal.GetDriverByName("GTiff").Create(str(three), source.RasterXSize, source.RasterYSize, 3, gdal.GDT_Int16)
+    made.SetProjection(source.GetProjection())
+    made.SetGeoTransform(source.GetGeoTransform())
+    made.SetMetadataItem("PRODUCT", "a mosaic")
+    for number, name in enumerate(("red", "green", "nir"), start=1):
+        band = made.GetRasterBand(number)
+        band.WriteArray(np.where(np.arange(pixels.shape[1]) < 30, -9999, pixels // number).astype(np.int16))
+        band.SetNoDataValue(-9999)
+        band.SetDescription(name)
+    made = None
+    aligned(three, shifted[1], tmp_path / "out")
+    found = gdal.Open(str(tmp_path / "out" / "three_aligned.tif"))
+    assert found.GetGeoTransform() == source.GetGeoTransform()
+    assert (found.RasterXSize, found.RasterYSize, found.RasterCount) == (320, 320, 3)
+    assert found.GetMetadataItem("PRODUCT") == "a mosaic"
+    assert found.GetMetadataItem("LAYOUT", "IMAGE_STRUCTURE") == "COG"
+    for number, name in enumerate(("red", "green", "nir"), start=1):
+        band = found.GetRasterBand(number)
+        assert band.DataType == gdal.GDT_Int16
+        assert band.GetNoDataValue() == -9999
+        assert band.GetDescription() == name
+    values = found.ReadAsArray()
+    # Displaced by 2.6 px to the west: the nodata in the first 30 columns reaches farther now.
+    assert (values[:, 50, :31] == -9999).all()
+    assert (values[:, 50, 40:300] != -9999).all()
+
+
+@pytest.mark.parametrize("form", ["COG", "GTiff"])
+def test_without_resampling_no_pixel_is_touched(shifted, tmp_path, form):
+    document = aligned(*shifted, tmp_path, "--shift-only", "--no-resample", "--format", form)
+    path = tmp_path / f"ortho_aligned{'.vrt' if form == 'COG' else '.tif'}"
+    assert document["files"]["ortho"] == str(path)
+    source, found = gdal.Open(str(shifted[0])), gdal.Open(str(path))
+    np.testing.assert_array_equal(found.ReadAsArray(), source.ReadAsArray())
+    moved = np.subtract(source.GetGeoTransform(), found.GetGeoTransform())[[0, 3]]
+    np.testing.assert_allclose(moved, SHIFTED.shift, atol=0.03)
+    assert document["relative"]["bias_px"]["value"] < 0.03
+    assert not document["resampled"]
+
+
+def test_a_geotransform_is_moved_along_its_own_axes():
+    rotated = (1000.0, 3.0, 4.0, 2000.0, 4.0, -3.0)
+    moved = moved_geotransform(rotated, np.array([2.0, -1.0]))
+    # What was shown 2 columns and -1 row off is shown where it belongs.
+    np.testing.assert_allclose(gdal.ApplyGeoTransform(moved, 12.0, 19.0), gdal.ApplyGeoTransform(rotated, 10.0, 20.0))
+
+
+def test_a_local_change_does_not_move_the_whole(tmp_path):
+    pair = Pair(side=400, seed=3, shift=(2.0, 1.0), patch=(6.0, 0.0))
+    ortho, reference = pair.write(tmp_path)
+    aligned(ortho, reference, tmp_path / "out")
+    left = left_by(pair, tmp_path / "out")
+    image = np.random.default_rng(0).uniform(0.06, 0.94, (400, 2))
+    inside = ((image > 0.4) & (image < 0.85)).all(axis=1)
+    assert np.abs(left[~inside]).max() < 0.08
+
+
+def test_contradictions_are_refused(shifted, tmp_path):
+    folder = "-o", tmp_path / "out"
+    assert (
+        run("align", shifted[0], "--reference", shifted[1], *folder, "--no-resample", "--correction", "field").exit_code
+        == 2
+    )
+    assert (
+        run("align", shifted[0], "--reference", shifted[1], *folder, "--shift-only", "--correction", "affine").exit_code
+        == 2
+    )
+    assert run("align", shifted[0], "--reference", shifted[0], *folder).exit_code == 2
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,261 @@
+"""`ortho verify`: the accuracy of orthos whose displacement is known, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from landscape import field_of
+from osgeo import gdal
+from pairs import BENT, CORNER, SHIFTED, Look, Pair
+from scipy.ndimage import map_coordinates
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.orthos.datums import datum_of
+from ortho_pipeline.commands.orthos.requirement import Requirement
+from ortho_pipeline.commands.orthos.statistics import Accuracy
+from ortho_pipeline.commands.orthos.verifying import verify
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
+from ortho_pipeline.options import MatchOptions, SurfaceOptions
+
+gdal.UseExceptions()
+
+
+def run(*words: Any) -> Result:
+    return CliRunner().invoke(cli, list(map(str, words)))
+
+
+def truth(pair: Pair, cells: list[dict[str, Any]]) -> np.ndarray:
+    return pair.on_the_ground(np.array([one["image"] for one in cells]))
+
+
+@pytest.fixture(scope="module")
+def verified(bent: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    folder = tmp_path_factory.mktemp("verified")
+    words = "--require", "ce90<30", "--require", "bias<1", "--json", "-o", folder
+    done = run("verify", bent[0], "--reference", bent[1], "--reference-sigma", "2", *words)
+    assert done.exit_code == 4, done.output
+    return json.loads(done.stdout), folder
+
+
+def test_the_accuracy_is_that_of_the_truth(verified):
+    document, _ = verified
+    true = truth(BENT, document["field"]["cells"])
+    relative = document["relative"]
+    pixel = document["pixel_m"]
+    values = {
+        "bias_m": np.hypot(*true.mean(axis=0)),
+        "rmse_m": np.sqrt((true**2).sum(axis=1).mean()),
+        "ce90_m": np.quantile(np.hypot(*true.T), 0.9),
+    }
+    for name, value in values.items():
+        assert abs(relative[name]["value"] - value) < 0.03, name
+        assert relative[name]["low"] <= relative[name]["value"] <= relative[name]["high"]
+        np.testing.assert_allclose(relative[name]["value"] / pixel, relative[name.replace("_m", "_px")]["value"])
+    found = np.array([[one["east_m"], one["north_m"]] for one in document["field"]["cells"]])
+    assert np.abs(found - true).max() < 0.25
+    assert document["matches"]["tested_share"] > 0.9
+
+
+def test_the_error_of_the_reference_is_part_of_the_absolute_accuracy(verified):
+    document, _ = verified
+    relative, absolute = document["relative"]["bias_east_m"], document["absolute"]["bias_east_m"]
+    np.testing.assert_allclose((absolute["high"] - absolute["low"]) / (2 * 1.96 * 2.0), 1.0, atol=0.1)
+    assert relative["high"] - relative["low"] < 0.1
+
+
+def test_its_causes_are_named(verified):
+    document, _ = verified
+    codes = [one["code"] for one in document["causes"]]
+    assert "shift" in codes
+    assert "smooth" in codes
+
+
+def test_it_writes_page_numbers_and_displacements(verified):
+    document, folder = verified
+    page = (folder / "ortho_verify.html").read_text()
+    assert "90 % of the ortho is within" in page
+    assert "<svg" in page
+    numbers = json.loads((folder / "ortho_verify.json").read_text())
+    assert numbers["relative"] == document["relative"]
+    assert document["stac"]["accuracy:geometric_rmse"] == document["absolute"]["rmse_m"]["value"]
+    places = json.loads((folder / "ortho_displacements.geojson").read_text())["features"]
+    assert len(places) == document["matches"]["kept"]
+    to_map = ground_transform("EPSG:4979", "EPSG:32735")
+    one = places[0]
+    x, y, _ = to_map([[*one["geometry"]["coordinates"], 0.0]])[0]
+    column, row = one["properties"]["column"], one["properties"]["row"]
+    off = (CORNER[0] + column * BENT.ortho.gsd - x, CORNER[1] - row * BENT.ortho.gsd - y)
+    np.testing.assert_allclose(off, [one["properties"]["east_m"], one["properties"]["north_m"]], rtol=0.01, atol=0.02)
+
+
+def test_requirements_are_judged_by_the_upper_limit(verified):
+    document, _ = verified
+    assert [one["met"] for one in document["requirements"]] == [True, False]
+    part = {"relative": {"ce90_m": {"value": 4.9, "low": 4.5, "high": 5.2}}, "absolute": None}
+    assert not Requirement.parse("ce90<5").judged(part)["met"]
+    assert Requirement.parse("ce90<=5.3m").judged(part)["met"]
+    with pytest.raises(InputError, match="not known"):
+        Requirement.parse("absolute.ce90<5").judged(part)
+
+
+@pytest.mark.parametrize("text", ["ce95<5", "ce90>5", "ce90<0", "ce90<five", "ce90<1e", ""])
+def test_what_is_no_requirement_is_refused(text):
+    with pytest.raises(InputError, match="not a requirement"):
+        Requirement.parse(text)
+
+
+def test_another_place_is_refused(tmp_path):
+    ortho, reference = Pair(side=300, seed=9, elsewhere=True).write(tmp_path)
+    done = run("verify", ortho, "--reference", reference, "--json")
+    assert done.exit_code == 2
+    assert "remedy" in json.loads(done.stdout)["error"]
+
+
+def test_an_ortho_upside_down_is_refused_unless_it_is_searched(shifted, tmp_path):
+    turned = tmp_path / "turned.tif"
+    source = gdal.Open(str(shifted[0]))
+    made = gdal.GetDriverByName("GTiff").CreateCopy(str(turned), source)
+    made.GetRasterBand(1).WriteArray(source.ReadAsArray()[::-1, ::-1].copy())
+    made = None
+    assert run("verify", turned, "--reference", shifted[1], "--json").exit_code == 2
+    done = run("verify", turned, "--reference", shifted[1], "--search-rotation", "180", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["relative"]["rmse_px"]["value"] > 100
+
+
+def test_a_displacement_beyond_the_search_is_refused(shifted):
+    done = run("verify", shifted[0], "--reference", shifted[1], "--search", "2.2", "--json")
+    found = json.loads(done.stdout)
+    assert done.exit_code == 2 or abs(found["relative"]["bias_m"]["value"] - np.hypot(*SHIFTED.shift)) < 0.05
+
+
+def test_clouds_are_masked_by_their_classes(tmp_path):
+    pair = Pair(side=400, seed=2, ortho=Look(clouds=0.4), shift=(4.0, 2.0))
+    ortho, reference = pair.write(tmp_path)
+    classes = tmp_path / "scl.tif"
+    pixels = gdal.Open(str(ortho)).ReadAsArray()
+    made = gdal.GetDriverByName("GTiff").Create(str(classes), 400, 400, 1)
+    made.SetProjection(gdal.Open(str(ortho)).GetProjection())
+    made.SetGeoTransform(gdal.Open(str(ortho)).GetGeoTransform())
+    made.GetRasterBand(1).WriteArray(np.where(pixels > 2400, 9, 4).astype(np.uint8))
+    made = None
+    result = verify(ortho, match=MatchOptions(reference=[str(reference)]), masks=[f"{classes}=3,8-10"])
+    bias = result.document["relative"]
+    np.testing.assert_allclose(
+        [bias["bias_east_m"]["value"], bias["bias_north_m"]["value"]], pair.shift, atol=0.06, rtol=2e-3
+    )
+    assert result.document["matches"]["tried"] < 300
+    with pytest.raises(InputError, match="not a list of mask classes"):
+        verify(ortho, match=MatchOptions(reference=[str(reference)]), masks=[f"{classes}=clouds"])
+
+
+def test_a_folder_gives_one_table(shifted, tmp_path):
+    folder = tmp_path / "orthos"
+    folder.mkdir()
+    shutil.copy(shifted[0], folder / "a.tif")
+    (folder / "b.tif").write_bytes(b"no raster")
+    done = run("verify", folder, "--reference", shifted[1], "-o", tmp_path / "out", "--require", "ce90<4")
+    assert done.exit_code == 0, done.output
+    table = json.loads((tmp_path / "out" / "verify.json").read_text())
+    assert [Path(row["ortho"]).name for row in table["orthos"]] == ["a.tif", "b.tif"]
+    assert table["failed"] == 1
+    assert "error" in table["orthos"][1]
+    assert "a.tif" in (tmp_path / "out" / "verify.html").read_text()
+    assert (tmp_path / "out" / "a_verify.html").exists()
+
+
+def test_points_alone_say_how_accurate_an_ortho_is(shifted, tmp_path):
+    random = np.random.default_rng(1)
+    image = random.uniform(20, 300, (40, 2))
+    error = random.normal((1.5, -0.5), 0.4, (40, 2))
+    ground = CORNER + image * (1, -1) - error
+    rows = [
+        f"p{k},{c:.4f},{r:.4f},{x:.4f},{y:.4f}" for k, ((c, r), (x, y)) in enumerate(zip(image, ground, strict=True))
+    ]
+    points = tmp_path / "points.csv"
+    points.write_text("id,col,row,x,y\n" + "\n".join(rows))
+    words = "--points-crs", "EPSG:32735", "--json"
+    done = run("verify", shifted[0], "--gcps", points, *words)
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    found = document["points"]
+    assert found["count"] == 40
+    scale = document["pixel_m"]
+    np.testing.assert_allclose(found["bias_east_m"]["value"], error[:, 0].mean() * scale, rtol=0.01)
+    np.testing.assert_allclose(found["rmse_m"]["value"], np.sqrt((error**2).sum(axis=1).mean()) * scale, rtol=0.01)
+    assert "ASPRS 2023 class" in document["asprs"]
+    assert "Indicative" not in document["asprs"]
+    few = tmp_path / "few.csv"
+    few.write_text("id,col,row,x,y\n" + "\n".join(rows[:3]))
+    assert run("verify", shifted[0], "--gcps", few, *words).exit_code == 2
+
+
+def test_nothing_to_compare_with_is_an_error(shifted):
+    done = run("verify", shifted[0])
+    assert done.exit_code == 2
+    assert "--reference" in done.output
+    assert "--gcps" in done.output
+
+
+def test_intervals_of_points_cover_the_truth():
+    random = np.random.default_rng(7)
+    covered = {"bias_east": 0, "rmse": 0, "ce90": 0}
+    mean, root = np.array([0.8, -0.3]), np.array([[0.5, 0.0], [0.2, 0.4]])
+    length = np.hypot(*(mean + random.standard_normal((1_000_000, 2)) @ root.T).T)
+    true = {"bias_east": 0.8, "rmse": np.sqrt((length**2).mean()), "ce90": np.quantile(length, 0.9)}
+    for _ in range(200):
+        found = Accuracy.of_points(mean + random.standard_normal((25, 2)) @ root.T)
+        for name, value in true.items():
+            one = getattr(found, name)
+            covered[name] += one.low <= value <= one.high
+    assert all(180 <= count <= 198 for count in covered.values()), covered
+
+
+def test_displacements_by_wrong_heights_are_named(tmp_path):
+    hills = np.random.default_rng(3)
+    heights = 300.0 + 15.0 * field_of(hills, 256, 60.0)[:200, :200]
+    dem = tmp_path / "dem.tif"
+    made = gdal.GetDriverByName("GTiff").Create(str(dem), 200, 200, 1, gdal.GDT_Float32)
+    made.SetProjection(parse_crs("EPSG:32735").to_wkt())
+    made.SetGeoTransform((CORNER[0], 2.0, 0.0, CORNER[1], 0.0, -2.0))
+    made.GetRasterBand(1).WriteArray(heights)
+    made = None
+
+    class Leaning(Pair):
+        """Seen 6 degrees off vertical from the west, on ground that was taken to be flat at 280 m."""
+
+        def displacement(self):
+            def at(image):
+                where = [image[:, 1] / 2 - 0.5, image[:, 0] / 2 - 0.5]
+                above = map_coordinates(heights, where, order=1, mode="nearest") - 280.0
+                return np.column_stack([0.1 * above, np.zeros(len(image))])
+
+            return at
+
+    ortho, reference = Leaning(side=400, seed=6).write(tmp_path / "leaning")
+    options = SurfaceOptions(dem=str(dem), vertical="ellipsoid")
+    result = verify(ortho, match=MatchOptions(reference=[str(reference)]), surface=options)
+    found = result.document["heights"]
+    assert found["significant"]
+    np.testing.assert_allclose(found["rate_m_per_m"], 0.1, atol=0.015)
+    np.testing.assert_allclose(found["azimuth_deg"], 90.0, atol=8.0)
+    np.testing.assert_allclose(found["zero_height_m"], 280.0, atol=5.0)
+    assert result.document["causes"][0]["code"] == "heights"
+    assert "° off vertical" in result.document["causes"][0]["text"]
+
+
+def test_a_datum_that_explains_a_shift_is_named():
+    # WGS84 coordinates in Germany that were labelled as of ED50.
+    there = ground_transform("EPSG:4230", "EPSG:25832")([[9.0, 50.0, 0.0]])[0]
+    here = ground_transform("EPSG:4258", "EPSG:25832")([[9.0, 50.0, 0.0]])[0]
+    crs = parse_crs("EPSG:25832")
+    assert datum_of(crs, here, (here - there)[:2], 0.5) == "ED50"
+    assert datum_of(crs, here, np.array([40.0, -55.0]), 0.5) is None
+    assert datum_of(crs, here, np.array([2.0, 1.0]), 0.5) is None
