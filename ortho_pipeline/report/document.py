@@ -70,6 +70,9 @@ Array = NDArray[np.float64]
 
 #: Median of control height minus DEM height from which a difference of datums is suspected, metres.
 _SUSPICIOUS_HEIGHT = 5.0
+#: Typical difference between heights of points and of the surface beyond which the surface is not the ground, metres:
+#: twice the error that global DEMs state (90 %).
+_NOT_THE_GROUND = 20.0
 _MAX_BYTES = 50_000_000
 _DOCUMENT, _VERSION = "ortho-pipeline report", 1
 _REMEDY = "give a <stem>_report.json"
@@ -226,6 +229,9 @@ def _surface(surface: Surface, coverage: float | None) -> FlatGround | Dem:
 def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> tuple[PointHeights | None, list[Notice]]:
     """Compare the heights of the points with the DEM's: a difference of datums shows here and nowhere else."""
     points = fit.points
+    if isinstance(surface, FlatSurface):
+        difference = points.ground[:, 2] - surface.height
+        return None, _not_the_ground(difference[np.isfinite(difference)], seen)
     difference = surface.above(points.ground, points.crs)
     difference = difference[np.isfinite(difference)]
     if not len(difference):
@@ -243,8 +249,30 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
         )
         by = None if displacement is None else abs(median) * displacement
         doubts = [Notice("heights-disagree", text, median_m=median, spread_m=spread, moved_m=by)]
+    else:
+        doubts = _not_the_ground(difference, seen)
     warning = str(doubts[0]) if doubts else None
     return PointHeights(median_m=median, spread_m=spread, n=len(difference), warning=warning), doubts
+
+
+def _not_the_ground(difference: Array, seen: Mapping[str, Any]) -> list[Notice]:
+    """Return a notice if the surface is typically far from the points ``(n,)`` m, and that moves the ortho by a pixel.
+
+    Flat ground and voids that are filled are such surfaces: the fit uses the heights of the points and does not see it.
+    """
+    if len(difference) < 3:
+        return []
+    typical, worst = 1.4826 * float(np.median(np.abs(difference))), float(np.abs(difference).max())
+    moved = None if seen["lean_m_per_m"] is None else typical * seen["lean_m_per_m"]
+    if typical < _NOT_THE_GROUND:
+        return []
+    if moved is not None and moved < max(seen["ground_pixel_m"] or (0.0,)):
+        return []
+    text = (
+        f"the surface is typically {metres(typical)} (at most {metres(worst)}) from the heights of the points, so it "
+        f"is not the ground there{'' if moved is None else f'; that moves the ortho by {metres(moved)}'}"
+    )
+    return [Notice("surface-not-ground", text, typical_m=typical, worst_m=worst, moved_m=moved)]
 
 
 def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:

@@ -147,6 +147,9 @@ def refuted(notices: Iterable[Mapping[str, Any]]) -> str | None:
             apart = f"the heights of points and DEM differ by {metres(abs(one['median_m']))}"
             moved = one.get("moved_m")
             return apart if moved is None else f"{apart}, which moves the ortho by {metres(moved)}"
+        if one["code"] == "surface-not-ground":
+            apart, moved = f"the surface is typically {metres(one['typical_m'])} from the points", one.get("moved_m")
+            return apart if moved is None else f"{apart}, which moves the ortho by {metres(moved)}"
         if one["code"] in _UNTRUE:
             return _UNTRUE[one["code"]]
     return None

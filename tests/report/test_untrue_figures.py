@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from click.testing import CliRunner
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.report.wording import NO_SCALE
 
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 PIPELINE = """
 output: out
 defaults:
@@ -69,6 +71,22 @@ def test_no_output_shows_a_figure_that_an_error_makes_untrue(outputs, tiny):
     said = CliRunner().invoke(cli, given).output
     assert f"accuracy  unknown: {why}" in said
     assert f"map scale {NO_SCALE}" in said
+
+
+@pytest.mark.parametrize(("height", "unknown"), [(900, True), (None, False)])
+def test_flat_ground_that_is_not_the_ground_has_no_accuracy(tmp_path, height, unknown):
+    """The points' own heights adjust the model, so residuals of 0.2 px said nothing of an ortho that was 55 m off."""
+    surface = ("--dem", SAMPLE / "dem.tif") if height is None else ("--height", height)
+    words = ("rectify", SAMPLE / "scene.tif", "--gcps", SAMPLE / "gcps.geojson", *surface, "-o", tmp_path)
+    done = CliRunner().invoke(cli, [*map(str, words)])
+    assert done.exit_code == 0, done.output
+    document = json.loads((tmp_path / "scene_report.json").read_text())
+    codes = {one["code"]: one for one in document["notices"]}
+    assert ("surface-not-ground" in codes) == unknown
+    assert (document["headline"]["figure"] == "Accuracy unknown") == unknown
+    if unknown:
+        # Phase correlation with the right ortho found an RMS of 56 m.
+        assert 20.0 < codes["surface-not-ground"]["moved_m"] < 120.0
 
 
 def test_with_the_right_heights_all_of_them_show_it(outputs):

@@ -25,6 +25,7 @@ _STOP: dict[str, str] = {
         Setting("surface.vertical"),
         ") and repeat the job.",
     ),
+    "surface-not-ground": Text("Use a DEM that covers the scene (", Setting("surface.dem"), ")."),
     "model-elsewhere": "Check image, points, CRS, and the order of columns and rows.",
     "reference-made-of-scene": "Use another reference, one that was not made from this scene.",
     "unstable": "Add points, or use a simpler correction.",
