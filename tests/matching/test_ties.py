@@ -198,8 +198,8 @@ def test_scenes_of_different_places_have_no_ties(tmp_path):
 
 def test_resolutions_that_are_too_different_are_said_of_both_images(tmp_path):
     _, views = looks(tmp_path, [-14.0], side=280)
-    coarse = ImageCorrection(views[0].model, "affine", (0.0, 0.0), np.array([0.0, -0.9, 0, 0, 0, -0.9]))
-    with pytest.raises(InputError, match=r"a pixel of scene0.tif is 0.1 pixels of scene0.tif"):
+    coarse = ImageCorrection(views[0].model, "affine", (0.0, 0.0), np.array([0.0, -0.93, 0, 0, 0, -0.93]))
+    with pytest.raises(InputError, match=r"a pixel of scene0.tif is 0.07 pixels of scene0.tif"):
         tie([views[0], replace(views[0], model=coarse)], TieSettings(search=25.0))
 
 

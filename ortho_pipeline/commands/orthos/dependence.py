@@ -184,8 +184,9 @@ def causes_of(
     ):
         text = (
             f"the displacement bends by {size_m(rest)} (RMS) over the ortho. Wrong heights or a sensor model that was "
-            "not adjusted cause this. Give a DEM to test the heights"
+            "not adjusted cause this"
         )
+        text += ". Give a DEM to test the heights" if heights is None else ""
         found.append(Cause("smooth", text))
     return found
 
