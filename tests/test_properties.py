@@ -39,6 +39,8 @@ from ortho_pipeline.models import (
 )
 from ortho_pipeline.models.frame.camera import PARAMETERS
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.orthos.map_grid import MapGrid
+from ortho_pipeline.models.orthos.smooth_field import SmoothField
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.source import Grid, RasterSource
@@ -161,6 +163,24 @@ def pieces(draw: st.DrawFn) -> Pieces:
 
 
 @st.composite
+def map_grids(draw: st.DrawFn) -> MapGrid:
+    """Draw the grid of a finished ortho in UTM: rotated, and south-up or not."""
+    pixel, turn = draw(st.floats(0.3, 30.0)), draw(st.floats(-math.pi, math.pi))
+    east, north, down = pixel * math.cos(turn), pixel * math.sin(turn), draw(st.sampled_from((-1.0, 1.0)))
+    place = draw(st.floats(3e5, 7e5)), draw(st.floats(1e6, 8e6))
+    size = draw(st.integers(100, 5_000)), draw(st.integers(100, 5_000))
+    return MapGrid("EPSG:32639", (place[0], east, down * -north, place[1], north, down * east), size)
+
+
+@st.composite
+def smooth_fields(draw: st.DrawFn) -> SmoothField:
+    """Draw an ortho that a smooth field of up to 3 px moves."""
+    grid = draw(map_grids())
+    seed = draw(st.integers(0, 99))
+    return SmoothField(grid, grid.size, np.random.default_rng(seed).uniform(-3.0, 3.0, (3, 4, 2)))
+
+
+@st.composite
 def crops(draw: st.DrawFn) -> Cropped:
     """Draw a crop of an image that a correction moves."""
     return Cropped(draw(corrections()), (draw(st.floats(-1e4, 1e4)), draw(st.floats(-1e4, 1e4))))
@@ -168,7 +188,7 @@ def crops(draw: st.DrawFn) -> Cropped:
 
 MODELS = {
     RPC: rpcs, Rational: rationals, ImageCorrection: corrections, Cropped: crops, FrameCamera: frames,
-    MapPlane: map_planes, Pieces: pieces, Pushbroom: pushbrooms,
+    MapGrid: map_grids, MapPlane: map_planes, Pieces: pieces, Pushbroom: pushbrooms, SmoothField: smooth_fields,
 }  # fmt: skip
 EVERY_KIND = pytest.mark.parametrize("kind", MODELS, ids=lambda kind: kind.kind)
 

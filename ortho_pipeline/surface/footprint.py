@@ -151,7 +151,7 @@ class Footprint:
                     ", nearest, or an ellipsoidal height in metres",
                 )
                 if self.coverage
-                else "check the CRS of the DEM ('ortho info' shows it), or give a DEM of this place",
+                else "check the CRS of the DEM, or give a DEM of this place",
             )
         if self.coverage == 0.0 and surface.fill == "mask":
             raise CoverageError(
