@@ -139,7 +139,11 @@ def adjust(
         inside = blunders.kept
     if robust:
         problem = replace(solved.problem, pseudo=problem.pseudo)
-        solved, inside = _checked(attempt(problem, near, inside), inside)
+        again = attempt(problem, near, inside)
+        if dem_heights is not None and not again.converged:
+            # Heights that were renewed once may have no minimum in reach. Stable ones have.
+            again, dem_heights = dem_heights.settled(solved, inside)
+        solved, inside = _checked(again, inside)
     gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)

@@ -249,7 +249,7 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
         )
         by = None if displacement is None else abs(median) * displacement
         doubts = [Notice("heights-disagree", text, median_m=median, spread_m=spread, moved_m=by)]
-    else:
+    elif surface.coverage(points.ground[:, :2], points.crs) < 1.0:
         doubts = _not_the_ground(difference, seen)
     warning = str(doubts[0]) if doubts else None
     return PointHeights(median_m=median, spread_m=spread, n=len(difference), warning=warning), doubts

@@ -18,7 +18,7 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
 from ortho_pipeline.block.heights.spots import SpotDifferences
-from ortho_pipeline.block.heights.terrain import Terrain
+from ortho_pipeline.block.heights.terrain import LocalTerrain
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
@@ -57,7 +57,7 @@ class Heights:
         Points that take the height of the DEM, if it has one there.
     images : ndarray (N,)
         The first image that shows each point.
-    terrain : Terrain
+    terrain : LocalTerrain
         The DEM under the points.
     stated : ndarray (N,) or None
         Stated sigmas of the heights, m upwards.
@@ -80,7 +80,7 @@ class Heights:
     source: DemHeights
     of: Mask
     images: Index
-    terrain: Terrain
+    terrain: LocalTerrain
     stated: Array | None
     sigma: float
     own: Array
@@ -124,7 +124,7 @@ class Heights:
         images = np.full(count, len(problem.models))
         np.minimum.at(images, problem.points.point, problem.points.image)
         each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
-        terrain = Terrain.under(source, _places(problem, local), of, each, images)
+        terrain = LocalTerrain.under(source, _places(problem, local), of, each, images)
         heights = cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
         if spots is None:
             return heights
@@ -154,7 +154,7 @@ class Heights:
         """Return them with the DEM under points at `local` ``(N, 3)``."""
         ground = _places(problem, local)
         return replace(
-            self, terrain=Terrain.under(self.source, ground, self.of, self.sigmas, self.images, self.terrain)
+            self, terrain=LocalTerrain.under(self.source, ground, self.of, self.sigmas, self.images, self.terrain)
         )
 
     def settled(self, solved: Solved, selection: Selection, rounds: int = _ROUNDS) -> tuple[Solved, Heights]:

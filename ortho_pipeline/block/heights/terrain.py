@@ -32,7 +32,7 @@ _MOVED = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Terrain:
+class LocalTerrain:
     """The DEM under N points.
 
     Parameters
@@ -58,8 +58,14 @@ class Terrain:
 
     @classmethod
     def under(
-        cls, source: DemHeights, ground: Array, of: Mask, sigmas: Array, images: Index, before: Terrain | None = None
-    ) -> Terrain:
+        cls,
+        source: DemHeights,
+        ground: Array,
+        of: Mask,
+        sigmas: Array,
+        images: Index,
+        before: LocalTerrain | None = None,
+    ) -> LocalTerrain:
         """Return it under points.
 
         Parameters
@@ -72,7 +78,7 @@ class Terrain:
             Standard deviations of the heights, m.
         images : ndarray (N,)
             An image that shows each point.
-        before : Terrain, optional
+        before : LocalTerrain, optional
             Its slopes stay where points have hardly moved.
         """
         count, spacing = len(ground), source.spacing(sigmas[of])

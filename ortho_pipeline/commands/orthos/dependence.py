@@ -79,7 +79,7 @@ class HeightDependence:
 
 
 @dataclass(frozen=True)
-class Step:
+class FieldStep:
     """A step of the displacement at a column or row: a detector join, a seam of a mosaic, or a jump of the attitude."""
 
     axis: str
@@ -115,7 +115,7 @@ def height_dependence(measured: MeasuredOrtho, surface: Surface) -> HeightDepend
     )
 
 
-def steps_of(measured: MeasuredOrtho, field: DisplacementField) -> list[Step]:
+def steps_of(measured: MeasuredOrtho, field: DisplacementField) -> list[FieldStep]:
     """Return the largest steps along columns and rows, if there are any."""
     found = []
     for axis, name in ((0, "column"), (1, "row")):
@@ -127,11 +127,11 @@ def steps_of(measured: MeasuredOrtho, field: DisplacementField) -> list[Step]:
     return found
 
 
-def _strength(step: Step) -> float:
+def _strength(step: FieldStep) -> float:
     return math.hypot(step.east, step.north) / max(step.sigma, 1e-12)
 
 
-def _steps(measured: MeasuredOrtho, axis: int, name: str) -> list[Step]:
+def _steps(measured: MeasuredOrtho, axis: int, name: str) -> list[FieldStep]:
     along, values = measured.image[:, axis], measured.displacement
     low, high = along.min(), along.max()
     window, found = _WINDOW * (high - low), []
@@ -149,7 +149,7 @@ def _steps(measured: MeasuredOrtho, axis: int, name: str) -> list[Step]:
         left = values[near] - design @ (inverse @ values[near])
         variance = (left**2).sum() / max(len(off) - design.shape[1], 1) / 2
         sigma = float(np.sqrt(variance * (inverse[0] ** 2).sum()))
-        found.append(Step(name, float(at), float(size[0]), float(size[1]), sigma))
+        found.append(FieldStep(name, float(at), float(size[0]), float(size[1]), sigma))
     return found
 
 
@@ -168,7 +168,7 @@ class Cause:
 
 
 def causes_of(
-    verified: Verified, relative: Accuracy, heights: HeightDependence | None, steps: Sequence[Step]
+    verified: Verified, relative: Accuracy, heights: HeightDependence | None, steps: Sequence[FieldStep]
 ) -> list[Cause]:
     """Return the likely causes of the displacement, the most specific first."""
     measured = verified.measured
@@ -253,7 +253,7 @@ def _of_shift(verified: Verified, relative: Accuracy) -> list[Cause]:
     return [Cause("shift", f"the whole ortho is shifted by {size_m(length)} towards azimuth {azimuth:.0f}°")]
 
 
-def _of_step(step: Step, measured: MeasuredOrtho) -> Cause:
+def _of_step(step: FieldStep, measured: MeasuredOrtho) -> Cause:
     size = math.hypot(step.east, step.north)
     text = (
         f"the displacement jumps by {size_m(size)} at {step.axis} {step.at:.0f}. A seam line of a mosaic, a join of "

@@ -11,7 +11,13 @@ import numpy as np
 
 from ortho_pipeline.commands.control.points import read_control
 from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
-from ortho_pipeline.commands.orthos.dependence import HeightDependence, Step, causes_of, height_dependence, steps_of
+from ortho_pipeline.commands.orthos.dependence import (
+    FieldStep,
+    HeightDependence,
+    causes_of,
+    height_dependence,
+    steps_of,
+)
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, measure_ortho
 from ortho_pipeline.commands.orthos.opening import open_ortho
@@ -194,7 +200,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
     pixel, field = measured.pixel, verified.field
     relative = verified.relative()
     heights: HeightDependence | None = None if surface is None else height_dependence(measured, surface)
-    steps: list[Step] = steps_of(measured, field)
+    steps: list[FieldStep] = steps_of(measured, field)
     matched = measured.searched.record
     bands = _bands(measured)
     cells = [

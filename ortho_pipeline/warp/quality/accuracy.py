@@ -36,7 +36,7 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.rays import levels, polynomials
 from ortho_pipeline.warp.quality import accuracy_kernel
-from ortho_pipeline.warp.quality.accuracy_kernel import Heights, Nodes
+from ortho_pipeline.warp.quality.accuracy_kernel import Nodes, PixelHeights
 from ortho_pipeline.warp.quality.error_ellipse import circular_error, circular_error_of_all, radii
 from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.tile_kernel import DemWindow
@@ -404,12 +404,12 @@ class _Layer:
         share = min(1.0, side / height) * min(1.0, side / width)
         return float(8 * share * np.ptp(finite, axis=0).prod(axis=0).sum())
 
-    def _heights(self, samples: Array) -> Heights:
+    def _heights(self, samples: Array) -> PixelHeights:
         """Return the heights under some nodes, and how good they are."""
         dem, sigma, datum = _window(self.surface, samples[..., 0]), self.budget.heights, self.budget.datum**2
         if isinstance(sigma, Surface):
-            return Heights(dem, _window(sigma, samples[..., 1]), -1.0, datum)
-        return Heights(dem, dem, float(sigma or 0.0), datum)
+            return PixelHeights(dem, _window(sigma, samples[..., 1]), -1.0, datum)
+        return PixelHeights(dem, dem, float(sigma or 0.0), datum)
 
     def _count(self, left: int, top: int, bands: NDArray[np.float32]) -> None:
         _, height, width = bands.shape

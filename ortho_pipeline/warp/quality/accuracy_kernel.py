@@ -33,7 +33,7 @@ class Nodes(NamedTuple):
     half: float
 
 
-class Heights(NamedTuple):
+class PixelHeights(NamedTuple):
     """Heights and how good they are: `constant` is their standard deviation unless negative, `datum` a variance."""
 
     dem: DemWindow
@@ -43,7 +43,7 @@ class Heights(NamedTuple):
 
 
 @compiled
-def fill(lattice: Nodes, heights: Heights, even: float, size: Any, radii: Any, bands: Any, totals: Any) -> None:
+def fill(lattice: Nodes, heights: PixelHeights, even: float, size: Any, radii: Any, bands: Any, totals: Any) -> None:
     """Fill bands ``(4, h, w)``, which stay as they are where nothing is seen or known.
 
     `even` is a variance, `size` that of the image. `totals` ``(8,)`` grows by the variances of the parts, of east and
