@@ -96,6 +96,9 @@ class FakeSurface:
     def above(self, ground: np.ndarray, crs: Any) -> np.ndarray:
         return ground[:, 2] - TERRAIN(ground[:, 0], ground[:, 1]) - self.offset
 
+    def coverage(self, xy: np.ndarray, crs: Any) -> float:
+        return 1.0
+
 
 # -- numbers ---------------------------------------------------------------------------------------------------------
 
