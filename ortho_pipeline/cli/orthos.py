@@ -14,6 +14,7 @@ from ortho_pipeline.cli.options import (
     folder_option,
     json_option,
     matching_options,
+    optional_folder,
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
@@ -54,14 +55,7 @@ _band_option = click.option(
     metavar="'ce90<M'",
     help="Limit of bias, rmse or ce90, in m or px. The exit code is 4 if it is not met. May be repeated.",
 )
-@click.option(
-    "--output",
-    "-o",
-    "folder",
-    type=click.Path(file_okay=False),
-    metavar="DIR",
-    help="Folder for the report, its numbers and the displacements.",
-)
+@optional_folder("Folder for the report, its numbers and the displacements.")
 @open_option
 @click_options("scene", SceneOptions, "allow_network", "roots")
 @click_options("output", OutputOptions, "memory", "threads")

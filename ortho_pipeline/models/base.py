@@ -16,6 +16,8 @@ from ortho_pipeline.errors import InputError
 
 #: The type of all arrays of coordinates and parameters.
 Array = NDArray[np.float64]
+#: Corners of an image from the upper left, clockwise, in parts of its size.
+RING = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 
 #: Newton's method stops at this distance (px) from the image point.
 INVERSE_TOLERANCE = 1e-9
@@ -365,6 +367,12 @@ def box_around(ground: Array, heights: tuple[float, float]) -> tuple[Array, Arra
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     low[2], high[2] = heights
     return (low + high) / 2, (high - low) / 2
+
+
+def ground_of_corners(model: SensorModel, size: tuple[int, int], heights: tuple[float, float]) -> Array:
+    """Return the ground ``(8, 3)`` of the corners of an image of `size` (columns, rows), clockwise, at two heights."""
+    image = RING * size
+    return np.concatenate([model.image_to_ground(image, height) for height in heights])
 
 
 def solve_2x2(matrices: Array, right: Array) -> Array:

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
-from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
+from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image, box_around, ground_of_corners
 
 PARAMETERS = ("shift_x", "shift_y", "relief_x", "relief_y")
 #: Length (m) over which a direction on the ellipsoid is converted to the map.
@@ -142,15 +142,11 @@ class MapPlane(SensorModel):
 
     @property
     def domain(self) -> tuple[Array, Array]:
-        corners = self.corners
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        return (low + high) / 2, (high - low) / 2
+        return box_around(self.corners, self.heights)
 
     @property
     def corners(self) -> Array:
-        width, height = self.size
-        frame = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
-        return np.concatenate([self.image_to_ground(frame, level) for level in self.heights])
+        return ground_of_corners(self, self.size, self.heights)
 
     @property
     def height_range(self) -> tuple[float, float]:

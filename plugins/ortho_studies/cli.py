@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ortho_pipeline.cli.options import folder_option, json_option
+from ortho_pipeline.cli.options import folder_option, json_option, optional_folder
 from ortho_pipeline.cli.parsing import Command, Group
 from ortho_pipeline.cli.printing import print_result, progress
 from ortho_pipeline.cli.survey.examples import with_examples
@@ -73,9 +73,7 @@ def _simulation(study: Study) -> click.Command:
 
 
 def _experiment(study: Study) -> click.Command:
-    @click.option(
-        "--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder for the page."
-    )
+    @optional_folder("Folder for the page.")
     @click.option(
         "--realisations",
         type=click.IntRange(min=1),

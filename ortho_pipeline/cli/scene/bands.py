@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import click
 
-from ortho_pipeline.cli.options import folder_option, image_argument, json_option, network_option, scene_options
+from ortho_pipeline.cli.options import (
+    folder_option,
+    image_argument,
+    json_option,
+    network_option,
+    optional_folder,
+    scene_options,
+)
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result
 from ortho_pipeline.options import SceneOptions
@@ -16,14 +23,7 @@ from ortho_pipeline.options import SceneOptions
     "--edge", metavar="X1,Y1,X2,Y2", help="Columns and rows of the ends of one edge.  [default: found automatically]"
 )
 @click.option("--band", type=click.IntRange(min=1), default=1, show_default=True, help="Band to measure.")
-@click.option(
-    "--output",
-    "-o",
-    "folder",
-    type=click.Path(file_okay=False),
-    metavar="DIR",
-    help="Folder for the result (JSON) and a plot.",
-)
+@optional_folder("Folder for the result (JSON) and a plot.")
 @network_option
 @json_option
 def edge(image: str, edge: str | None, band: int, folder: str | None, scene: SceneOptions, as_json: bool) -> None:

@@ -9,6 +9,7 @@ from ortho_pipeline.cli.options import (
     image_argument,
     json_option,
     match_options,
+    optional_folder,
     point_options,
     scene_options,
     surface_options,
@@ -50,7 +51,7 @@ def fit(
 @image_argument
 @click.option("--models", default="all", show_default=True, metavar="all|A,B,C", help="Models to compare.")
 @click.option("--units", type=click.Choice(["px", "m"]), default="px", show_default=True, help="Units of the table.")
-@click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help="Folder of the report.")
+@optional_folder("Folder of the report.")
 @point_options
 @match_options
 @scene_options

@@ -26,12 +26,14 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.models.base import (
+    RING,
     Array,
     SensorModel,
     as_ground,
     as_image,
     box_around,
     checked_names,
+    ground_of_corners,
     ground_of_grid,
 )
 from ortho_pipeline.models.frame.collinearity import Exterior, directions, image_by_vector, rays
@@ -63,8 +65,6 @@ LOOKS_PAST = Notice(
 )
 #: A point that the camera does not see is NaN, not a warning.
 _quiet = partial(np.errstate, invalid="ignore", divide="ignore", over="ignore")
-#: Corners of the image from the upper left, in parts of its size.
-_RING = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +198,7 @@ class FrameCamera(SensorModel):
 
         The box of `domain` is parallel to the ground axes, so its corners are far outside a rotated image.
         """
-        size = (self.interior.width, self.interior.height)
-        image = _RING * size
-        return np.concatenate([self.image_to_ground(image, height) for height in self.heights])
+        return ground_of_corners(self, (self.interior.width, self.interior.height), self.heights)
 
     @property
     def perspective_centre(self) -> Array:
@@ -294,7 +292,7 @@ class FrameCamera(SensorModel):
         """Return the corners ``(4, 3)`` of a square below the camera, as wide as the field of view."""
         centre = self.perspective_centre
         reach = max(abs(centre[2] - sum(self.heights) / 2), 1.0) * math.tan(min(self.interior.field_of_view, 1.4))
-        corners = (2 * _RING - 1) * reach / self.working_frame.metres_per_unit(centre)
+        corners = (2 * RING - 1) * reach / self.working_frame.metres_per_unit(centre)
         return np.column_stack([centre[:2] + corners, np.full(4, self.heights[0])])
 
     # -- files -------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import horizontal, parse_crs
-from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image
+from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image, box_around, ground_of_corners
 
 #: Heights (m, ellipsoidal) of all ground.
 _HEIGHTS = -500.0, 9000.0
@@ -86,15 +86,11 @@ class MapGrid(SensorModel):
 
     @property
     def domain(self) -> tuple[Array, Array]:
-        corners = self.corners
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        return (low + high) / 2, (high - low) / 2
+        return box_around(self.corners, _HEIGHTS)
 
     @property
     def corners(self) -> Array:
-        width, height = self.size
-        frame = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
-        return np.concatenate([self.image_to_ground(frame, level) for level in _HEIGHTS])
+        return ground_of_corners(self, self.size, _HEIGHTS)
 
     @property
     def reference_height(self) -> float:
