@@ -17,7 +17,7 @@ from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.common_heights import CommonHeights, correlated
 from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
-from ortho_pipeline.block.heights.spots import SpotDifferences
+from ortho_pipeline.block.heights.spots import NORMAL, SpotDifferences
 from ortho_pipeline.block.heights.terrain import LocalTerrain
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.estimation.observations.on_points import Planes
@@ -42,8 +42,6 @@ _ENOUGH, _REDUNDANT = 50, 0.2
 _SIGNIFICANT = 2.5
 #: Standard deviation (m) before the adjustment of a bias that spot heights fix.
 _FREE = 100.0
-#: The sigma of a normal distribution over its median absolute value.
-_NORMAL = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +253,7 @@ class Heights:
             scaled = np.concatenate([scaled, self.sigma * self.spots.standardised(self.common, self.sigma)])
         if len(scaled) < _ENOUGH:
             return self
-        sigma = _NORMAL * float(np.median(scaled))
+        sigma = NORMAL * float(np.median(scaled))
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 

@@ -22,7 +22,7 @@ from ortho_pipeline.points.heights.spot_heights import SpotHeights
 #: A spot with a larger difference, in sigmas, is left out.
 _WRONG = 4.0
 #: The sigma of a normal distribution over its median absolute value.
-_NORMAL = 1.4826
+NORMAL = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class SpotDifferences:
         )
         spread = np.sqrt(found.variances(sigma, shared=False))
         middle = np.median(apart[known])
-        typical = np.maximum(spread, _NORMAL * np.median(np.abs(apart[known] - middle)))
+        typical = np.maximum(spread, NORMAL * np.median(np.abs(apart[known] - middle)))
         with np.errstate(invalid="ignore"):
             return replace(found, wrong=np.abs(apart - middle) > _WRONG * typical)
 

@@ -14,8 +14,8 @@ from scipy import stats
 
 from ortho_pipeline.commands.inputs import check_paths
 from ortho_pipeline.commands.orthos.masks import ClassMask
-from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, affine_of, measure_ortho, smooth_field
-from ortho_pipeline.commands.orthos.statistics import tested_cells
+from ortho_pipeline.commands.orthos.measuring import BENDING, MeasuredOrtho, affine_of, measure_ortho, smooth_field
+from ortho_pipeline.commands.orthos.statistics import Verified, tested_cells
 from ortho_pipeline.commands.orthos.verifying import displacements, document_of
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, to_store
@@ -40,8 +40,6 @@ from ortho_pipeline.surface.flat import FlatSurface
 
 #: The corrections, from simple to flexible.
 CORRECTIONS = ("shift", "affine", "field")
-#: How much the displacement may change per pixel.
-BENDING = 0.02
 #: A field is justified if it predicts held-out matches better: by this part of the variance, at this chance, and if it
 #: bends by so many pixels (RMS).
 _BETTER, _CHANCE, _BENDS = 0.2, 1e-3, 0.05
@@ -94,7 +92,7 @@ def align(
     _refuse_contradictions(match, correction, bending, resample)
     hidden = [ClassMask.parse(text) for text in masks]
     measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
-    before = document_of(measured, match)
+    before = Verified.of(measured).relative().to_json(measured.pixel)
     chosen = _choose(measured, "shift" if not resample else correction, bending)
     stem = Path(ortho).stem
     as_vrt = not resample and output.format != "GTiff"
@@ -110,7 +108,7 @@ def align(
         dataset = open_dataset(ortho, **scene.access)
         moved = moved_geotransform(_grid_of(measured).geotransform, chosen.shift)
         write_moved(dataset, moved, files["ortho"])
-    document = _after(files["ortho"], measured, match, scene, output, band) | {"before": before["relative"]}
+    document = _after(files["ortho"], measured, match, scene, output, band) | {"before": before}
     document["correction"] = _described(chosen)
     document["resampled"] = resample
     with together(folder, stem):
@@ -121,7 +119,7 @@ def align(
         write_page(
             document, files["html"], files["ortho"], scene.access | {"roots": (Path(ortho).parent, *scene.roots)}
         )
-    return Result(files, document, _summary(document, before))
+    return Result(files, document, _summary(document))
 
 
 def _refuse_contradictions(match: MatchOptions, correction: str | None, bending: float, resample: bool) -> None:
@@ -221,7 +219,7 @@ def _justified(kept: MeasuredOrtho, field: DisplacementField, cells: Array) -> t
     better = 1.0 - float(with_field.sum() / max(without.sum(), 1e-300))
     bends = float(np.sqrt((field.mean(cells) ** 2).sum(axis=1).mean()))
     if chance < _CHANCE and better > _BETTER and bends > _BENDS:
-        return "field", f"a smooth field reduces the variance of held-out matches by {better:.0%}"
+        return "field", f"it reduces the variance of held-out matches by {better:.0%}"
     points = kept.matched.matches.points
     inside = np.isin(np.round(points.image, 6).view("c16").ravel(), np.round(kept.image, 6).view("c16").ravel())
     correction, _ = by_matches(kept.scene, points.select(inside))
@@ -302,11 +300,11 @@ def _described(chosen: Chosen) -> dict[str, Any]:
     }
 
 
-def _summary(document: Mapping[str, Any], before: Mapping[str, Any]) -> str:
+def _summary(document: Mapping[str, Any]) -> str:
     correction = document["correction"]
     called = {"shift": "a shift", "affine": "an affine transformation", "field": "a smooth field"}
     lines = [f"Corrected by {called[correction['kind']]}: {correction['reason']}"]
-    for title, found in (("Before", before["relative"]), ("After", document["relative"])):
+    for title, found in (("Before", document["before"]), ("After", document["relative"])):
         numbers = ", ".join(
             f"{name} {found[f'{key}_m']['value']:.2f} m" for key, name in (("ce90", "CE90"), ("bias", "bias"))
         )

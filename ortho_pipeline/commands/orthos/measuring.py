@@ -37,8 +37,10 @@ _AGAIN, _NEAR, _NEAR_CHIPS = 2, 6.0, 3.0
 #: The field of a matching is followed by another one if it bends by so many px (and chip px), or if so many matches
 #: contradicted the others.
 _BENDS, _CONTRADICT = 0.3, 0.1
-#: Knots of the field along the longer side, at most; and what it may change per pixel.
-_KNOTS, _BENDING = 14, 0.02
+#: Knots of the field along the longer side, at most.
+_KNOTS = 14
+#: How much the displacement of a field may change per pixel, unless stated.
+BENDING = 0.02
 #: Matches share noise up to so many sides of their chips: calibrated with drawn pairs.
 _SHARED = 1.5
 #: Number of bands that are tried alone if all of them together do not match.
@@ -146,11 +148,12 @@ def measure_ortho(
 
 def default_search(scene: Scene) -> float:
     """Return the default search radius (m) of an ortho: 100 m or 30 pixels, at most a quarter of its shorter side."""
-    pixel = _pixel(scene)
+    pixel = pixel_of(scene)
     return min(max(_METRES, _PIXELS * pixel), _PART * min(scene.width, scene.height) * pixel)
 
 
-def _pixel(scene: Scene) -> float:
+def pixel_of(scene: Scene) -> float:
+    """Return the size (m) of a pixel in the middle of an ortho."""
     middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), 0.0)
     plan, _ = metre_partials(scene.model, middle)
     return float(1.0 / np.sqrt(abs(np.linalg.det(plan[0]))))
@@ -236,7 +239,7 @@ def following(measured: MeasuredOrtho) -> SensorModel | None:
     contradict = float((reason == "contradicts").sum()) / max(1, int((reason != "hidden").sum()))
     if bends < _BENDS * measured.matched.matches.factor and contradict < _CONTRADICT:
         return None
-    return smooth_field(affine, field, measured.size, _BENDING)
+    return smooth_field(affine, field, measured.size, BENDING)
 
 
 def affine_of(measured: MeasuredOrtho) -> ImageCorrection:

@@ -19,7 +19,7 @@ from ortho_pipeline.commands.orthos.dependence import (
     steps_of,
 )
 from ortho_pipeline.commands.orthos.masks import ClassMask
-from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, measure_ortho
+from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, measure_ortho, pixel_of
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import FEWEST_POINTS, Accuracy, Verified, profile
@@ -164,7 +164,7 @@ def document_of(
 ) -> dict[str, Any]:
     """Return what is published of an ortho: of its matches, or of points alone where it was not matched."""
     opened = found if isinstance(found, Scene) else found.scene
-    pixel = _pixel(opened)
+    pixel = pixel_of(opened)
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "ortho": str(opened.path),
@@ -186,12 +186,6 @@ def document_of(
     if isinstance(found, MeasuredOrtho):
         notices += _notices(document, found, match.reference_sigma)
     return document | to_document(notices)
-
-
-def _pixel(opened: Scene) -> float:
-    middle = opened.model.image_to_ground(np.array([[opened.width / 2, opened.height / 2]]), 0.0)
-    plan, _ = metre_partials(opened.model, middle)
-    return float(1.0 / np.sqrt(abs(np.linalg.det(plan[0]))))
 
 
 def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigma: float | None) -> dict[str, Any]:
