@@ -144,15 +144,17 @@ def refuted(notices: Iterable[Mapping[str, Any]]) -> str | None:
             # Earlier versions did not count them.
             return contradicting(one.get("off", 0), one["count"], one["points"], what)
         if one["code"] == "heights-disagree":
-            apart = f"the heights of points and DEM differ by {metres(abs(one['median_m']))}"
-            moved = one.get("moved_m")
-            return apart if moved is None else f"{apart}, which moves the ortho by {metres(moved)}"
+            return _moving(f"the heights of points and DEM differ by {metres(abs(one['median_m']))}", one)
         if one["code"] == "surface-not-ground":
-            apart, moved = f"the surface is typically {metres(one['typical_m'])} from the points", one.get("moved_m")
-            return apart if moved is None else f"{apart}, which moves the ortho by {metres(moved)}"
+            return _moving(f"the surface is typically {metres(one['typical_m'])} from the points", one)
         if one["code"] in _UNTRUE:
             return _UNTRUE[one["code"]]
     return None
+
+
+def _moving(cause: str, notice: Mapping[str, Any]) -> str:
+    moved = notice.get("moved_m")
+    return cause if moved is None else f"{cause}, which moves the ortho by {metres(moved)}"
 
 
 def instead(figure: str, what: str, notices: Iterable[Mapping[str, Any]]) -> tuple[str, str] | None:

@@ -55,16 +55,6 @@ HALF_RANGE = 500.0
 SIGMAS = {"shift_x": 25.0, "shift_y": 25.0, "relief_x": 0.01, "relief_y": 0.01}
 #: RPC and metadata that differ by more than this on the plane (px) belong to different images.
 DISAGREEMENT = 1.0
-_CHOOSE = Text(
-    "choose the RPC with ",
-    Setting("scene.rpc", "tag"),
-    ", ",
-    Setting("scene.rpc", "sidecar"),
-    " or ",
-    Setting("scene.rpc", "FILE"),
-    ", or the metadata with ",
-    Setting("scene.sensor_options", "geo", key="geometry"),
-)
 
 
 @hookimpl
