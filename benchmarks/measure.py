@@ -38,7 +38,7 @@ LON, LAT, CRS, GSD = 33.35, 37.25, "EPSG:32636", 1.0
 
 
 def write_model(path: Path, side: int, off_nadir_deg: float) -> RPC:
-    """Write the RPC of a scene beside it, and return it."""
+    """Write the RPC of a scene next to it, and return it."""
     camera = LineScanner.over(
         LON, LAT, 850.0, image_width=side, image_height=side, gsd=GSD, off_nadir_deg=off_nadir_deg,
         heights=(600.0, 1400.0),
@@ -105,7 +105,7 @@ def write(folder: Path, side: int) -> None:
     origin = (x - reach, GSD, 0, y + reach, 0, -GSD)
     write_noise(folder, "scene", side, noise)
     if (mosaic := folder / "scene.vrt").exists():
-        # GDAL reads no text beside a mosaic.
+        # GDAL reads no text next to a mosaic.
         made = gdal.Open(str(mosaic), gdal.GA_Update)
         made.SetMetadata(rpc_metadata(rpc), "RPC")
         made.FlushCache()

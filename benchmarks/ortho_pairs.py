@@ -31,7 +31,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions  # noqa: E402
 
 
 def trial(seed: int, *, elsewhere: bool) -> dict[str, Any]:
-    """Return what `ortho verify` says of one pair, beside the truth; lengths in px of the coarser image."""
+    """Return what `ortho verify` says of one pair, next to the truth; lengths in px of the coarser image."""
     pair: Pair = drawn(seed, elsewhere=elsewhere)
     coarse = max(pair.ortho.gsd, pair.reference.gsd)
     row: dict[str, Any] = {

@@ -3,7 +3,7 @@
     python benchmarks/regress.py OLD NEW               all jobs, 11 pairs of runs each
     python benchmarks/regress.py OLD NEW --job warp    one of them; may be repeated
 
-Both commits are checked out beside each other and use the packages of this environment. Runs alternate, and so does
+Both commits are checked out next to each other and use the packages of this environment. Runs alternate, and so does
 which commit begins; a run is a whole process, and CPU seconds are compared, which other work on the machine disturbs
 less than wall time. For each job the median of the ratios new to old is printed, with the interval that holds the
 median of such ratios in 95 of 100 cases. The exit code is 1 if a job surely became slower by more than 5 %.

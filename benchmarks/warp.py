@@ -4,7 +4,7 @@
     python benchmarks/warp.py --dem-crs EPSG:4326    the same with a DEM in longitude and latitude
     python benchmarks/warp.py --scaling        1000² to 40000², 32 bands, Float32, JPEG 2000, one thread
     python benchmarks/warp.py --kernels        by kernel, number of bands and sensor model
-    python benchmarks/warp.py --layers         what layers beside the ortho cost, as shares of the warp alone
+    python benchmarks/warp.py --layers         what layers next to the ortho cost, as shares of the warp alone
     python benchmarks/warp.py --cog            COGs with ZSTD and overviews beside GDAL's COG driver on finished pixels
     python benchmarks/warp.py --accuracy       every output pixel of a ramp against an independent exact evaluation
 

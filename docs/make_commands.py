@@ -184,7 +184,7 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
         "output": _NAMED,
         "gcps": "You have points already, and add more.",
         "dem": "Reference and image must match in hilly ground, and points need heights.",
-        "reference": "You read the ground coordinates from an orthoimage that is shown beside the image.",
+        "reference": "You read the ground coordinates from an orthoimage that is shown next to the image.",
     },
     "rectify": {
         "dem": "You make an ortho of anything but flat ground. `auto` downloads the Copernicus DEM.",

@@ -44,7 +44,7 @@ def main(folder: Path = IMAGES) -> None:
 
 
 def played(page: Path, folder: Path, *, slow: bool = True) -> Iterator[int | None]:
-    """Do what a page says in `folder`: its sessions, and its Python beside the files that it wrote.
+    """Do what a page says in `folder`: its sessions, and its Python next to the files that it wrote.
 
     Gives the number of each step after it was done, and None at the end.
 
@@ -133,7 +133,7 @@ def first_ortho(path: Path) -> None:
 
 
 def matches(path: Path) -> None:
-    """Draw chips of the scene beside those of the reference."""
+    """Draw chips of the scene next to those of the reference."""
     found = op.match_scene(
         op.open_scene("sample_data/scene.tif"),
         op.MatchOptions(reference=["sample_data/reference.tif"], points=100),
@@ -154,7 +154,7 @@ def matches(path: Path) -> None:
 
 
 def reference_off(path: Path) -> None:
-    """Draw the residuals of surveyed points beside the model that was matched."""
+    """Draw the residuals of surveyed points next to the model that was matched."""
     model = op.read_rpc("relative/scene_RPC.TXT")
     points = op.read_points("sample_data/gcps.geojson")
     off = points.image - model.ground_to_image(points.ground)

@@ -18,7 +18,7 @@ sensor model; the mathematics stays in `ortho_pipeline.models`. A complete plugi
         return Scene("tinysat", dataset.GetDescription(), dataset.RasterXSize, dataset.RasterYSize, {"rpc": rpc},
                      source, facts={"band": int(band)})
 
-To find files beside an image, use ``ortho_pipeline.plugin.place(dataset.GetDescription())``. It has the methods of
+To find files next to an image, use ``ortho_pipeline.plugin.place(dataset.GetDescription())``. It has the methods of
 `pathlib.Path`, for images on disk and in archives (docs/plugin-reference.md).
 
 The host tries every scene at a few points before it uses it (`ortho_pipeline.host.contract`).
@@ -271,8 +271,8 @@ class Sensor:
         A fallback sensor opens a general kind of product. It is asked only if no other sensor recognises the dataset.
         It is also used if it alone declares the options that the user gave.
     metadata_beside : callable(image) -> Path, optional
-        Where an image has its metadata, if a product is one image and one file beside it (`Scene.model_source`). With a
-        copy there, another image of the same pixels is such a product too (`ortho register` does this).
+        Where an image has its metadata, if a product is one image and one file (`Scene.model_source`) next to it. With
+        a copy there, another image of the same pixels is such a product too (`ortho register` does this).
 
     Examples
     --------

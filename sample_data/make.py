@@ -1,6 +1,6 @@
 """Make the sample data: a simulated satellite scene, its RPC, a DEM, ground control, and the truth behind them.
 
-Beside it a small BILSAT-1 frame with its imaging survey, a small IKONOS Geo delivery, a CARTOSAT-1 pair and two
+Next to it a small BILSAT-1 frame with its imaging survey, a small IKONOS Geo delivery, a CARTOSAT-1 pair and two
 OrbView-3 scenes, in folders of their own.
 
 Run ``python sample_data/make.py [FOLDER]``; without a folder the files of this one are written again. Everything comes
@@ -119,7 +119,7 @@ def as_delivered(measured: Points) -> Points:
 
 
 def write_scene(image: np.ndarray, path: Path) -> None:
-    """Write the image without any georeference: the RPC beside it is all there is."""
+    """Write the image without any georeference: the RPC next to it is all there is."""
     rows, cols = image.shape
     options = ["COMPRESS=DEFLATE", "PREDICTOR=2", "ZLEVEL=9", "TILED=YES"]
     with whole_or_nothing(path) as temporary:

@@ -55,7 +55,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=f"this GDAL was built without {mark.args[0]}"))
     if REAL.is_dir():
         return
-    skip = pytest.mark.skip(reason="the real scenes (../shared/data beside the checkout) are not on this machine")
+    skip = pytest.mark.skip(reason="the real scenes (../shared/data next to the checkout) are not on this machine")
     for item in items:
         if "realdata" in item.keywords:
             item.add_marker(skip)

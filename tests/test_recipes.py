@@ -47,7 +47,7 @@ def test_the_dockerfile_has_no_faults_that_linters_know():
 
 
 def test_the_image_is_made_of_what_its_steps_read(tmp_path):
-    """The step that compiles is done with the files that are copied for it; the RPC beside the scene was not."""
+    """The step that compiles is done with the files that are copied for it; the RPC next to the scene was not."""
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8").replace("\\\n", " ")
     copied = [line.split()[1:] for line in text.splitlines() if line.startswith("COPY ") and "--from" not in line]
     for *sources, target in copied:

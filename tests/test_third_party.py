@@ -1,4 +1,4 @@
-"""A sensor of somebody else: built, installed beside the host in a fresh environment, used from the command line."""
+"""A sensor of somebody else: built, installed next to the host in a fresh environment, used from the command line."""
 
 from __future__ import annotations
 

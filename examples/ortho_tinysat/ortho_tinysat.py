@@ -1,4 +1,4 @@
-"""Sensor plugin for TinySat-1: an image `scene.tif` with its flight in `scene.tinysat.json` beside it."""
+"""Sensor plugin for TinySat-1: an image `scene.tif` with its flight in `scene.tinysat.json` next to it."""
 
 import json
 from collections.abc import Iterable, Mapping

@@ -110,7 +110,7 @@ def adjust(
     unknown = sorted(set(exclude) - set(points.ids))
     if unknown:
         raise InputError(f"cannot exclude {unknown[0]!r}: no point has this id", field="exclude")
-    # Rays of a point beside each other, and points beside those of the same images: memory is read as it lies.
+    # Rays of a point next to each other, and points next to those of the same images: memory is read as it lies.
     order = Ordering.of(points, np.ones(points.rays, dtype=bool), points.control).rays
     stated = points.of_rays(order)
     dem = None if heights is None else DemHeights.of(heights)

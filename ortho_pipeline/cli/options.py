@@ -329,12 +329,12 @@ def _folder(_: click.Context, __: click.Parameter, text: str) -> str:
     return text
 
 
-#: The option ``-o DIR``, which is required.
 def optional_folder(text: str) -> Decorator:
     """Return the option of a folder that a command writes only if it is given."""
     return click.option("--output", "-o", "folder", type=click.Path(file_okay=False), metavar="DIR", help=text)
 
 
+#: The option ``-o DIR``, which is required.
 folder_option = click.option(
     "--output",
     "-o",

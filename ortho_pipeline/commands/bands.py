@@ -36,7 +36,7 @@ def register(
     """Bring single-band images onto one of them and write all bands as one image, in the order given.
 
     The stack has the geometry of the reference. Where that is a product of a sensor with its metadata in a file beside
-    the image, this is copied beside the stack, which then opens as such a product; any other model is written as a
+    the image, this is copied next to the stack, which then opens as such a product; any other model is written as a
     model file.
 
     Parameters

@@ -194,6 +194,6 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
 
 
 def old_side_cars(ortho: Path) -> list[Path]:
-    """Return the files beside an ortho that GDAL would attach to it: models, statistics, overviews, masks."""
+    """Return the files next to an ortho that GDAL would attach to it: models, statistics, overviews, masks."""
     names = [ortho.stem + ending for ending in SIDE_CARS] + [ortho.name + ending for ending in ATTACHED]
     return [path for path in (ortho.with_name(name) for name in names) if path.is_file() or path.is_symlink()]

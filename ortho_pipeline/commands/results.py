@@ -178,7 +178,7 @@ def to_store(**outputs: str | None) -> Callable[[Callable[_P, _R]], Callable[_P,
     ----------
     **outputs : str or None
         Parameters of the command that name a folder, with what its outputs are called together; or (None) a file,
-        after which they are called, and with which what is written beside it goes along.
+        after which they are called, and with which what is written next to it goes along.
     """
 
     def decorate(command: Callable[_P, _R]) -> Callable[_P, _R]:

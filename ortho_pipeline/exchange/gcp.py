@@ -122,7 +122,7 @@ def _wgs84() -> osr.SpatialReference:
 def write_geolocation(
     dataset: gdal.Dataset, model: SensorModel, size: tuple[int, int], surface: Surface | None, path: str | PathLike[str]
 ) -> float:
-    """Write a VRT of the image with GDAL's geolocation arrays, and the arrays as GeoTIFF beside it.
+    """Write a VRT of the image with GDAL's geolocation arrays, and the arrays as GeoTIFF next to it.
 
     The arrays have longitude and latitude (WGS 84) of image points on the surface, or at the model's reference height.
     GDAL allows no relative names here, so the arrays must not be moved.

@@ -78,7 +78,7 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
 
 
 def has_rpc(dataset: gdal.Dataset) -> bool:
-    """Return whether GDAL finds an RPC for this dataset, in it or beside it, readable or not.
+    """Return whether GDAL finds an RPC for this dataset, in it or next to it, readable or not.
 
     Examples
     --------
@@ -175,7 +175,7 @@ def _refuse_unread_sidecar(dataset: gdal.Dataset) -> None:
 
 
 def _unreadable_beside(path: Path) -> list[str]:
-    """Return the names of files beside an image that look like its RPC."""
+    """Return the names of files next to an image that look like its RPC."""
     if not path.parent.is_dir():
         return []
     beside = (path.parent / name for name in listing(path.parent).beginning(path.stem))

@@ -324,7 +324,7 @@ def rpc_metadata(rpc: RPC) -> dict[str, str]:
 
 
 def write_rpc_txt(rpc: RPC, path: str | PathLike[str]) -> None:
-    """Write RPC text. GDAL reads it beside an image if it is named ``<image>_RPC.TXT`` or ``<image>_rpc.txt``.
+    """Write RPC text. GDAL reads it next to an image if it is named ``<image>_RPC.TXT`` or ``<image>_rpc.txt``.
 
     Raises
     ------
@@ -348,7 +348,7 @@ def write_rpc_txt(rpc: RPC, path: str | PathLike[str]) -> None:
 
 
 def write_rpb(rpc: RPC, path: str | PathLike[str]) -> None:
-    """Write an ``.RPB`` file, which GDAL reads beside an image.
+    """Write an ``.RPB`` file, which GDAL reads next to an image.
 
     Raises
     ------

@@ -123,7 +123,7 @@ class VsiPath:
         return VsiPath(f"{self._name}/{name}")
 
     def with_suffix(self, suffix: str) -> VsiPath:
-        """Return the file beside it whose name has another ending."""
+        """Return the file next to it whose name has another ending."""
         return self.with_name(self.stem + suffix)
 
     def absolute(self) -> VsiPath:

@@ -208,7 +208,7 @@ class Outputs:
             self.staged.pop(final).unlink(missing_ok=True)
 
     def drop(self, temporary: Path) -> None:
-        """Remove a temporary file and the side-cars that a driver put beside it."""
+        """Remove a temporary file and the side-cars that a driver put next to it."""
         self._clear(temporary.name)
 
     # -- all files ---------------------------------------------------------------------------------------------------
@@ -332,7 +332,7 @@ def whole_or_nothing(path: str | os.PathLike[str], *, side_cars: bool = True) ->
     Parameters
     ----------
     side_cars : bool
-        Whether a driver may put files of its own beside the temporary one; they are removed.
+        Whether a driver may put files of its own next to the temporary one; they are removed.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Images whose orientation is beside them in a form that no sensor opens automatically: what was recognised."""
+"""Images whose orientation is next to them in a form that no sensor opens automatically: what was recognised."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Unread(NamedTuple):
 
 
 def unread(dataset: Any) -> Unread | None:
-    """Return what describes the orientation of an image, beside it or in it; None if nothing does."""
+    """Return what describes the orientation of an image, next to it or in it; None if nothing does."""
     image = place(dataset.GetDescription())
     if isinstance(image, Path):
         for file in (folder / name for folder in (image.parent, image.parent.parent) for name in _RECONSTRUCTIONS):
@@ -69,7 +69,7 @@ def _of_orthority(folder: Path) -> Iterator[str]:
 
 
 def _table_of(image: Path) -> str | None:
-    """Return the name of a text file beside an image with a line of the image's name and six numbers."""
+    """Return the name of a text file next to an image with a line of the image's name and six numbers."""
     row = re.compile(rf"^\s*\"?{re.escape(image.stem)}(?:\.\w{{1,5}})?\"?{_NUMBERS}", re.M | re.I)
     for name in sorted(os.listdir(image.parent)) if image.parent.is_dir() else ():
         file = image.parent / name

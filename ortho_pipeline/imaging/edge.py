@@ -177,7 +177,7 @@ class _Area:
         values = np.where(inside, pixels[rows[:, None], np.clip(columns, 0, width - 1)], np.nan)
         if np.isfinite(values).mean() < 0.5:
             raise InputError(
-                "most pixels beside the edge have no value (nodata, or outside the image)",
+                "most pixels next to the edge have no value (nodata, or outside the image)",
                 field="edge",
                 remedy="give an edge with valid pixels on both sides",
             )
@@ -335,7 +335,7 @@ def _require_step(fitted: _Fitted) -> None:
 
 def _faint(step: float, noise: float) -> InputError:
     return InputError(
-        f"the edge has too little contrast: its step is {step:.3g}, the noise beside it {noise:.3g}",
+        f"the edge has too little contrast: its step is {step:.3g}, the noise next to it {noise:.3g}",
         field="edge",
         remedy=_NO_EDGE_REMEDY,
     )
@@ -402,7 +402,7 @@ def _crossing(at: Array, lsf: Array, peak: int, step: int, half: float) -> float
 
 
 def _overshoot(distance: Array, esf: Array, error: Array, sigma: float) -> float:
-    """Return the overshoot of the ESF beside the edge, as a share of the step; 0 if it may be noise."""
+    """Return the overshoot of the ESF next to the edge, as a share of the step; 0 if it may be noise."""
     beside = (np.abs(distance) > 0.5) & (np.abs(distance) <= 2 + 3 * sigma)
     above = np.where(distance > 0, esf - 1.0, -esf)
     clear = beside & (above > 3 * error)

@@ -123,7 +123,7 @@ def _vertical_of(
     """Return the height datum of the points, and metres per unit of their heights."""
     declared = declared_vertical(crs)
     if table.assumed_vertical is not None and option is not None:
-        # The format prescribes this CRS; nobody stated it for these heights.
+        # The format prescribes this CRS. It is not stated for these heights.
         declared = None
     wanted = None if option is None else Vertical.parse(option)
     stated = None if table.vertical is None else Vertical.stated(table.vertical)

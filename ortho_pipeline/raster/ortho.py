@@ -333,7 +333,7 @@ class RasterWriter:
         return 1
 
     def scratch(self, name: str) -> Path:
-        """Return the path of a temporary raster beside the output; it is removed together with that of the output."""
+        """Return the path of a temporary raster next to the output; it is removed together with that of the output."""
         return self._temporary.with_name(f"{self._temporary.name}.{name}.tif")
 
     def copy(self, path: Path) -> int:

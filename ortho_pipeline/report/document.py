@@ -301,7 +301,7 @@ def _ortho(grid: Grid, warp: WarpRecord | None) -> OrthoRecord:
 def with_layers(
     report: SceneReport, *, accuracy: AccuracyLayer | None, angles: AnglesLayer | None = None
 ) -> SceneReport:
-    """Return the report with what layers beside the ortho say; the headline gives the accuracy over the scene."""
+    """Return the report with what layers next to the ortho say; the headline gives the accuracy over the scene."""
     report = report.replaced(angles=angles)
     if accuracy is None:
         return report

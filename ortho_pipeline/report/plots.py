@@ -122,7 +122,7 @@ def _draw_point(drawing: Drawing, point: Drawn, at: Any, arrow: float, label: bo
             drawing.arrow(kind, x, y, dx, dy)
         drawing.mark(kind, x, y)
         if label:
-            # Beside the point, on the side that the arrow does not go to.
+            # Next to the point, on the side that the arrow does not go to.
             side, anchor = (-9, "end") if dx > 0 else (9, "start")
             if x + side * 6 > drawing.width:
                 side, anchor = -9, "end"

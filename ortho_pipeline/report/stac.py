@@ -44,7 +44,7 @@ _SHA256 = "1220"
 #: Longer side in pixels of the pictures of an item, by their key among the files.
 _PICTURES = {"thumbnail": 256, "overview": 1024}
 _COG = "image/tiff; application=geotiff; profile=cloud-optimized"
-#: Files beside the ortho: key, title, media type, roles.
+#: Files next to the ortho: key, title, media type, roles.
 _ASSETS = (
     ("thumbnail", "Orthoimage, small", "image/png", ["thumbnail"]),
     ("overview", "Orthoimage, reduced", "image/png", ["overview", "visual"]),
@@ -99,7 +99,7 @@ def write_item(path: Path, report: SceneReport, files: Mapping[str, Path], acqui
     Parameters
     ----------
     path : Path
-        Beside the ortho, to which it refers by relative links.
+        Next to the ortho, to which it refers by relative links.
     report : SceneReport
         The accuracy report of the ortho.
     files : mapping of str to Path

@@ -88,7 +88,7 @@ def ask_beside(*paths: AnyPath | None, allow_network: bool = False) -> None:
 
 
 def _questions(path: VsiPath) -> Iterator[VsiPath]:
-    """Yield the names to request beside a file; none if the folder is listed."""
+    """Yield the names to request next to a file; none if the folder is listed."""
     if not str(path).startswith("/vsicurl/"):
         return
     rest, letters = path.stem[3:], path.suffix[1:]

@@ -6,7 +6,7 @@ between they are bilinear in plan and a polynomial in height. The height itself 
 for every pixel. The cost of a pixel thus does not depend on the sensor model.
 
 The error is not assumed but bounded, in every block, over the cells of its lattice that may show some of the image
-(also where all check points of the block lie beside it). The bound is the sum of
+(also where all check points of the block lie next to it). The bound is the sum of
 
 - *an eighth of the largest second difference* of the nodes in either direction: the error of bilinear interpolation
   where curvature changes little from node to node. The nodes are everywhere, so no place goes unseen;

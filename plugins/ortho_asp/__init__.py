@@ -1,4 +1,4 @@
-"""Sensor plugin for cameras of Ames Stereo Pipeline and ISIS beside an image: CSM states, .tsai, ASTER; and .adjust."""
+"""Sensor plugin for cameras of Ames Stereo Pipeline and ISIS next to an image: CSM states, .tsai, ASTER, .adjust."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _kind(path: Path) -> str | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether there is a camera beside an image."""
+    """Return whether there is a camera next to an image."""
     return camera_of(dataset.GetDescription()) is not None
 
 

@@ -1,4 +1,4 @@
-"""Sensor plugin for BILSAT-1 scenes: an image and its imaging survey (docs/formats/bilsat.md) beside it."""
+"""Sensor plugin for BILSAT-1 scenes: an image and its imaging survey (docs/formats/bilsat.md) next to it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether there is an imaging survey beside the image."""
+    """Return whether there is an imaging survey next to the image."""
     try:
         # A dataset in memory has no name: ValueError.
         survey = survey_of(dataset.GetDescription())

@@ -67,7 +67,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether there are CARTOSAT-1 metadata beside this image."""
+    """Return whether there are CARTOSAT-1 metadata next to this image."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and read_metadata(path).is_cartosat1
@@ -91,7 +91,7 @@ def open_scene(
     name = dataset.GetDescription()
     path = metadata_of(name)
     if path is None:
-        raise InputError("there is no metadata beside this image", file=name, remedy=f"add {Path(name).stem}_MET.TXT")
+        raise InputError("there is no metadata next to this image", file=name, remedy=f"add {Path(name).stem}_MET.TXT")
     if rpc_origin not in ("0", "1") or view not in (None, "fore", "aft"):
         field, allowed = ("rpc_origin", "0 or 1") if rpc_origin not in ("0", "1") else ("view", "fore or aft")
         raise InputError(f"unknown value for {field}", field=field, remedy=f"give {allowed}")

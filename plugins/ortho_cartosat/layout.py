@@ -1,7 +1,7 @@
 """Which files belong to a CARTOSAT-1 image: its metadata, its RPC, and the other image of the pair.
 
 =====================================  ====================================================================
-image                                  beside it (in any mixture of upper and lower case that vendors use)
+image                                  next to it (in any mixture of upper and lower case that vendors use)
 =====================================  ====================================================================
 ``BANDA.tif``, ``BANDF.tif``           ``BANDA_MET.TXT``, ``BANDA_RPC.TXT`` …, aft and fore
 ``<name>_A.tif``, ``<name>_F.tif``     ``<name>_A_MET.TXT``, ``<name>_A_RPC.TXT`` …
@@ -30,7 +30,7 @@ MAX_FOLDERS = 200
 
 
 def beside(image: str | PathLike[str], before: str, after: str) -> Path | None:
-    """Return the file ``<before><stem><after>`` beside an image, in the usual cases of letters; None without it."""
+    """Return the file ``<before><stem><after>`` next to an image, in the usual cases of letters; None without it."""
     path = place(image)
     for stem in dict.fromkeys((path.stem, path.stem.upper(), path.stem.lower())):
         head, tail = before + stem, after.removesuffix("TXT")
@@ -49,7 +49,7 @@ def metadata_of(image: str | PathLike[str]) -> Path | None:
 
 
 def rpc_of(image: str | PathLike[str]) -> tuple[RPC | None, Path | None, list[Notice]]:
-    """Return the first readable RPC beside an image, its file, and warnings about unreadable ones."""
+    """Return the first readable RPC next to an image, its file, and warnings about unreadable ones."""
     warnings: list[Notice] = []
     for before, after in (("", "_RPC_ORG.TXT"), ("DECRYPTED_", "_RPC.TXT"), ("", "_RPC.TXT")):
         path = beside(image, before, after)
@@ -85,7 +85,7 @@ def view_of(image: str | PathLike[str], metadata: Metadata) -> str | None:
 
 
 def partner_of(image: str | PathLike[str], metadata: Metadata) -> Path | None:
-    """Return the other image of the stereo pair: beside this one, or in a folder beside its own.
+    """Return the other image of the stereo pair: next to this one, or in a folder next to its own.
 
     None without it, and if several folders have one.
     """

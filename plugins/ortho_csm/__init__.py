@@ -1,7 +1,7 @@
 """Plugin for CSM states of line scanners and frames, which Ames Stereo Pipeline and ISIS read: the format ``csm``.
 
 This package also reads states, because each state is read back before it is written. The sensor ``asp`` opens images
-with a state beside them, like those with other cameras of Ames Stereo Pipeline; it imports `ortho_csm.files`.
+with a state next to them, like those with other cameras of Ames Stereo Pipeline; it imports `ortho_csm.files`.
 """
 
 from __future__ import annotations

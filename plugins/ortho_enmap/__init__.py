@@ -87,7 +87,7 @@ def metadata_of(name: str) -> tuple[Path, str] | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether this is the image of an EnMAP detector with its metadata beside it."""
+    """Return whether this is the image of an EnMAP detector with its metadata next to it."""
     metadata = metadata_of(dataset.GetDescription())
     try:
         return metadata is not None and b"level_X" in read_bounded(metadata[0], 1000)
@@ -100,7 +100,7 @@ def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     metadata = metadata_of(name)
     if metadata is None:
-        raise InputError("there is no METADATA.XML beside this image", file=name, remedy="add it from the delivery")
+        raise InputError("there is no METADATA.XML next to this image", file=name, remedy="add it from the delivery")
     path, detector = metadata
     rpcs, facts = read_enmap(path)
     its = _of_detector(rpcs, facts, detector, dataset.RasterCount, path)

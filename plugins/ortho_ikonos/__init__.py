@@ -40,7 +40,7 @@ from ortho_pipeline.plugin import (
 )
 
 OPTIONS = {
-    "metadata": "the metadata file, if it is not po_<order>_metadata.txt beside the image",
+    "metadata": "the metadata file, if it is not po_<order>_metadata.txt next to the image",
     "rpc": "which RPC to use: tag, sidecar, or an RPC file",
     "geometry": "the first model: rpc (default if there is one) or geo (the plane at Reference Height)",
     "bands": "files to stack in the ortho: one (default), all separate bands, or names such as red,grn,blu",
@@ -70,7 +70,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether the file is named like an image of an order, with IKONOS metadata beside it."""
+    """Return whether the file is named like an image of an order, with IKONOS metadata next to it."""
     image = OrderImage.of(place(dataset.GetDescription()))
     if image is None:
         return False

@@ -1,4 +1,4 @@
-"""The files of an IKONOS order: bands and components beside an image, and the map position of each."""
+"""The files of an IKONOS order: bands and components next to an image, and the map position of each."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether there is ISD XML beside an image."""
+    """Return whether there is ISD XML next to an image."""
     return metadata_of(dataset.GetDescription()) is not None
 
 
@@ -49,7 +49,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     path = metadata_of(name)
     if path is None:
-        raise InputError("no ISD XML found beside this image", file=name, remedy="add it from the delivery")
+        raise InputError("no ISD XML found next to this image", file=name, remedy="add it from the delivery")
     isd, image = Isd(path), place(name)
     tile, warnings = tile_of(isd, image.name), []
     if tile is not None and (tile.width, tile.height) != size:

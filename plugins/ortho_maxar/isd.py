@@ -80,7 +80,7 @@ class Isd:
         self.path = path
         self.file = XmlFields(path, remedy="use the RPC", limit=MAX_SIZE)
         if not self.file.has("IMD"):
-            raise self.file.error("this file is not the ISD XML of an image", "IMD", "give the XML beside the image")
+            raise self.file.error("this file is not the ISD XML of an image", "IMD", "give the XML next to the image")
 
     @cached_property
     def size(self) -> tuple[int, int]:

@@ -106,7 +106,7 @@ def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], li
 def colours_beside(isd: Isd, image: Path, model: SensorModel) -> Iterator[Piece]:
     """Yield the images of other bands that were taken with this one, panchromatic for colours or colours for it.
 
-    They are in the same folder or, as delivered, in folders ``..._PAN`` and ``..._MUL`` beside each other.
+    They are in the same folder or, as delivered, in folders ``..._PAN`` and ``..._MUL`` next to each other.
     """
     for path in _of_other_bands(isd.path):
         try:
@@ -157,5 +157,5 @@ def _other_parts(path: Path) -> Iterator[Path]:
 
 
 def _file(image: Path, name: str) -> Path | None:
-    """Return the file of this name beside an image, whatever the case of its letters."""
+    """Return the file of this name next to an image, whatever the case of its letters."""
     return next((image.parent / file for file in listing(image.parent).named(name)), None)

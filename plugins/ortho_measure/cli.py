@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     "-o",
     type=click.Path(dir_okay=False),
     metavar="FILE.geojson",
-    help="File for the points; their journal is beside it.  [default: <stems>_points.geojson]",
+    help="File for the points; their journal is next to it.  [default: <stems>_points.geojson]",
 )
 @click.option("--no-browser", is_flag=True, help="Only print the address; do not open a browser.")
 @click.option(
@@ -58,7 +58,7 @@ def measure(
 ) -> None:
     """Measure control points in the browser.
 
-    The page shows IMAGE beside its reference, in the geometry of the image. A click is matched to a fraction of a
+    The page shows IMAGE next to its reference, in the geometry of the image. A click is matched to a fraction of a
     pixel, the fit is updated after every point, and the page proposes the best next point. Everything stays on this
     machine; Ctrl-C ends the command. Give the file of points to 'ortho fit', 'rectify', 'compare' or 'export' with
     --gcps. Points of several images, such as a stereo pair, are for --points of 'ortho adjust'.
@@ -100,7 +100,7 @@ def _open_browser(address: str, points: Path, until_end: contextlib.ExitStack) -
 
     path = until_end.enter_context(private_file(address, points))
     if path is None:
-        say("Note: cannot write a private file beside the points. Open the address in your browser yourself.", err=True)
+        say("Note: cannot write a private file next to the points. Open the address in a browser yourself.", err=True)
     else:
         webbrowser.open(path.as_uri())
 

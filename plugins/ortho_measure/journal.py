@@ -108,7 +108,7 @@ class Journal:
         return new
 
     def set_aside(self, count: int) -> None:
-        """Keep this many actions; move the others to the end of a file beside the journal.
+        """Keep this many actions; move the others to the end of a file next to the journal.
 
         A journal that another process writes is not changed.
         """

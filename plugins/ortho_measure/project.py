@@ -164,7 +164,7 @@ class Project(_Shown):
     Parameters
     ----------
     output : Path
-        The GeoJSON of the points; the journal is beside it.
+        The GeoJSON of the points; the journal is next to it.
     surface : Surface
         The heights.
     views : sequence of SceneView
@@ -240,7 +240,7 @@ class Project(_Shown):
 
     @abc.abstractmethod
     def ortho(self, progress: Progress, number: int = 0) -> Result:
-        """Make the ortho of an image with the saved points, in a folder beside them."""
+        """Make the ortho of an image with the saved points, in a folder next to them."""
 
     # -- opening and closing -----------------------------------------------------------------------------------------
 

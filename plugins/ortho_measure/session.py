@@ -50,7 +50,7 @@ class Session(Project):
     places : SceneGeometry
         With the delivered model.
     output : Path
-        The GeoJSON of the points; the journal is beside it.
+        The GeoJSON of the points; the journal is next to it.
     request : Request
         Options of image and heights, the correction (as for `ortho fit`), and the search distance.
     """
@@ -172,7 +172,7 @@ class Session(Project):
         return compare(self.scene, options).to_json()
 
     def ortho(self, progress: Progress, number: int = 0) -> Result:
-        """Run `ortho rectify` with the saved points, into a folder beside them."""
+        """Run `ortho rectify` with the saved points, into a folder next to them."""
         from ortho_pipeline.commands.rectification import rectify
 
         with self._lock:
@@ -217,7 +217,7 @@ def open_session(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
 ) -> Session:
-    """Open scene, reference and heights, and continue with the points of the journal beside the output.
+    """Open scene, reference and heights, and continue with the points of the journal next to the output.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether there is an OrbView-3 label beside the image."""
+    """Return whether there is an OrbView-3 label next to the image."""
     path = label_of(dataset.GetDescription())
     if path is None:
         return False
@@ -66,7 +66,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
     path = place(label) if label else label_of(name)
     if path is None:
         raise InputError(
-            "no label (.pvl) found beside this image",
+            "no label (.pvl) found next to this image",
             file=name,
             field="label",
             remedy="give it as sensor option label=FILE",

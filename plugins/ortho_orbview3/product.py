@@ -102,12 +102,12 @@ class Product:
 
 
 def label_of(image: str | PathLike[str]) -> Path | None:
-    """Return the label beside an image; None without one."""
+    """Return the label next to an image; None without one."""
     return _beside(place(image), ".pvl")
 
 
 def rpc_text_of(image: str | PathLike[str]) -> Path | None:
-    """Return the RPC text beside an image; None without one."""
+    """Return the RPC text next to an image; None without one."""
     return _beside(place(image), "_rpc.txt")
 
 
@@ -174,11 +174,11 @@ def choose_rpc(product: Product, text: Path | None, choice: str | None) -> tuple
     if text is None:
         if choice is not None:
             raise InputError(
-                "no RPC text file found beside the image",
+                "no RPC text file found next to the image",
                 field="rpc",
                 remedy=Text("take ", Setting("scene.rpc", "label")),
             )
-        text_missing = "no RPC text file found beside the label, so the RPC of the label is used"
+        text_missing = "no RPC text file found next to the label, so the RPC of the label is used"
         return product.rpc, product.file, (Notice("no-rpc-text", text_missing),)
     rpc = read_rpc_text(text)
     difference = _difference(product.rpc, rpc)

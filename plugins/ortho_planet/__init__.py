@@ -1,6 +1,6 @@
 """Sensor plugin for Planet's basic products: PlanetScope level 1B and SkySat level 1A/1B, by their RPC.
 
-The metadata of an item (``<id>_metadata.json``) are beside its assets, whose names begin with that of the item. Frames
+The metadata of an item (``<id>_metadata.json``) are next to its assets, whose names begin with that of the item. Frames
 of a strip are separate images; `ortho adjust` adjusts them together.
 """
 
@@ -75,7 +75,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether there are metadata of a Planet item beside an image."""
+    """Return whether there are metadata of a Planet item next to an image."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and b'"item_type"' in read_bounded(path, MAX_SIZE)
@@ -88,7 +88,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None) -> Scene:
     name = dataset.GetDescription()
     path = metadata_of(name)
     if path is None:
-        raise InputError("no <id>_metadata.json found beside this image", file=name, remedy="download it")
+        raise InputError("no <id>_metadata.json found next to this image", file=name, remedy="download it")
     facts = read_item(path)
     if rpc is None and not has_rpc(dataset):
         raise InputError(

@@ -1,7 +1,7 @@
 """Sensor plugin for every product that comes with an RPC: TIFF tag, side-car, DIMAP, NITF, VRT, or a file given.
 
 It is a fallback: plugins that know the product have priority. If there are DIMAP metadata with the rigorous model of
-the same image beside it, the scene also has the model ``pushbroom``.
+the same image next to it, the scene also has the model ``pushbroom``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def ortho_sensors() -> Iterable[Sensor]:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether an image has an RPC, or is a DIMAP metadata file with one beside it."""
+    """Return whether an image has an RPC, or is a DIMAP metadata file with one next to it."""
     return has_rpc(dataset) or _of_dimap(dataset) is not None
 
 

@@ -55,7 +55,7 @@ def _tiles(file: DimapFile, image: str, beside: dict[str, Path]) -> Iterator[Pie
 def _other_bands(file: DimapFile, model: SensorModel) -> Iterator[Piece]:
     """Yield the images of the same strip in other bands, each with its RPC.
 
-    They are in the same folder or, as delivered, in folders ``IMG_...`` beside each other.
+    They are in the same folder or, as delivered, in folders ``IMG_...`` next to each other.
     """
     strip, bands = _strip(file), file.said(_SPECTRAL)
     folder = place(file.path).parent.absolute()  # a folder that is entered has no name of its own

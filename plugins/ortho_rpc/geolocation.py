@@ -102,7 +102,7 @@ def open_scene(dataset: gdal.Dataset, *, lon: str | None = None, lat: str | None
 
 
 def _layout_of(dataset: gdal.Dataset) -> Layout:
-    """Return the contents of the domain ``GEOLOCATION``; its files must be beside the image."""
+    """Return the contents of the domain ``GEOLOCATION``; its files must be next to the image."""
     name = dataset.GetDescription()
     # GDAL returns bytes for invalid text.
     fields = {
@@ -118,7 +118,7 @@ def _layout_of(dataset: gdal.Dataset) -> Layout:
         # Only the folder of the image is searched, whatever folder the metadata name.
         if ":" in text or not _is_file(beside):
             raise InputError(
-                f"the array {text[:200]!r} is not a file beside the image",
+                f"the array {text[:200]!r} is not a file next to the image",
                 file=name,
                 field=f"{axis}_DATASET",
                 remedy=_REMEDY,

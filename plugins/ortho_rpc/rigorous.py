@@ -1,4 +1,4 @@
-"""Find the DIMAP metadata of an image beside it, and warn about rigorous models that are not used."""
+"""Find the DIMAP metadata of an image next to it, and warn about rigorous models that are not used."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WITHIN = np.array([[x, y, h] for x in (0.05, 0.5, 0.95) for y in (0.05, 0.5, 0.
 
 @dataclass(frozen=True)
 class Rigorous:
-    """The rigorous model beside an image, if there is one, and the reasons why others are not used.
+    """The rigorous model next to an image, if there is one, and the reasons why others are not used.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Rigorous:
 
 
 def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
-    """Return the rigorous model of an image of this size, from DIMAP metadata beside it."""
+    """Return the rigorous model of an image of this size, from DIMAP metadata next to it."""
     try:
         beside = listing(image.parent)
     except (OSError, ValueError):
@@ -82,7 +82,7 @@ def rigorous_beside(image: Path, size: tuple[int, int], rpc: RPC) -> Rigorous:
             others[file.path.name] = "it is for {} x {} pixels, but this image has {} x {}".format(*its, *size)
     if len(models) > 1:
         several = ", ".join(path.name for path in models)
-        reason = f"there are several rigorous models of this size beside the image, so none is used: {several}"
+        reason = f"there are several rigorous models of this size next to the image, so none is used: {several}"
         return Rigorous(left=left | {path.name: reason for path in models})
     for path, (model, limit) in models.items():
         apart = _apart(model, rpc, _MIDDLE if limit is None else _WITHIN)

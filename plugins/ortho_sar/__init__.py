@@ -74,7 +74,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether an image has extended Capella metadata beside it, or complex values without a position."""
+    """Return whether an image has extended Capella metadata next to it, or complex values without a position."""
     path = metadata_of(dataset.GetDescription())
     if path is None and _is_slant(dataset) and not has_rpc(dataset):
         return True

@@ -49,7 +49,7 @@ def metadata_of(name: str) -> Path | None:
 
 
 def recognises(dataset: gdal.Dataset) -> bool:
-    """Return whether a file is the metadata of a SPOT scene, or an image with them beside it."""
+    """Return whether a file is the metadata of a SPOT scene, or an image with them next to it."""
     path = metadata_of(dataset.GetDescription())
     try:
         return path is not None and b"<METADATA_PROFILE>SPOTSCENE" in read_bounded(path, 4000).replace(b" ", b"")
@@ -62,7 +62,7 @@ def open_scene(dataset: gdal.Dataset, *, attitude: str = "vendor") -> Scene:
     name = dataset.GetDescription()
     path = metadata_of(name)
     if path is None:
-        raise InputError("no METADATA.DIM found beside this image", file=name, remedy="add it from the delivery")
+        raise InputError("no METADATA.DIM found next to this image", file=name, remedy="add it from the delivery")
     if attitude not in ("vendor", "speeds"):
         raise InputError("unknown attitude", field="attitude", remedy="give vendor or speeds")
     spot = read_spot(path, attitude=attitude)

@@ -1,6 +1,6 @@
 """Deliveries whose data lead elsewhere: texts that name files outside of their folder, servers and programs.
 
-`hostile.py` has those that are rasters or lie beside one; here are points, pipeline files, models, catalogs and links.
+`hostile.py` has those that are rasters or lie next to one; here are points, pipeline files, models, catalogs and links.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class Attack:
 
     def __init__(self, reader: Reader, folder: Path, real: Path | None = None) -> None:
         self.reader, self.path = reader, folder / reader.file
-        # The seed puts beside it what has to lie there.
+        # The seed puts next to it what has to lie there.
         self.data = reader.seed(folder)
         if real is not None:
             self.data = real.read_bytes()

@@ -28,7 +28,7 @@ def write(folder: Path, secret: Path, url: str) -> dict[str, Path | str]:
     Parameters
     ----------
     folder : path
-        A new folder beside the secret.
+        A new folder next to the secret.
     secret : path
         A raster, or anything else that nobody may open.
     url : str

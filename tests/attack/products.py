@@ -291,7 +291,7 @@ def bundle_text(band: str, size: tuple[int, int]) -> str:
 
 
 def geolocation_text(folder: Path) -> str:
-    """Return a VRT of `one.tif` in `folder` with geolocation arrays, which are written beside it."""
+    """Return a VRT of `one.tif` in `folder` with geolocation arrays, which are written next to it."""
     for name, step in (("lon", (0.001, 1e-5)), ("lat", (2e-5, -0.001))):
         dataset = gdal.GetDriverByName("GTiff").Create(str(folder / f"{name}.tif"), 12, 10, 1, gdal.GDT_Float64)
         rows, columns = np.mgrid[0:10, 0:12]
@@ -375,7 +375,7 @@ STAC_HEIGHTS = """{"type": "FeatureCollection", "features": [
   "assets": {"elevation": {"href": "./b.tif", "proj:epsg": 9518, "proj:wkt2": "GEOGCRS[]"}}}],
  "links": []}
 """
-#: A static collection with an item in it, and the way to one beside it that is not there.
+#: A static collection with an item in it, and the way to one next to it that is not there.
 STAC_COLLECTION = f"""{{"type": "Collection", "stac_version": "1.0.0", "id": "C", "features": [{STAC_ITEM}],
  "links": [{{"rel": "item", "href": "./items/T.json"}}, {{"rel": "root", "href": "../catalog.json"}}]}}
 """

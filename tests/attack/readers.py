@@ -65,7 +65,7 @@ class Reader:
     file : str
         Name that the file has to have.
     seed : callable(folder) -> bytes
-        Makes a valid file; may put others beside it into the folder.
+        Makes a valid file; may put others next to it into the folder.
     read : callable(path) -> any
         Reads it and returns all that has to be finite (`numbers`).
     unknown : bool
@@ -197,7 +197,7 @@ def _frame_seed(text: str) -> Callable[[Path], bytes]:
 
 
 def _beside(image: str, *source: str) -> Callable[[Path], bytes]:
-    """Return a seed that lies beside the image of a sample product, whose other files are there too."""
+    """Return a seed that lies next to the image of a sample product, whose other files are there too."""
 
     def seed(folder: Path) -> bytes:
         product = seeds.SAMPLE / source[0]
@@ -328,7 +328,7 @@ def _frame_model(folder: Path) -> bytes:
 
 
 def _bundle_seed(folder: Path) -> bytes:
-    """Write the panchromatic image of a bundle, whose pieces the metadata of the colours beside it give."""
+    """Write the panchromatic image of a bundle, whose pieces the metadata of the colours next to it give."""
     pan, colours = "IMG_PHR1A_P_1_R1C1.TIF", "IMG_PHR1A_MS_1_R1C1.TIF"
     for name, size in ((pan, (40, 32)), (colours, (10, 8))):
         dataset = gdal.GetDriverByName("GTiff").Create(str(folder / name), *size)

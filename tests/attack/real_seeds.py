@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-#: Beside the checkout, as for the tests marked `realdata`.
+#: Next to the checkout, as for the tests marked `realdata`.
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 #: Reader -> real files that it reads, below `REAL`.
 FILES: dict[str, tuple[str, ...]] = {

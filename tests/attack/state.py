@@ -47,7 +47,7 @@ def renames(folder: Path) -> bytes:
 
 
 def read_renames(path: Path) -> list[float]:
-    """Let the next command complete what is listed; nothing beside the folder may change, and nothing stay."""
+    """Let the next command complete what is listed; nothing next to the folder may change, and nothing stay."""
     folder = path.parent / "out"
     folder.mkdir()
     place = Outputs(folder, "scene")

@@ -264,7 +264,7 @@ mosaic: {format: COG, order: first-on-top}
 
 
 def plant(image: Path, kind: str, secret: Path, url: str) -> None:
-    """Put a side-car beside an image that leads to a secret and to a server."""
+    """Put a side-car next to an image that leads to a secret and to a server."""
     if kind == ".aux.xml":
         Path(f"{image}.aux.xml").write_text(
             f'<PAMDataset><Metadata domain="overviews"><MDI key="OVERVIEW_FILE">{secret}</MDI></Metadata></PAMDataset>'
@@ -276,7 +276,7 @@ def plant(image: Path, kind: str, secret: Path, url: str) -> None:
 
 
 def test_a_run_with_a_mosaic_reads_nothing_outside(trap, tiny, tmp_path):
-    """Hostile files beside scenes, then beside the orthos of an earlier run that the mosaic is made of."""
+    """Hostile files beside scenes, then next to the orthos of an earlier run that the mosaic is made of."""
     secret = Path(trap.pipes["vrt-absolute"]).parents[2] / "secret.tif"
     raw = tmp_path / "raw"
     raw.mkdir()

@@ -34,7 +34,7 @@ def trap(tmp_path_factory) -> Iterator[Trap]:
 
 
 def view(path: Path | str) -> Path:
-    """Write a harmless VRT with a place in a map, beside the folder of a hostile file, which is its only source."""
+    """Write a harmless VRT with a place in a map, next to the folder of a hostile file, which is its only source."""
     name = os.fspath(path)
     folder = next(parent for parent in Path(name.removeprefix("/vsizip/")).parents if parent.name == "files")
     made = folder / f"view-{abs(hash(name))}.vrt"

@@ -63,7 +63,7 @@ def test_a_bad_block_is_an_error_that_names_the_file(bad_blocks, tmp_path, name,
 
 
 def test_an_rpc_beside_an_image_is_not_passed_over_for_its_tag(bad_blocks, tmp_path):
-    """GDAL took the tag without a word, which may be another RPC than the one beside it."""
+    """GDAL took the tag without a word, which may be another RPC than the one next to it."""
     folder = copied(tmp_path / "in")
     image = folder / "scene.tif"
     words = ["export", str(image), "--format", "tag", "--height", "900", "-o", str(tmp_path / "tagged")]

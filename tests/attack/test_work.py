@@ -150,7 +150,7 @@ def test_strips_as_products_have_them_keep_cache_and_threads():
     try:
         strip = 60_000 * 2 * 4 * 16
         assert limit_cache(512_000_000, 8, strip, 30_000 * 4) == 8
-        # Beside the cache each thread has room for the block that it decodes.
+        # Next to the cache each thread has room for the block that it decodes.
         assert 8 * strip <= gdal.GetCacheMax() <= 128_000_000
     finally:
         gdal.SetCacheMax(before)

@@ -156,7 +156,7 @@ for folder, words in json.loads(open(sys.argv[1]).read()):
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace, which tells what is opened, is not on this machine")
 @pytest.mark.parametrize("kind", ["data", "rasters"])
 def test_no_data_of_a_delivery_lead_elsewhere(tmp_path: Path, sample: Path, kind: str) -> None:
-    """Neither what its texts name, nor what lies beside the delivery, is opened; nothing is run, nobody asked."""
+    """Neither what its texts name, nor what lies next to the delivery, is opened; nothing is run, nobody asked."""
     place = tmp_path / "place"
     place.mkdir()
     secret = hostile.raster(place / "secret.tif", hostile.SECRET)

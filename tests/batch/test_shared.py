@@ -309,7 +309,7 @@ def test_a_run_in_a_store_notices_what_changed(bucket_run: Any, store: str, tiny
         "DEM raised": raised,
         "image changed": lambda: gdal.Open(str(image), gdal.GA_Update).WriteRaster(0, 0, 1, 1, b"\0\0"),
         "points changed": lambda: tiny.write(tiny.gcps, tiny.points(11)),
-        "a model beside the image": lambda: (image.parent / "s0_notes.txt").write_text("new"),
+        "a model next to the image": lambda: (image.parent / "s0_notes.txt").write_text("new"),
         "settings changed": lambda: file.write_text(file.read_text().replace("resolution: 40", "resolution: 20")),
         "empty record": lambda: objects.put(result, b"{}"),
         "record that is no JSON": lambda: objects.put(result, b"\xff{"),

@@ -109,7 +109,7 @@ def test_the_remedy_for_a_real_project_works(real):
     assert done.exit_code == 2
     options = done.output.split("give ")[1].split(" (replace ")[0]
     assert info(image, *shlex.split(options)).exit_code == 0
-    # A frame that was laid on the map roughly is no ortho, and the DEM beside it is a DEM.
+    # A frame that was laid on the map roughly is no ortho, and the DEM next to it is a DEM.
     ngi = real / "orthority" / "ngi"
     assert "camera_pos_ori.txt" in info(ngi / "3324c_2015_1004_05_0182_RGB.tif").output
     assert json.loads(info(ngi / "dem.tif", "--json").stdout)["vertical"] == "EGM2008 height"

@@ -64,7 +64,7 @@ def test_a_failure_at_the_end_leaves_no_mixture(tiny, tmp_path, monkeypatch):
 
 
 def test_a_report_that_fails_does_not_cost_the_ortho(tiny, tmp_path, monkeypatch):
-    """Ortho and model are those of a run whose report does not fail; no report of an earlier run stays beside them."""
+    """Ortho and model are those of a run whose report does not fail; no report of an earlier run stays next to them."""
     stac = {"stac": True, "acquired": "2005-08-03T08:12:31Z", "resampling": "cubic"}
     good, out = tmp_path / "good", tmp_path / "out"
     rectify(tiny, good, **stac)

@@ -184,7 +184,7 @@ def test_a_sensor_of_somebody_else_in_an_archive(tmp_path):
 
 # -- archives of strangers -------------------------------------------------------------------------------------------
 
-#: What a sensor reads beside its image, and by what beginning it takes the file for its own.
+#: What a sensor reads next to its image, and by what beginning it takes the file for its own.
 READ = {
     "ikonos": ("po_39001_metadata.txt", b"IKONOS"),
     "orbview3": (ORBVIEW.replace(".tif", ".pvl"), b"OV-3"),

@@ -153,7 +153,7 @@ def test_kernels_of_a_version_whose_types_are_gone_are_compiled_anew(tmp_path: P
 
 
 def test_every_kernel_keeps_its_own_code_whatever_its_module_is_called(tmp_path: Path) -> None:
-    """Files lie beside each other, and kernels of two rooms have the same module and name."""
+    """Files lie next to each other, and kernels of two rooms have the same module and name."""
     for room, factor in (("near", 2), ("far", 3)):
         (tmp_path / room).mkdir()
         (tmp_path / room / "one.py").write_text(ONE.replace("2 * x", f"{factor} * x"))

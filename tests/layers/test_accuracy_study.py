@@ -1,4 +1,4 @@
-"""Predicted accuracy beside the truth of simulated scenes: a small part of benchmarks/accuracy.py, and real points."""
+"""Predicted accuracy next to the truth of simulated scenes: a small part of benchmarks/accuracy.py, and real points."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
 from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
-#: Streets, a tower, a low house beside it, a long block, and a cliff: half of the square lies 35 m higher.
+#: Streets, a tower, a low house next to it, a long block, and a cliff: half of the square lies 35 m higher.
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (130, 96, 142, 112, 8.0), (30, 150, 150, 162, 18.0)))
 CLIFF = City(((128, -100, 400, 400, 35.0),))
 
@@ -154,7 +154,7 @@ def spikes(random: np.random.Generator) -> np.ndarray:
 
 
 def plateaus(random: np.random.Generator) -> np.ndarray:
-    """Blocks wide enough that lines end inside of them, some beside a void, on a slope."""
+    """Blocks wide enough that lines end inside of them, some next to a void, on a slope."""
     heights = np.kron(random.uniform(0, 60, (20, 20)), np.ones((10, 10))) + np.arange(200) / 10
     heights[60:70, 90:95] = -32768.0
     return heights

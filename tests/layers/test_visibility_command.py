@@ -1,4 +1,4 @@
-"""What terrain hides, as `rectify` treats it: a mask beside the ortho, or a true ortho."""
+"""What terrain hides, as `rectify` treats it: a mask next to the ortho, or a true ortho."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def test_match_shows_what_it_found(case: Case, written_points: tuple[Path, dict]
 
 
 def test_points_and_their_page_appear_together(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A command that ended between the two left new points beside the page of old ones."""
+    """A command that ended between the two left new points next to the page of old ones."""
     there = []
 
     def interrupted(*_: object, **__: object) -> None:

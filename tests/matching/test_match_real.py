@@ -57,7 +57,7 @@ class QuickBird:
         return read_points(self.data / "orthority" / "rpc" / "gcps.geojson", image_name=self.image.name)
 
     def frame(self, strip: str) -> FrameCamera:
-        """Return the camera of a frame, as the frame plugin makes it of the files beside it."""
+        """Return the camera of a frame, as the frame plugin makes it of the files next to it."""
         folder, camera, table = self.data / "orthority", self.folder / "dmc.json", self.folder / "ngi.csv"
         camera.write_text('{"width": 640, "height": 1152, "focal_length_mm": 120, "sensor_mm": [92.16, 165.888]}')
         rows = [line.split() for line in (folder / "ngi" / "camera_pos_ori.txt").read_text().splitlines()]

@@ -117,6 +117,6 @@ def test_matches_with_an_ortho_of_the_other_image_are_the_ties(real, tmp_path):
     assert same.sum() >= 100
     # What little the places differ is the same in both images.
     difference = (there - matches.image)[nearest[same]] - (right - left)[same]
-    # The issue asks for 0.2 px; an ortho of cubic convolution beside its image moves edges by a fiftieth.
+    # The issue asks for 0.2 px; an ortho of cubic convolution next to its image moves edges by a fiftieth.
     assert np.sqrt((difference**2).mean(axis=0)).max() <= 0.05
     assert np.abs(difference).max() <= 0.2

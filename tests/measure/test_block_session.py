@@ -112,7 +112,7 @@ def test_a_click_in_the_other_image_and_one_in_the_reference_find_their_places(
     session = opens()
     grounds = truth.ground_at(features)
     there = stereo.truth.image_of(grounds)
-    # The place in the first image is known: a click 3 px beside it in the second is mended.
+    # The place in the first image is known: a click 3 px next to it in the second is mended.
     beside = session.proposal(1, (there[2] + (2.0, -2.0)).tolist(), {"scene": features[2].tolist()})
     assert np.hypot(*np.subtract(beside["rays"]["second"]["image"], there[2])) < 0.1
     # A place in the map, and so its ground.

@@ -37,7 +37,7 @@ COUNTS = {
 
 
 def frame_camera(ground: np.ndarray) -> np.ndarray:
-    """A frame camera 686 km above and 90 km beside the scene, from the collinearity equations."""
+    """A frame camera 686 km above and 90 km next to the scene, from the collinearity equations."""
     position = np.array([450e3, 5100e3, 686e3])
     axis = np.array([415e3, 5015e3, 800.0]) - position
     axis /= np.linalg.norm(axis)

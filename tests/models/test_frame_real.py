@@ -1,4 +1,4 @@
-"""Real aerial and drone frames: our projection beside the orientations given, and orthos that have to agree."""
+"""Real aerial and drone frames: our projection next to the orientations given, and orthos that have to agree."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def bent_rpc(seed: int = 5) -> RPC:
 
 @pytest.mark.parametrize("model", [make_rpc(), bent_rpc()], ids=["rpc", "bent"])
 def test_the_compiled_result_of_a_point_does_not_depend_on_the_others(model):
-    """Blocks are computed together: the order of points, and what stands beside them, must not show in a bit."""
+    """Blocks are computed together: the order of points, and what stands next to them, must not show in a bit."""
     count = COMPILED_FROM + 77
     random = np.random.default_rng(3)
     ground = box_of(model, count) + np.where(random.uniform(size=(count, 1)) < 0.1, [0.05, 0.03, 400.0], 0.0)

@@ -1,4 +1,4 @@
-"""Images in pieces: beside the antimeridian, and at the seams."""
+"""Images in pieces: next to the antimeridian, and at the seams."""
 
 from __future__ import annotations
 

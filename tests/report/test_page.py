@@ -246,7 +246,7 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "Good enough for maps" not in page
     assert "Map scales" not in page
-    # Beside the figure, with what it is without them; in the picture in rings; what to do is of these points.
+    # Next to the figure, with what it is without them; in the picture in rings; what to do is of these points.
     assert said.adjustment.notices[0]["rest"] == pytest.approx(0.5, abs=0.5)
     assert re.search(rf'class="unsettled">Not settled: 0\.\d+ px without {", ".join(names)}<', page)
     assert page.count('class="doubted"') == wrong

@@ -235,7 +235,7 @@ def test_gdal_finds_another_rpc_than_the_plugin_and_that_is_said(pair_folder, tm
     # GDAL looks for <name>_RPC.TXT only beside products that it knows, or in the PAM file.
     dataset = open_dataset(folder / "BANDA.tif")
     if not dataset.GetMetadata("RPC"):
-        pytest.skip("this GDAL does not read _RPC.TXT beside a TIFF")
+        pytest.skip("this GDAL does not read _RPC.TXT next to a TIFF")
     assert float(dataset.GetMetadataItem("LINE_OFF", "RPC").split()[0]) == pytest.approx(offset)
     scene = open_scene(folder / "BANDA.tif")
     assert any("GDAL reads another one" in warning and "7.0 px" in warning for warning in scene.warnings)

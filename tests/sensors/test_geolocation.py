@@ -87,12 +87,12 @@ def test_arrays_in_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"X_DATASET": 'HDF5:"PRS_L1.he5"://HDFEOS/Longitude'}, "is not a file beside the image"),
-        ({"X_DATASET": "../lon.tif", "Y_DATASET": "elsewhere.tif"}, "is not a file beside the image"),
+        ({"X_DATASET": 'HDF5:"PRS_L1.he5"://HDFEOS/Longitude'}, "is not a file next to the image"),
+        ({"X_DATASET": "../lon.tif", "Y_DATASET": "elsewhere.tif"}, "is not a file next to the image"),
         ({"PIXEL_STEP": "0"}, "PIXEL_STEP: .* is not a number"),
         ({"LINE_STEP": "nan"}, "LINE_STEP: .* is not a number"),
         ({"X_BAND": "2"}, "has no band 2"),
-        ({"X_DATASET": "9" * 300}, "is not a file beside the image"),
+        ({"X_DATASET": "9" * 300}, "is not a file next to the image"),
         ({"SRS": "nonsense"}, "CRS of the arrays"),
         ({"PIXEL_OFFSET": "100000"}, "nodes have both a longitude"),
     ],

@@ -253,7 +253,7 @@ def test_another_size_is_refused_and_another_label_can_be_given(copied):
     whole = copied.with_name("whole.tif")
     copied.rename(whole)
     assert open_scene(whole, "orbview3", {"label": label}).model_source == label
-    with pytest.raises(InputError, match=r"no label \(\.pvl\) found beside"):
+    with pytest.raises(InputError, match=r"no label \(\.pvl\) found next to"):
         open_scene(whole, "orbview3")
 
 

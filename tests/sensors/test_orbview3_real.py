@@ -31,7 +31,7 @@ def label(real) -> Path:
 
 @pytest.fixture
 def scene(label, tmp_path) -> Path:
-    """A sparse image of the right size and name beside the real label and RPC text."""
+    """A sparse image of the right size and name next to the real label and RPC text."""
     shutil.copy(label, tmp_path / f"{NAME}.pvl")
     shutil.copy(label.with_name("md_ov_rpc.txt"), tmp_path / f"{NAME}_rpc.txt")
     image = tmp_path / f"{NAME}.tif"

@@ -57,7 +57,7 @@ def drawn_at(point: np.ndarray, target: np.ndarray, satellite: np.ndarray, track
 
 
 def test_relief_is_that_of_equal_ranges(image: Path) -> None:
-    """A point and its image on the plane are equally far from the satellite, and beside it, square to its track."""
+    """A point and its image on the plane are equally far from the satellite, and next to it, square to its track."""
     model = open_scene(image).model
     document = json.loads(capella_text())
     vectors = document["collect"]["state"]["state_vectors"]

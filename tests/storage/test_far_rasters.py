@@ -96,7 +96,7 @@ def share_read(folder: Path, tmp_path: Path) -> float:
 
 
 def test_a_crop_reads_its_share(scene: Path, tmp_path: Path) -> None:
-    # 335 pixels of 1500, with what the kernel needs beside them, lie on three tiles of 256 at most in each direction:
+    # 335 pixels of 1500, with what the kernel needs next to them, lie on three tiles of 256 at most in each direction:
     # 9 of 36, a header and the DEM.
     assert share_read(scene.parent, tmp_path) < 9.5 / 36 + 0.01
 

@@ -1,4 +1,4 @@
-"""What is kept of files that lie elsewhere: whole, with its record, whatever ends or stands beside the process."""
+"""What is kept of files that lie elsewhere: whole, with its record, whatever ends or stands next to the process."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def test_declared_options_reach_the_sensor_and_others_are_refused(product, tmp_p
     image, survey = tmp_path / "a.tif", tmp_path / "other.txt"
     image.write_bytes((product / "bilsat.tif").read_bytes())
     survey.write_bytes((product / "bilsat_survey.txt").read_bytes())
-    # Nothing beside the image: the sensor and its option say it all.
+    # Nothing next to the image: the sensor and its option say it all.
     chosen = ("--sensor", "bilsat", "--sensor-option", f"survey={survey}")
     found = json.loads(run("info", image, *chosen, "--sensor-option", "attitude=zero", "--json"))
     assert found["model_source"] == str(survey)

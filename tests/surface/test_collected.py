@@ -86,7 +86,7 @@ WINDOWS = {"a": [0, 0, 70, 70], "b": [70, 0, 60, 70], "c": [0, 70, 70, 60], "d":
 
 @pytest.fixture
 def cells(tiny: Any) -> Path:
-    """Cut the DEM of the tiny scene into four cells, beside one that lies elsewhere, and make a VRT of the four."""
+    """Cut the DEM of the tiny scene into four cells, next to one that lies elsewhere, and make a VRT of the four."""
     folder: Path = tiny.folder / "cells"
     paths = [cell(folder / f"{name}.tif", tiny.dem, window) for name, window in WINDOWS.items()]
     gdal.BuildVRT(str(folder / "all.vrt"), list(map(str, paths))).FlushCache()
@@ -264,7 +264,7 @@ def test_a_run_knows_the_documents_and_files_of_a_collection(cells: Path, tiny: 
 
     assert states() == ["new"]
     assert made() == ["done"]
-    # A name beside the collection changes nothing; an item, its file and the list of items do.
+    # A name next to the collection changes nothing; an item, its file and the list of items do.
     (cells / "notes.txt").write_text("x")
     assert states() == ["done"]
     for changed in (cells / "a" / "a.json", cells / "b" / "b.tif", path):
@@ -363,7 +363,7 @@ def test_catalogs_within_a_collection_are_followed_but_not_where_they_lie_elsewh
         ({"data": ["data"], "edm": [], "hem": [], "dem_ql": []}, "data"),
         # NASADEM.
         ({"elevation": []}, "elevation"),
-        # ArcticDEM and REMA: the DEM beside its counts, and a hillshade.
+        # ArcticDEM and REMA: the DEM next to its counts, and a hillshade.
         ({"hillshade": ["overview", "visual"], "dem": ["data"], "count": ["metadata"], "mad": ["metadata"]}, "dem"),
         # LINZ calls its only raster so.
         ({"visual": []}, "visual"),

@@ -337,7 +337,7 @@ def global_dem(folder: Path, **options: str) -> Surface:
 
 def test_no_two_surfaces_share_what_they_keep(tmp_path: Path) -> None:
     surface = global_dem(tmp_path, fill="nearest")
-    where = np.array([[-0.5, 42.0], [33.0, 10.0], [-91.0, -33.3]])  # the first beside a void
+    where = np.array([[-0.5, 42.0], [33.0, 10.0], [-91.0, -33.3]])  # the first next to a void
     expected, lowest = surface.heights(where), surface.height_range
     assert np.isfinite(expected).all()
     for name, other in copies(surface).items():

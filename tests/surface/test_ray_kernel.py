@@ -75,7 +75,7 @@ def test_first_meetings_are_those_of_dense_sampling(name):
         under = np.flatnonzero(sampled <= 0.0)
         hits = len(under) and under[0] > 0 and sampled[under[0] - 1] > 0.0
         if np.isnan(found):
-            # Sampling finds nothing either, or a ray that comes out of a void, or from beside the DEM, below it.
+            # Sampling finds nothing either, or a ray that comes out of a void, or from next to the DEM, below it.
             assert not hits
             continue
         met += 1

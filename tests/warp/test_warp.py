@@ -562,7 +562,7 @@ def test_mask_and_nan_are_not_valid(scene, tmp_path):
 
 
 def test_a_valid_pixel_never_becomes_nodata(scene, tmp_path):
-    """Between 4 and 6 lies 5, which is nodata: such a pixel moves to the value beside it."""
+    """Between 4 and 6 lies 5, which is nodata: such a pixel moves to the value next to it."""
     pixels = np.full((1, HEIGHT, WIDTH), 4, np.uint8)
     pixels[:, :, ::2] = 6
     path = scene.write(pixels, nodata=5)

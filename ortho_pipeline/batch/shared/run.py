@@ -234,7 +234,7 @@ def _collected(
 
 
 def summary_of(planned: Plan, where: SharedFolder) -> BatchResult:
-    """Collect the results of all workers, and write them beside the scenes as ``run.json``; make nothing."""
+    """Collect the results of all workers, and write them next to the scenes as ``run.json``; make nothing."""
     begin = time.monotonic()
     outcomes = tuple(_collected(where, where.leases(), planned, {}))
     store = Objects(where.address, allow_network=where.allow_network)

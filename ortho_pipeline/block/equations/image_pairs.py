@@ -1,6 +1,6 @@
 """Which images of a block share points: where its normal equations are not zero, and an order in which to solve them.
 
-Images stand in levels: those that share points with an image of one level stand in it or beside it (the levels of a
+Images stand in levels: those that share points with an image of one level stand in it or next to it (the levels of a
 search in breadth from an image at the rim). So the normal equations are block tridiagonal, and a strip of a thousand
 images takes ten times as long as one of a hundred.
 

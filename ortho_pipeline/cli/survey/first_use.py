@@ -141,7 +141,7 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         if images and seen.of("points"):
             line = shlex.join(["ortho", "compare", at(images[0]), "--gcps", at(seen.of("points")[0])])
             return ["No image has a sensor model. Fit one to the points:", f"  {line}"]
-        return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) beside the image."]
+        return ["No image has a sensor model. Put the metadata (RPC, DIMAP, .IMD ...) next to the image."]
     dems, points, maps = (seen.beside(scenes[0], kind) for kind in _KINDS)
     notes, words = [], ["--dem", at(dems[0])] if dems else ["--dem", "auto", "--allow-network"]
     if not dems:

@@ -46,7 +46,7 @@ def mosaic(
 ) -> Result:
     """Make one raster of orthos that share a grid.
 
-    How each was seen is taken from its report beside it (`<stem>_report.json`), how accurate it is from
+    How each was seen is taken from its report next to it (`<stem>_report.json`), how accurate it is from
     `<stem>_accuracy.tif`.
 
     Parameters

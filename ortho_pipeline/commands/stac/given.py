@@ -117,7 +117,7 @@ def _one_of_several(image: Any, scene: SceneOptions) -> Any:
         raise InputError(
             f"the RPC of this image lies elsewhere ({rpc.name}), and there is no option to give it for several images",
             file=image,
-            remedy="put it beside the image, with the same stem",
+            remedy="put it next to the image, with the same stem",
         )
     return chosen.href
 

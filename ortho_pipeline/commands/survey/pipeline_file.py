@@ -50,7 +50,7 @@ def init(
         raise InputError(
             "no image has a sensor model",
             file=folder,
-            remedy="put the metadata (RPC, DIMAP, .IMD ...) beside the image",
+            remedy="put the metadata (RPC, DIMAP, .IMD ...) next to the image",
         )
     prefix = os.path.relpath(Path(folder).resolve(), target.resolve().parent)
     if prefix.startswith(os.pardir):

@@ -105,7 +105,7 @@ class _Gate:
         if isinstance(path, VsiPath):
             self._roots: list[AnyPath] = [path.parent]
         else:
-            # The sidecars of a link may be beside the link or beside its target.
+            # The sidecars of a link may be next to the link or next to its target.
             here = Path(path)
             folders = [here, here.resolve()] if here.is_dir() else [here.parent, here.resolve().parent]
             self._roots = [folder.resolve() for folder in (*folders, *map(Path, roots))]
@@ -351,7 +351,7 @@ class _Gate:
 
 
 def _beside(path: Any) -> list[str]:
-    """Return the names beside a file that begin with its own name; behind a URL, those of its existing sidecars."""
+    """Return the names next to a file that begin with its own name; behind a URL, those of its existing sidecars."""
     folder = path.parent
     if isinstance(folder, VsiPath) and not (Location(str(folder)).in_archive and folder.is_dir()):
         names = (path.name + ending for ending in (".ovr", ".msk", ".aux", ".aux.xml"))

@@ -1,4 +1,4 @@
-"""The gallery: chips of the scene beside those of the reference, those that fit worst first."""
+"""The gallery: chips of the scene next to those of the reference, those that fit worst first."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: How many kept and how many rejected matches are shown.
 _WORST, _REJECTED = 24, 8
-#: Pairs of chips beside each other in the picture that holds them all.
+#: Pairs of chips next to each other in the picture that holds them all.
 _COLUMNS = 4
 #: Percentiles of both chips that are black and white.
 _STRETCH = (2.0, 98.0)

@@ -19,7 +19,7 @@ from ortho_pipeline.report.records import SceneReport
 if TYPE_CHECKING:
     from ortho_pipeline.raster.source import RasterSource
 
-#: Side of a chip, px, how many of them lie beside each other in the picture, and how many there are at most.
+#: Side of a chip, px, how many of them lie next to each other in the picture, and how many there are at most.
 SIDE, _COLUMNS, _MOST = 41, 12, 120
 #: The larger of measured and predicted is at most this share of half a chip from its middle.
 _INSIDE = 0.75
@@ -54,7 +54,7 @@ class PointChips:
 def point_chips(report: SceneReport, source: RasterSource) -> PointChips | None:
     """Return chips about the measured points, of at most 120: then those with the largest residuals.
 
-    Matches have chips of their own, beside those of the reference; points outside of the image have none.
+    Matches have chips of their own, next to those of the reference; points outside of the image have none.
     """
     matched = report.matched_places
     known = [

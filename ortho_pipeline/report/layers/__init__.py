@@ -1,1 +1,1 @@
-"""Layers beside an ortho in the report: their records, words and maps."""
+"""Layers next to an ortho in the report: their records, words and maps."""

@@ -1,4 +1,4 @@
-"""Styles in QGIS of layers beside an ortho: one band in five steps of colour."""
+"""Styles in QGIS of layers next to an ortho: one band in five steps of colour."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def write_report_html(
 
 
 def _too_short(report: SceneReport) -> bool:
-    """Tell whether some arrows over the ortho are too short to be drawn beside the longest."""
+    """Tell whether some arrows over the ortho are too short to be drawn next to the longest."""
     sizes = [
         math.hypot(*one.residual_m)
         for one in report.adjustment.points

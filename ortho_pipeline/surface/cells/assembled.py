@@ -149,7 +149,7 @@ def _lost(source: Source, lost: list[Cell], *, known: bool) -> CoverageError:
         if known
         else f"{names} are missing, and without {LIST} it is unknown whether this is sea"
     )
-    otherwise = "" if known else f"; or put the list {LIST} beside the cells"
+    otherwise = "" if known else f"; or put the list {LIST} next to the cells"
     return CoverageError(
         what,
         file=source.address,

@@ -23,7 +23,7 @@ from ortho_pipeline.surface.dem_file import SampleGrid
 PUBLIC = "https://copernicus-dem-30m.s3.amazonaws.com"
 #: The worldwide DEM of 90 m, which has a cell wherever there is land: GLO-30 has not, by decision of its owners.
 PUBLIC_LAND = "https://copernicus-dem-90m.s3.amazonaws.com"
-#: File beside the cells that lists all of them, one name in each line.
+#: File next to the cells that lists all of them, one name in each line.
 LIST = "tileList.txt"
 _CRS = "EPSG:4326+3855"
 #: Samples from one degree of latitude to the next.

@@ -5,7 +5,7 @@ metre that it rises. Within a cell of four samples the terrain along it is a qua
 rises above the line is known, not sampled. Terrain can rise above a line only in a cell that is *steep*: where it
 climbs faster than the line does. All other cells are passed unseen, and so are squares of them whose steep cells all
 lie below the line. A line ends where it is above all steep cells that it could still meet: `find_bounds` takes from
-square to square what stands in the way of lines farther on, less what they rise until then.
+square to square what blocks lines farther on, less what they rise until then.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def is_steep(heights: Any, low: Any, high: Any) -> bool:
 def find_bounds(course: Course, heights: Any, tops: Any, above: Any, below: Any) -> None:
     """Fill the heights of cells from which on lines meet no steep cell any more, and those up to which they meet one.
 
-    What stands in the way is handed on from row to row along columns that move with the lines. A line that begins in a
+    What blocks lines is handed on from row to row along columns that move with the lines. A line that begins in a
     cell of such a column stays within `pad` cells of it: what a column moves in whole cells differs from what a line
     does by less than one, begin and end may be anywhere in their rows, and its direction may be another by the spread.
     Where that comes to more than a cell, the neighbours are taken in each time it has come to one.
@@ -251,7 +251,7 @@ def _rises_above(heights, i, j, x, y, h, across, down, bend, start, end):
 
 @inlined
 def _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend):
-    """Return whether terrain stands in the way of the line from (x, y) in the window, at the height h.
+    """Return whether terrain blocks the line from (x, y) in the window, at the height h.
 
     It goes `across` and `down` samples per metre upwards.
     """
@@ -290,7 +290,7 @@ def _is_hidden(heights, tops, squares, above, below, x, y, h, across, down, bend
 
 @inlined
 def _height(heights, x, y):
-    """Interpolate at (x, y) in the window; NaN outside, and beside a void."""
+    """Interpolate at (x, y) in the window; NaN outside, and next to a void."""
     rows, columns = heights.shape
     if not (0.0 <= x <= columns - 1 and 0.0 <= y <= rows - 1):
         return np.nan

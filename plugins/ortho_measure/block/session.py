@@ -68,7 +68,7 @@ class BlockSession(Project):
     references : tuple of Reference
         May be empty.
     output : Path
-        The GeoJSON of the points; the journal is beside it.
+        The GeoJSON of the points; the journal is next to it.
     options : BlockOptions
         Options of the adjustment, as for `ortho adjust`; `points` are the first points.
     """
@@ -315,7 +315,7 @@ def open_block_session(
     surface: SurfaceOptions = SurfaceOptions(),
     match: MatchOptions = MatchOptions(),
 ) -> BlockSession:
-    """Open images, heights and references, and continue with the points of the journal beside the output.
+    """Open images, heights and references, and continue with the points of the journal next to the output.
 
     Parameters
     ----------

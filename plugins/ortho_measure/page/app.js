@@ -555,7 +555,7 @@ function bandChoices(pane) {
 
 function banner() {
   const text = facts.locked ? 'Read-only: these points are open in another ortho measure process. This window shows its changes.'
-    : facts.stopped ? `Warning: ${facts.stopped}. Only the points before it are loaded. The other actions are in a .rest file beside the journal.`
+    : facts.stopped ? `Warning: ${facts.stopped}. Only the points before it are loaded. The other actions are in a .rest file next to the journal.`
     : facts.writes ? (facts.healed ? 'Note: the last action was not saved completely and is lost.' : '') : 'Read-only: these points are open in another window.';
   $('banner-text').textContent = text;
   $('banner').hidden = !text;

@@ -88,7 +88,7 @@ def leading_to(address: str) -> str:
 def private_file(address: str, points: Path) -> Iterator[Path | None]:
     """Provide a file that leads to an address while the context lasts; None if others could read it.
 
-    It is beside the points, because packaged browsers cannot read ``/tmp`` or hidden folders.
+    It is next to the points, because packaged browsers cannot read ``/tmp`` or hidden folders.
     """
     path = points.with_name(points.name + _ENDING)
     try:
