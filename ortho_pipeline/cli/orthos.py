@@ -80,7 +80,7 @@ def verify(
     from ortho_pipeline.commands.orthos import verifying
 
     require_page("-o DIR", folder)
-    groups = _grouped(grouped, "points", "scene", "output")
+    groups = grouped_options(grouped, "points", "scene", "output")
     result = verifying.verify(
         ortho, folder, match=match, surface=surface, masks=masks, band=band, require=require, **groups
     )
@@ -143,7 +143,7 @@ def align(
 
     if shift_only and correction not in (None, "shift"):
         raise click.UsageError("--shift-only and --correction contradict each other: leave out one.")
-    groups = _grouped(grouped, "scene", "output")
+    groups = grouped_options(grouped, "scene", "output")
     groups["output"] = replace(groups["output"], resampling=resampling)
     result = aligning.align(
         ortho,
@@ -159,7 +159,7 @@ def align(
     print_result(result, as_json)
 
 
-def _grouped(grouped: Mapping[str, Any], *groups: str) -> dict[str, Any]:
+def grouped_options(grouped: Mapping[str, Any], *groups: str) -> dict[str, Any]:
     """Return single options as objects of their groups."""
     options: dict[str, Any] = {}
     for group in groups:

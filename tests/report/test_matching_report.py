@@ -79,7 +79,7 @@ def matches_of(points: Points, rejected: int = 6) -> Matches:
     order = np.argsort(image[:, 1])
     return Matches(
         image[order], rng.normal(0, 1, (total, 2)), score[order], reason[order], np.arange(total)[order],
-        scene[order], target[order], found[order], 2, (Level(4, 8, 60, 50, (3.0, -2.0)),),
+        scene[order], target[order], found[order], np.full((total, 3), np.nan), 2, (Level(4, 8, 60, 50, (3.0, -2.0)),),
         Components(2.0, 1.5, 0.1), points,
     )  # fmt: skip
 

@@ -15,6 +15,7 @@ from scipy import stats
 from ortho_pipeline.commands.inputs import check_paths
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.measuring import BENDING, MeasuredOrtho, affine_of, measure_ortho, smooth_field
+from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.orthos.statistics import Verified, tested_cells
 from ortho_pipeline.commands.orthos.verifying import displacements, document_of
 from ortho_pipeline.commands.resolved.request import Request
@@ -32,11 +33,9 @@ from ortho_pipeline.models import ImageCorrection, MapGrid, SensorModel, SmoothF
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
-from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
+from ortho_pipeline.raster.source import Grid, open_dataset
 from ortho_pipeline.report.orthos.page import write_page
-from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread
-from ortho_pipeline.surface.flat import FlatSurface
+from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
 
 #: The corrections, from simple to flexible.
 CORRECTIONS = ("shift", "affine", "field")
@@ -103,7 +102,7 @@ def align(
     check_paths(files, Request(ortho, scene, match=match, output=output))
     # The ortho gets its name first: what is left is measured in it.
     if resample:
-        _resampled(measured, chosen, files["ortho"], output, scene, progress)
+        write_resampled(measured.scene, chosen.model, _output_grid(measured), files["ortho"], output, scene, progress)
     else:
         dataset = open_dataset(ortho, **scene.access)
         moved = moved_geotransform(_grid_of(measured).geotransform, chosen.shift)
@@ -246,30 +245,6 @@ def _output_grid(measured: MeasuredOrtho) -> Grid:
         return Grid(crs, left, top, dx, -dy, *size)
     low, high = model.corners[:, :2].min(axis=0), model.corners[:, :2].max(axis=0)
     return Grid.of_extent(crs, (*low, *high), (float(np.hypot(dx, other)), float(np.hypot(skew, dy))))
-
-
-def _resampled(
-    measured: MeasuredOrtho,
-    chosen: Chosen,
-    path: Path,
-    output: OutputOptions,
-    scene: SceneOptions,
-    progress: Progress | None,
-) -> None:
-    from ortho_pipeline.warp.engines import engine_of
-    from ortho_pipeline.warp.job import WarpJob
-
-    source = RasterSource(measured.scene.path, **scene.access)
-    profile = Profile.of(source, output.dtype, output.nodata)
-    own = source.dataset.GetMetadata() or {}
-    kept = {key: value for key, value in own.items() if not key.startswith(("AREA_OR_POINT", "STATISTICS_"))}
-    resampling = "nearest" if source.palette else output.resampling
-    job = WarpJob(
-        chosen.model, source, FlatSurface(0.0), _output_grid(measured), resampling, "bilinear", output.tolerance,
-        Resources(output.memory, output.threads, progress), output.format, dict(output.creation_options),
-        dataclasses.replace(profile, metadata={**profile.metadata, **kept}),
-    )  # fmt: skip
-    engine_of("ortho").rectify(job, path)
 
 
 def _after(

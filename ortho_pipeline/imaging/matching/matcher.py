@@ -122,6 +122,8 @@ class Matches:
         The compared chips.
     found : (n, 2)
         Position of the scene chip's centre in the target's chip, chip px from its centre; NaN if not measured.
+    ground : (n, 3)
+        Where the target shows it, also of measured chips that contradict the others; NaN if not measured.
     factor : int
         Pixels of the scene in a chip pixel.
     levels : tuple of Level
@@ -143,6 +145,7 @@ class Matches:
     scene: NDArray[np.float32]
     target: NDArray[np.float32]
     found: Array
+    ground: Array
     factor: int
     levels: tuple[Level, ...]
     components: Components
@@ -458,6 +461,7 @@ class _Tried:
             self.scene,
             self.target,
             self.found,
+            self.ground,
             self.factor,
             levels,
             parts,

@@ -1,0 +1,232 @@
+"""The orthos of a stack and their dates: from a list, a pattern of file names, STAC items, reports or metadata."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import io
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.verifying import RASTERS
+from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.files import decoded, read_bounded, read_json
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.raster.source import open_dataset
+
+#: A list and a JSON document next to an ortho are no larger.
+_BYTES = 50_000_000
+#: Columns of a list: of the file, and of its date.
+_FILE, _DATE = ("file", "path", "image", "ortho", "name"), ("date", "datetime", "acquired", "time")
+#: Metadata with the time of acquisition: domain and item, the best first.
+_ITEMS = (
+    ("IMAGERY", "ACQUISITIONDATETIME"),
+    ("", "ACQUISITIONDATETIME"),
+    ("", "acquired"),
+    ("", "TIFFTAG_DATETIME"),
+)
+_PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "%j": r"(?P<j>\d{3})",
+          "%H": r"(?P<H>\d{2})", "%M": r"(?P<M>\d{2})", "%S": r"(?P<S>\d{2})", "%%": "%"}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Dated:
+    """An ortho with its date, and where the date is from."""
+
+    name: str
+    path: Path
+    time: datetime
+    source: str
+    scene: Scene
+
+    @property
+    def days(self) -> float:
+        """Days since 1970."""
+        return self.time.timestamp() / 86400.0
+
+
+def dated_orthos(
+    given: Sequence[str | os.PathLike[str]], pattern: str | None = None, options: SceneOptions = SceneOptions()
+) -> list[Dated]:
+    """Return the orthos of folders, lists and patterns of names, in order of time and name.
+
+    Raises
+    ------
+    InputError
+        If an ortho has no date, two have one name, or one is no ortho.
+    """
+    found: dict[str, tuple[Path, str | None]] = {}
+    for path, stated in _files(given):
+        name = path.stem
+        if name in found and os.path.realpath(found[name][0]) != os.path.realpath(path):
+            raise InputError(f"two orthos are called {name}", file=path, field="orthos", remedy="rename one of them")
+        found[name] = path, stated
+    if len(found) < 2:
+        raise InputError(
+            f"a stack needs at least two orthos, not {len(found)}",
+            field="orthos",
+            remedy=f"give a folder with orthos ({', '.join(RASTERS)})",
+        )
+    dated = []
+    for name, (path, stated) in found.items():
+        scene = open_ortho(path, options)
+        time, source = _date(path, stated, pattern, options)
+        dated.append(Dated(name, path, time, source, scene))
+    return sorted(dated, key=lambda one: (one.time, one.name))
+
+
+def _files(given: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, str | None]]:
+    """Return files and the dates that lists state."""
+    found: list[tuple[Path, str | None]] = []
+    for one in given:
+        path = Path(one)
+        if path.is_dir():
+            found += [(file, None) for file in sorted(path.iterdir()) if file.suffix.lower() in RASTERS]
+        elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
+            found += read_list(path)
+        elif not path.exists() and any(mark in str(one) for mark in "*?["):
+            matches = sorted(glob.glob(str(one)))
+            if not matches:
+                raise InputError("no file has such a name", file=path, field="orthos", remedy="check the pattern")
+            found += [(Path(file), None) for file in matches]
+        else:
+            found.append((path, None))
+    return found
+
+
+@reads("give a CSV file with the columns file and date")
+def read_list(path: str | os.PathLike[str]) -> list[tuple[Path, str | None]]:
+    """Return the files of a list, and their dates if it has a column of them.
+
+    Raises
+    ------
+    InputError
+        If it has no column of files, or a row has no file.
+    """
+    text = decoded(read_bounded(path, _BYTES, remedy="give a list of files"))
+    rows = [row for row in csv.reader(io.StringIO(text)) if any(cell.strip() for cell in row)]
+    if not rows:
+        raise InputError("this list is empty", file=path)
+    header = [cell.strip().lower() for cell in rows[0]]
+    file = next((header.index(name) for name in _FILE if name in header), None)
+    date = next((header.index(name) for name in _DATE if name in header), None)
+    if file is None:
+        raise InputError("this list has no column of files", file=path, remedy="name the columns file and date")
+    found: list[tuple[Path, str | None]] = []
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) <= file or not row[file].strip() or "\0" in row[file]:
+            raise InputError("a row of this list has no file", file=path, field=f"line {number}")
+        stated = row[date].strip() if date is not None and len(row) > date else ""
+        found.append((Path(path).parent / row[file].strip(), stated or None))
+    return found
+
+
+def _date(path: Path, stated: str | None, pattern: str | None, options: SceneOptions) -> tuple[datetime, str]:
+    """Return the date of an ortho, and where it is from."""
+    if stated is not None:
+        return time_of(stated, path), "list"
+    if pattern is not None:
+        return by_pattern(path.name, pattern), "file name"
+    for document, name in _documents(path):
+        text = _stated_in(document)
+        if text is not None:
+            return time_of(text, path), name
+    dataset = open_dataset(path, **options.access)
+    for domain, item in _ITEMS:
+        text = (dataset.GetMetadata(domain) or {}).get(item)
+        if text:
+            return time_of(text, path), item
+    raise InputError(
+        "this ortho has no date: no STAC item and no report are next to it, and its metadata state none",
+        file=path,
+        field="date",
+        remedy="give a CSV file with the columns file and date, or the place of the date in the file names: "
+        "`--date-pattern %Y%m%d`",
+    )
+
+
+def _documents(path: Path) -> list[tuple[Any, str]]:
+    """Return JSON documents next to an ortho, which may state its date."""
+    stem = path.stem.removesuffix("_ortho")
+    names = [path.with_suffix(".json"), path.with_name(f"{stem}_stac.json"), path.with_name(f"{stem}_report.json")]
+    return [
+        (read_json(name, _BYTES, "delete this file, or give the date in a list"), name.name)
+        for name in names
+        if name.is_file()
+    ]
+
+
+def _stated_in(document: Any) -> str | None:
+    """Return the date that a STAC item or a report states."""
+    if not isinstance(document, dict):
+        return None
+    for member in (document.get("properties"), document.get("scene")):
+        facts = member.get("facts", member) if isinstance(member, dict) else {}
+        for name in ("datetime", "start_datetime", "acquired"):
+            if isinstance(facts, dict) and isinstance(facts.get(name), str):
+                return str(facts[name])
+    return None
+
+
+def time_of(text: str, file: str | os.PathLike[str] | None = None) -> datetime:
+    """Return a date or time as texts and metadata write it; UTC if they do not say otherwise.
+
+    >>> time_of("2024:05:03 10:12:00").isoformat()
+    '2024-05-03T10:12:00+00:00'
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    plain = re.sub(r"^(\d{4})[:/](\d\d)[:/](\d\d)", r"\1-\2-\3", text.strip())
+    try:
+        time = datetime.fromisoformat(plain)
+        return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"{text[:40]!r} is not a date", file=file, field="date", remedy="write dates as 2024-05-03"
+        ) from error
+
+
+def by_pattern(name: str, pattern: str) -> datetime:
+    """Return the date in a file name.
+
+    >>> by_pattern("T36_20240503_B04.tif", "_%Y%m%d_").date().isoformat()
+    '2024-05-03'
+
+    Raises
+    ------
+    InputError
+        If the pattern has no year, or does not occur in the name.
+    """
+    parts = re.split(r"(%[a-zA-Z%])", pattern)
+    codes = [part for part in parts if part.startswith("%") and len(part) == 2]
+    unknown = [code for code in codes if code not in _PARTS]
+    if unknown or "%Y" not in codes or len(set(codes)) < len(codes):
+        raise InputError(
+            f"{pattern!r} is not a pattern of a date", field="date_pattern", remedy="such as %Y%m%d or %Y-%j"
+        )
+    found = re.search("".join(_PARTS.get(part, re.escape(part)) for part in parts), name)
+    if found is None:
+        raise InputError(
+            f"the name {name} does not have the date pattern {pattern}",
+            field="date_pattern",
+            remedy="change the pattern, or give a CSV file with the columns file and date",
+        )
+    numbers = found.groupdict()
+    whole = "".join(numbers.values())
+    code = "".join(f"%{key}" for key in numbers)
+    try:
+        return datetime.strptime(whole, code).replace(tzinfo=UTC)
+    except ValueError as error:
+        raise InputError(
+            f"the name {name} has no valid date", field="date_pattern", remedy="change the pattern"
+        ) from error

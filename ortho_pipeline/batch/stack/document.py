@@ -1,0 +1,197 @@
+"""The document of a stack, from its adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ortho_pipeline.batch.stack.dates import Dated
+from ortho_pipeline.batch.stack.matching import Pair
+from ortho_pipeline.batch.stack.placing import Placed
+from ortho_pipeline.block.stack.adjustment import Adjusted
+from ortho_pipeline.commands.results import SCHEMA_VERSION
+from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.estimation.ground_residuals import metre_partials
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.report.stack.records import (
+    CellRecord,
+    ClosureRecord,
+    DateRecord,
+    GridRecord,
+    MovingRecord,
+    PairRecord,
+    StackRecord,
+    StepRecord,
+)
+
+
+def record_of(
+    dates: Sequence[Dated], placed: Placed, pairs: Sequence[Pair], stack: Adjusted, outputs: dict[str, str], datum: str
+) -> StackRecord:
+    """Return the record of a stack; `outputs` are the files of dates by name."""
+    metres = _metres(placed)
+    matched = [pair for pair in pairs if pair.matches is not None]
+    notices = _notices(dates, stack, matched, len(pairs))
+    shifts, usable = stack.trends.value[:, 0], stack.trends.good
+    grid = placed.grid
+    return StackRecord(
+        schema_version=SCHEMA_VERSION,
+        datum=datum,
+        grid=GridRecord(
+            crs=placed.model.crs, geotransform=grid.geotransform, size=(grid.width, grid.height),
+            pixel_m=float(np.sqrt(abs(np.linalg.det(metres)))),
+        ),
+        dates=tuple(_date(dates, number, stack, metres, outputs) for number in range(len(dates))),
+        pairs=tuple(_pairs(dates, pairs, stack)),
+        closure_before=closures(stack, shifts, usable),
+        closure_after=closures(stack, shifts, stack.closures.accepted),
+        moving=tuple(_moving(stack, placed, metres)),
+        cells=tuple(
+            CellRecord(
+                place=_pair(place), tested=bool(tested), moving=bool(moving), rate_px_per_year=_pair(rate),
+                sigma_px_per_year=_pair(np.minimum(sigma, 1e6)),
+            )
+            for place, tested, moving, rate, sigma in zip(
+                stack.cells.middles, stack.motion.tested, stack.motion.moving, stack.motion.rate, stack.motion.sigma,
+                strict=True,
+            )
+        ),
+        steps=tuple(
+            StepRecord(date=dates[one.date].name, size_px=one.size, sigma_px=one.sigma, chance=one.chance)
+            for one in stack.steps
+        ),
+        **to_document(notices),
+    )  # fmt: skip
+
+
+def _metres(placed: Placed) -> Array:
+    """Return metres to true east and north ``(2, 2)`` of a pixel along columns and rows, in the middle."""
+    model = placed.model
+    middle = model.image_to_ground(np.array([model.size]) / 2, 0.0)
+    return np.asarray(np.linalg.inv(metre_partials(model, middle)[0][0]))
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _date(dates: Sequence[Dated], number: int, stack: Adjusted, metres: Array, outputs: dict[str, str]) -> DateRecord:
+    one, known = dates[number], bool(stack.determined[number])
+    accepted, edges = stack.closures.accepted, stack.edges
+    count = int((accepted & ((edges.first == number) | (edges.second == number))).sum())
+    shift, sigma = stack.network.value[number, 0], stack.sigma[number]
+    low, size = stack.cells.low, stack.cells.side * np.array(stack.cells.shape)
+    corners = low + size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    largest = float(np.hypot(*stack.at(corners)[0][number].T).max())
+    return DateRecord(
+        name=one.name,
+        path=str(one.path),
+        time=one.time.isoformat(),
+        time_from=one.source,
+        correction=("affine" if stack.sloped[number] else "shift") if known else None,
+        shift_px=_pair(shift) if known else None,
+        sigma_px=_pair(sigma) if known else None,
+        corner_px=largest if known else None,
+        east_north_m=_pair(metres @ shift) if known else None,
+        sigma_m=float(np.sqrt(np.trace(metres @ np.diag(sigma**2) @ metres.T) / 2)) if known else None,
+        pairs=count,
+        output=outputs.get(one.name),
+    )
+
+
+def _pairs(dates: Sequence[Dated], pairs: Sequence[Pair], stack: Adjusted) -> list[PairRecord]:
+    names = [one.name for one in dates]
+    found, edge = [], 0
+    for pair in pairs:
+        first, second = names[pair.first], names[pair.second] if pair.second < len(names) else "reference"
+        if pair.matches is None:
+            found.append(
+                PairRecord(
+                    first=first, second=second, status="not matched", reason=pair.reason, matches=0, shift_px=None,
+                    closure_px=None, ratio=None,
+                )
+            )  # fmt: skip
+            continue
+        tested = bool(np.isfinite(stack.closures.ratio[edge])) and bool(stack.trends.good[edge])
+        accepted = bool(stack.closures.accepted[edge])
+        status = ("accepted" if tested else "untested") if accepted else "rejected"
+        reason = ""
+        if not accepted:
+            reason = "does not close with the other pairs" if tested else "too few places, or no connection"
+        found.append(
+            PairRecord(
+                first=first, second=second, status=status, reason=reason, matches=pair.matches.kept,
+                shift_px=_pair(stack.trends.value[edge, 0]),
+                closure_px=_pair(stack.closures.error[edge]) if tested else None,
+                ratio=float(stack.closures.ratio[edge]) if tested else None,
+            )
+        )  # fmt: skip
+        edge += 1
+    return found
+
+
+def closures(stack: Adjusted, shifts: Array, some: Array) -> ClosureRecord:
+    """Return the closing errors of loops of three of some edges ``(E,)``."""
+    edges = stack.edges
+    number = {(int(a), int(b)): e for e, (a, b) in enumerate(zip(edges.first, edges.second, strict=True)) if some[e]}
+    found = []
+    for (one, other), edge in number.items():
+        for third in range(other):
+            back, long = number.get((other, third)), number.get((one, third))
+            if back is not None and long is not None:
+                found.append(float(np.hypot(*(shifts[edge] + shifts[back] - shifts[long]))))
+    if not found:
+        return ClosureRecord(loops=0, median_px=None, p95_px=None, largest_px=None)
+    return ClosureRecord(
+        loops=len(found), median_px=float(np.median(found)), p95_px=float(np.quantile(found, 0.95)),
+        largest_px=max(found),
+    )  # fmt: skip
+
+
+def _moving(stack: Adjusted, placed: Placed, metres: Array) -> list[MovingRecord]:
+    motion, found = stack.motion, []
+    to_lon_lat = ground_transform(placed.model.crs, "EPSG:4979")
+    cell = (stack.cells.side**2) * abs(float(np.linalg.det(metres)))
+    for area in motion.areas(stack.cells):
+        weight = 1.0 / np.maximum(motion.sigma[area] ** 2, 1e-12)
+        rate = metres @ ((motion.rate[area] * weight).sum(axis=0) / weight.sum(axis=0))
+        # Errors of neighbouring cells are shared: their mean is no more certain than a cell.
+        sigma = float(np.median(motion.sigma[area])) * float(np.sqrt(abs(np.linalg.det(metres))))
+        middle = placed.model.image_to_ground(stack.cells.middles[area].mean(axis=0)[None], 0.0)
+        lon, lat, _ = to_lon_lat(middle)[0]
+        strongest = area[int(motion.ratio[area].argmax())]
+        found.append(
+            MovingRecord(
+                lon=float(lon), lat=float(lat), cells=len(area), area_m2=len(area) * cell,
+                east_m_per_year=float(rate[0]), north_m_per_year=float(rate[1]), sigma_m_per_year=sigma,
+                significance=float(np.sqrt(motion.ratio[strongest])), form=str(motion.form[strongest]),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _notices(dates: Sequence[Dated], stack: Adjusted, matched: Sequence[Pair], tried: int) -> list[Notice]:
+    found = []
+    lost = [one.name for one, known in zip(dates, stack.determined, strict=False) if not known]
+    if lost:
+        text = f"no accepted pair connects {counted(len(lost), 'date')} with the others, so they are not corrected"
+        found.append(Notice("stack-not-connected", text, dates=lost))
+    rejected = int((~stack.closures.accepted).sum())
+    if rejected > 0.2 * max(len(matched), 1):
+        text = f"{rejected} of {counted(len(matched), 'pair')} contradict the others"
+        found.append(Notice("stack-pairs-contradict", text, rejected=rejected, pairs=len(matched)))
+    if len(matched) < 0.7 * tried:
+        text = f"only {len(matched)} of {counted(tried, 'pair')} could be matched"
+        found.append(Notice("stack-pairs-unmatched", text, matched=len(matched), pairs=tried))
+    for step in stack.steps:
+        size = float(np.hypot(*step.size))
+        text = f"from {dates[step.date].name} on, all orthos are displaced by {size:.1f} px relative to those before"
+        found.append(Notice("stack-step", text, date=dates[step.date].name, size_px=list(step.size)))
+    moving = int(stack.motion.moving.sum())
+    if moving > 0.4 * max(int(stack.motion.tested.sum()), 1):
+        text = f"{moving} of {counted(int(stack.motion.tested.sum()), 'cell')} move, so the stable ground is uncertain"
+        found.append(Notice("stack-mostly-moving", text, cells=moving))
+    return found

@@ -1,0 +1,112 @@
+"""The common grid of a stack, and the corrected model of each date on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ortho_pipeline.batch.stack.dates import Dated
+from ortho_pipeline.block.stack.adjustment import Adjusted
+from ortho_pipeline.errors import CrsError
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.geodesy.naming import crs_definition
+from ortho_pipeline.models import ImageCorrection, MapGrid
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.source import Grid
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """The grid of a stack: that of its first date, extended to all others."""
+
+    grid: Grid
+
+    @classmethod
+    def of(cls, dates: Sequence[Dated]) -> Placed:
+        """Return the grid of orthos.
+
+        Raises
+        ------
+        CrsError
+            If their CRS differ.
+        """
+        models = [map_grid_of(one) for one in dates]
+        crs = parse_crs(models[0].map_crs)
+        for one, model in zip(dates, models, strict=True):
+            if parse_crs(model.map_crs) != crs:
+                raise CrsError(
+                    f"this ortho has another CRS than {dates[0].path.name}",
+                    file=one.path,
+                    field="orthos",
+                    remedy="give orthos of one CRS: `gdalwarp -t_srs EPSG:CODE -r cubic IN.tif OUT.tif`",
+                )
+        first = models[0]
+        step = np.array(_pixel(first))
+        corners = np.concatenate([_corners(model) for model in models])
+        origin = _corners(first)[:, 0].min(), _corners(first)[:, 1].max()
+        before = np.ceil((origin[0] - corners[:, 0].min()) / step[0] - 1e-6)
+        above = np.ceil((corners[:, 1].max() - origin[1]) / step[1] - 1e-6)
+        left, top = origin[0] - before * step[0], origin[1] + above * step[1]
+        width = int(np.ceil((corners[:, 0].max() - left) / step[0] - 1e-6))
+        height = int(np.ceil((top - corners[:, 1].min()) / step[1] - 1e-6))
+        return cls(Grid(crs, float(left), float(top), float(step[0]), float(step[1]), width, height))
+
+    @property
+    def model(self) -> MapGrid:
+        """The grid as a model."""
+        return MapGrid(crs_definition(self.grid.crs), self.grid.geotransform, (self.grid.width, self.grid.height))
+
+    def at(self, plan: Array) -> Array:
+        """Return places ``(n, 2)`` px of map coordinates ``(n, 2)``."""
+        return self.model.ground_to_image(np.column_stack([plan, np.zeros(len(plan))]))
+
+    def covered(self, dates: Sequence[Dated]) -> tuple[Array, Array]:
+        """Return the lowest and highest place (px) of the orthos."""
+        places = np.concatenate([self.at(_corners(map_grid_of(one))) for one in dates])
+        return places.min(axis=0), places.max(axis=0)
+
+    def corrected(self, one: Dated, stack: Adjusted, date: int) -> ImageCorrection:
+        """Return the model of an ortho with its correction."""
+        own, size = map_grid_of(one), (one.scene.width, one.scene.height)
+        origin = np.array(size) / 2
+
+        def moved(image: Array) -> Array:
+            place = self.at(own.image_to_ground(image, 0.0)[:, :2])
+            shown = place + stack.at(place)[0][date]
+            return own.ground_to_image(self.model.image_to_ground(shown, 0.0)) - image
+
+        middle, right, below = moved(origin + np.array([[0.0, 0.0], [size[0] / 2, 0.0], [0.0, size[1] / 2]]))
+        across, down = (right - middle) / (size[0] / 2), (below - middle) / (size[1] / 2)
+        kind = "affine" if stack.sloped[date] else "shift"
+        if kind == "shift":
+            across, down = np.zeros(2), np.zeros(2)
+        coefficients = np.array([middle[0], across[0], down[0], middle[1], across[1], down[1]])
+        return ImageCorrection(own, kind, (float(origin[0]), float(origin[1])), coefficients)
+
+
+def map_grid_of(one: Dated) -> MapGrid:
+    """Return the map grid of an ortho."""
+    model = one.scene.model
+    assert isinstance(model, MapGrid)
+    return model
+
+
+def geotransform_of(model: ImageCorrection) -> tuple[float, ...]:
+    """Return the geotransform of a map grid with a correction."""
+    origin, right, below = model.image_to_ground(np.array([[0.0, 0.0], [1000.0, 0.0], [0.0, 1000.0]]), 0.0)[:, :2]
+    across, down = (right - origin) / 1000.0, (below - origin) / 1000.0
+    return (origin[0], across[0], down[0], origin[1], across[1], down[1])
+
+
+def _pixel(model: MapGrid) -> tuple[float, float]:
+    _, a, b, _, c, d = model.geotransform
+    return float(np.hypot(a, c)), float(np.hypot(b, d))
+
+
+def _corners(model: MapGrid) -> Array:
+    """Return the map coordinates ``(4, 2)`` of the corners of an image."""
+    width, height = model.size
+    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
+    return model.image_to_ground(corners, 0.0)[:, :2]

@@ -1,0 +1,214 @@
+r"""Errors of the values of edges: which part belongs to a date, which to an edge, and what neighbours share.
+
+The error of the edge from date b to date a at place k is :math:`s_a(k) - s_b(k) + u(k)`. The field :math:`s` of a date
+is the same in all of its edges: noise of its pixels, shadows, bending. The field :math:`u` belongs to the edge. Each is
+a sum of noise of single places and of exponential correlations with some ranges. Their variances follow from moments:
+products of residuals of places at similar distances, within edges and between edges with a common date. What the trend
+takes from the residuals is part of the expected products. Variances are not negative.
+
+The mean size of the residuals gives each date a scale of :math:`s`, and each edge one of :math:`u`.
+
+Source: Cressie 1993, section 2.4 (moments of a variogram); Rao 1973, section 4j (MINQUE); Lawson and Hanson 1974
+(non-negative least squares).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize, sparse, spatial
+
+from ortho_pipeline.block.stack.edges import Edges
+from ortho_pipeline.block.stack.trends import Trends
+from ortho_pipeline.models.base import Array
+
+#: Ranges of correlations, in halves of the longer side, and upper limits of the classes of distances.
+_RANGES = 0.2, 0.45, 1.0
+_CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
+#: Edges and pairs of edges whose products are taken, at most.
+_EDGES, _PAIRS = 160, 240
+#: Limits of the scale of an edge, relative to the mean of its dates.
+_SCALES = 0.25, 25.0
+_ROUNDS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Variances of errors, in px².
+
+    Parameters
+    ----------
+    shared, own : (2, 4)
+        Of a date and of an edge, along both axes: noise of single places, and correlations of three ranges.
+    scale : (T,)
+        Of the variances of each date.
+    factor : (E,)
+        Of the variances of each edge.
+    constant : (2,)
+        Variance of an error that all values of an edge share; residuals within edges do not show it.
+    """
+
+    shared: Array
+    own: Array
+    scale: Array
+    factor: Array
+    constant: Array
+
+    def at_place(self, edges: Edges) -> tuple[Array, Array]:
+        """Return variances of single values ``(E, K)``, mean of both axes: in units of a date's scale, and own."""
+        relative = edges.relative
+        shared, own = self.shared.mean(axis=0), self.own.mean(axis=0)
+        both = shared[0] * relative + shared[1:].sum(), own[0] * relative + own[1:].sum()
+        rest = self.constant.mean() + edges.alike[:, None] ** 2
+        return both[0], self.factor[:, None] * both[1] + rest
+
+    def covariance(self, axis: int, edges: Edges, trends: Trends, place: Array) -> tuple[sparse.csr_matrix, Array]:
+        """Return the covariance of all trends ``(E m, E m)`` along an axis, and the part of each edge ``(E, m, m)``."""
+        count, _, terms = trends.weights.shape
+        correlations = _correlations(place)
+        root = np.sqrt(edges.relative)
+        noisy = trends.weights * root[:, :, None]
+        own = self._of_edges(axis, correlations, trends.weights, noisy)
+        own[:, 0, 0] += self.constant[axis] + edges.alike**2
+        smooth = np.tensordot(self.shared[axis, 1:], correlations, 1)
+        incidence = edges.incidence(len(self.scale)).tocsc()
+        blocks = []
+        for date, scale in enumerate(self.scale):
+            part = slice(incidence.indptr[date], incidence.indptr[date + 1])
+            rows, signs = incidence.indices[part], incidence.data[part]
+            flat = (signs[:, None, None] * trends.weights[rows]).transpose(0, 2, 1).reshape(len(rows) * terms, -1)
+            noise = (signs[:, None, None] * noisy[rows]).transpose(0, 2, 1).reshape(len(rows) * terms, -1)
+            block = scale * (flat @ smooth @ flat.T + self.shared[axis, 0] * noise @ noise.T)
+            index = (rows[:, None] * terms + np.arange(terms)).ravel()
+            blocks.append((block.ravel(), np.repeat(index, len(index)), np.tile(index, len(index))))
+        index = np.arange(count * terms).reshape(count, terms)
+        blocks.append((own.ravel(), np.repeat(index, terms, axis=1).ravel(), np.tile(index, (1, terms)).ravel()))
+        data, rows, columns = (np.concatenate(part) for part in zip(*blocks, strict=True))
+        return sparse.csr_matrix((data, (rows, columns)), shape=(count * terms, count * terms)), own
+
+    def _of_edges(self, axis: int, correlations: Array, weights: Array, noisy: Array) -> Array:
+        smooth = np.tensordot(self.own[axis, 1:], correlations, 1)
+        turned = np.tensordot(weights, smooth, axes=(1, 0))  # (E, m, K)
+        found = np.einsum("emk,ekn->emn", turned, weights)
+        found += self.own[axis, 0] * np.einsum("ekm,ekn->emn", noisy, noisy)
+        return np.asarray(self.factor[:, None, None] * found)
+
+
+def _correlations(place: Array) -> Array:
+    """Return the correlations ``(ranges, K, K)`` of places."""
+    distance = spatial.distance.cdist(place, place)
+    return np.exp(-distance / np.array(_RANGES)[:, None, None])
+
+
+def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Components:
+    """Return the components of the errors of edges, from the residuals of their trends."""
+    good = np.flatnonzero(trends.good)
+    size = np.sqrt((trends.residual**2).sum(axis=(1, 2)) / np.maximum(2 * trends.used.sum(axis=1), 1))
+    typical = float(np.median(size[good])) if len(good) else 1.0
+    typical = max(typical, 1e-6)
+    left = trends.residual / np.maximum(size, 1e-9)[:, None, None]
+    shapes = _Shapes(edges, trends, place, left)
+    shared, own = np.empty((2, 1 + len(_RANGES))), np.empty((2, 1 + len(_RANGES)))
+    seen = np.zeros(2)
+    for axis in (0, 1):
+        shared[axis], own[axis], parts = shapes.variances(axis)
+        seen += parts / 2
+    whole = float(seen.sum())
+    if whole > 0:
+        shared, own, seen = shared / whole, own / whole, seen / whole
+    else:
+        shared[:], own[:], seen = 0.0, [1.0, 0.0, 0.0, 0.0], np.array([0.0, 1.0])
+    scale, factor = _scales(edges, good, (size / typical) ** 2, seen, dates)
+    return Components(shared * typical**2, own * typical**2, scale, factor, np.zeros(2))
+
+
+def _scales(edges: Edges, good: Array, square: Array, seen: Array, dates: int) -> tuple[Array, Array]:
+    """Return scales of dates and edges, from squared sizes of residuals and the parts of dates and edges in them."""
+    scale, first, second = np.ones(dates), edges.first[good], edges.second[good]
+    for _ in range(_ROUNDS):
+        expected = (scale[first] + scale[second]) / 2
+        above, below = np.full(dates, 1e-9), np.full(dates, 1e-9)
+        for end in (first, second):
+            # Relative to what is expected, so that an edge of large errors does not decide for all.
+            np.add.at(above, end, np.minimum(square[good] / expected, 9.0))
+            np.add.at(below, end, 1.0)
+        scale *= np.sqrt(above / below)
+    mean = (scale[edges.first] + scale[edges.second]) / 2
+    rest = (square - seen[0] * mean) / max(seen[1], 1e-9)
+    factor = np.clip(rest, _SCALES[0] * mean, _SCALES[1] * mean)
+    return scale, np.where(seen[1] > 0.05, factor, mean)
+
+
+class _Shapes:
+    """Products of residuals, and what they are expected to be."""
+
+    def __init__(self, edges: Edges, trends: Trends, place: Array, left: Array) -> None:
+        self.edges, self.trends, self.left = edges, trends, left
+        self.correlations = _correlations(place)
+        distance = spatial.distance.cdist(place, place)
+        self.classes = np.searchsorted(_CLASSES, distance)
+        good = np.flatnonzero(trends.good)
+        self.single = _spread(good, _EDGES)
+        self.pairs = _spread(_with_common_date(edges, good), _PAIRS)
+
+    def variances(self, axis: int) -> tuple[Array, Array, Array]:
+        """Return variances of a date ``(4,)`` and of an edge ``(4,)``, and their parts ``(2,)`` of a residual."""
+        same, seen, number = self._sums([(e, e, 1.0) for e in self.single], axis)
+        between, cross, many = self._sums(self.pairs, axis)
+        none = np.zeros_like(between)
+        design = np.vstack([np.hstack([2 * same, same]), np.hstack([between, none])])
+        weight = 1.0 / np.sqrt(np.maximum(np.concatenate([number, many]), 1.0))
+        columns = design * weight[:, None]
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+        found = optimize.nnls(columns / size, np.concatenate([seen, cross]) * weight)[0] / size
+        shared, own = np.split(found, 2)
+        here = same[0] / max(float(number[0]), 1.0)
+        return shared, own, np.array([2 * here @ shared, here @ own])
+
+    def _sums(self, pairs: list[tuple[int, int, float]], axis: int) -> tuple[Array, Array, Array]:
+        """Return expected sums ``(classes, 4)`` per unit of variance, those seen ``(classes,)``, and numbers."""
+        classes, terms = len(_CLASSES) + 1, 1 + len(_RANGES)
+        expected, seen, number = np.zeros((classes, terms)), np.zeros(classes), np.zeros(classes)
+        design, relative = self.trends.design, np.sqrt(self.edges.relative)
+        for one, other, sign in pairs:
+            rows, columns = (np.flatnonzero(self.trends.used[edge]) for edge in (one, other))
+            block = np.ix_(rows, columns)
+            place = self.classes[block].ravel()
+            product = sign * np.outer(self.left[one, rows, axis], self.left[other, columns, axis])
+            seen += np.bincount(place, product.ravel(), classes)
+            number += np.bincount(place, minlength=classes)
+            out = [
+                design[index] @ self.trends.weights[edge, index].T for edge, index in ((one, rows), (other, columns))
+            ]
+            for term in range(terms):
+                if term:
+                    kernel = self.correlations[term - 1][block]
+                else:
+                    kernel = (rows[:, None] == columns) * np.outer(relative[one, rows], relative[other, columns])
+                kernel = kernel - out[0] @ kernel
+                kernel = kernel - kernel @ out[1].T
+                expected[:, term] += np.bincount(place, kernel.ravel(), classes)
+        return expected, seen, number
+
+
+def _with_common_date(edges: Edges, good: Array) -> list[tuple[int, int, float]]:
+    """Return pairs of edges with a common date, and the sign of its part in their product."""
+    ends: dict[int, list[tuple[int, float]]] = {}
+    for edge in good.tolist():
+        ends.setdefault(int(edges.first[edge]), []).append((edge, 1.0))
+        ends.setdefault(int(edges.second[edge]), []).append((edge, -1.0))
+    return [
+        (one, other, sign * back)
+        for date in sorted(ends)
+        for place, (one, sign) in enumerate(ends[date])
+        for other, back in ends[date][place + 1 :]
+    ]
+
+
+def _spread(items: list[tuple[int, int, float]] | Array, most: int) -> list:  # type: ignore[type-arg]
+    """Return at most so many items, spread evenly."""
+    listed = list(items)
+    if len(listed) <= most:
+        return listed
+    return [listed[place] for place in np.linspace(0, len(listed) - 1, most).round().astype(int)]

@@ -1,0 +1,188 @@
+"""Moving ground: places whose displacement changes over time beyond its sigma.
+
+What the network leaves at a place is compared with changes over time of some forms: steady, a step at one time, a
+wave of one year. The majority of places is stable by definition: a place moves if it differs from the rate that most
+places share. Sigmas include the errors that edges with a common date share at a place, and noisier places have larger
+ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.stats import chi2
+
+from ortho_pipeline.block.stack.components import Components
+from ortho_pipeline.block.stack.edges import Cells, Edges
+from ortho_pipeline.models.base import Array
+
+#: Chance that a stable place is found to move, over all forms.
+_CHANCE = 1e-3
+#: Less than so many px over the whole time is no motion.
+LEAST = 0.1
+#: A place needs so many edges; steps are tried at so many times.
+_FEWEST, _STEPS = 4, 10
+#: Squared sigmas within which places share a rate.
+_ALIKE = 9.2
+_WAVE = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What moves.
+
+    Parameters
+    ----------
+    moving, tested : (K,) of bool
+    rate, sigma : (K, 2)
+        px a year along columns and rows, relative to the stable places.
+    ratio : (K,)
+        The largest squared change in units of its covariance.
+    form : (K,) of str
+        The form with that: steady, step, or yearly.
+    """
+
+    moving: NDArray[np.bool_]
+    tested: NDArray[np.bool_]
+    rate: Array
+    sigma: Array
+    ratio: Array
+    form: NDArray[np.str_]
+
+    def areas(self, cells: Cells) -> list[NDArray[np.int_]]:
+        """Return connected moving cells, largest area first."""
+        columns, rows = cells.shape
+        numbered, count = ndimage.label(self.moving.reshape(rows, columns), structure=np.ones((3, 3)))
+        found = [np.flatnonzero(numbered.ravel() == number + 1) for number in range(count)]
+        return sorted(found, key=lambda one: (-len(one), one[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """What the network leaves of edges, with the variances of it."""
+
+    value: Array  # (E, K, 2), 0 where nothing is
+    weight: Array  # (E, K)
+    own: Array  # (E, K)
+    shared: Array  # (K,)
+    scale: Array  # (T,)
+    first: NDArray[np.int_]
+    second: NDArray[np.int_]
+
+    def change(self, form: Array) -> tuple[Array, Array, Array]:
+        """Return how much of a form ``(T,)`` each place has ``(K, 2)``, its variance ``(K,)`` and what is left."""
+        apart = (form[self.first] - form[self.second])[:, None]
+        squares = np.maximum((self.weight * apart**2).sum(axis=0), 1e-300)
+        shares = self.weight * apart / squares
+        size = np.einsum("ek,ekc->kc", shares, self.value)
+        of_dates = np.zeros((len(self.scale), shares.shape[1]))
+        np.add.at(of_dates, self.first, shares)
+        np.add.at(of_dates, self.second, -shares)
+        variance = self.shared * (self.scale[:, None] * of_dates**2).sum(axis=0) + (shares**2 * self.own).sum(axis=0)
+        return size, variance, self.value - (apart[:, :, None] * size)
+
+
+def motion_of(
+    edges: Edges,
+    network: Array,
+    components: Components,
+    accepted: NDArray[np.bool_],
+    years: Array,
+    *,
+    steady: bool = False,
+) -> Motion:
+    """Return which places move.
+
+    Parameters
+    ----------
+    network : (E, K, 2)
+        What the corrections of dates predict of the values.
+    years : (T,)
+        Of the dates; NaN of a date without a time, such as a reference.
+    steady : bool
+        Try steady motion only.
+    """
+    left = _left(edges, network, components, accepted & np.isfinite(years[edges.first] - years[edges.second]))
+    time = np.where(np.isfinite(years), years, 0.0)
+    tested = (left.weight > 0).sum(axis=0) >= _FEWEST
+    span = float(np.ptp(years[np.isfinite(years)]))
+    rate, variance, rest = left.change(time)
+    noisier = _noisier(rest, left.weight)
+    sigma2 = variance * noisier
+    rate = rate - _majority(rate[tested], sigma2[tested]) if tested.any() else rate
+    ratio = (rate**2).sum(axis=1) / np.maximum(sigma2, 1e-300)
+    size, form = np.hypot(*rate.T) * span, np.full(len(ratio), "steady", dtype="<U6")
+    forms = [] if steady else _forms(time, np.isfinite(years), span)
+    crit = chi2.isf(_CHANCE / (1 + len(forms)), 2)
+    moving = tested & (ratio > crit) & (size > LEAST)
+    without = _Left(rest, left.weight, left.own, left.shared, left.scale, left.first, left.second)
+    for name, course in forms:
+        change, variance, _ = without.change(course)
+        seen = tested & (variance < 1e6)
+        if not seen.any():
+            continue
+        change = change - np.median(change[seen & ~moving] if (seen & ~moving).any() else change[seen], axis=0)
+        here = (change**2).sum(axis=1) / np.maximum(variance * noisier, 1e-300)
+        found = seen & (here > crit) & (np.hypot(*change.T) > LEAST)
+        better = found & (~moving | (here > ratio))
+        form[better & ~moving] = name
+        ratio = np.where(better & ~moving, here, ratio)
+        moving |= found
+    sigma = np.sqrt(np.maximum(sigma2, 0.0))[:, None] * np.ones(2)
+    return Motion(moving, tested, rate, sigma, ratio, form)
+
+
+def _left(edges: Edges, network: Array, components: Components, accepted: NDArray[np.bool_]) -> _Left:
+    seen = edges.measured & accepted[:, None]
+    value = np.where(seen[:, :, None], np.nan_to_num(edges.value) - network, 0.0)
+    shared, own = components.at_place(edges)
+    scale = components.scale[edges.first] + components.scale[edges.second]
+    whole = scale[:, None] * shared + own
+    many = np.maximum(seen.sum(axis=0), 1)
+    return _Left(
+        value,
+        np.where(seen, 1.0 / np.maximum(whole, 1e-12), 0.0),
+        own,
+        np.where(seen, shared, 0.0).sum(axis=0) / many,
+        components.scale,
+        edges.first,
+        edges.second,
+    )
+
+
+def _noisier(rest: Array, weight: Array) -> Array:
+    """Return by how much the variance of each place ``(K,)`` is larger than the one of most."""
+    square = np.where((weight > 0)[:, :, None], rest**2 * weight[:, :, None], np.nan)
+    flat = square.transpose(1, 0, 2).reshape(square.shape[1], -1)
+    flat = np.where(np.isfinite(flat).any(axis=1)[:, None], flat, 0.0)
+    return np.asarray(np.maximum(np.nanmedian(flat, axis=1) / chi2.median(1), 1.0))
+
+
+def _majority(rate: Array, variance: Array) -> Array:
+    """Return the rate ``(2,)`` that most places share."""
+    apart = ((rate[:, None] - rate) ** 2).sum(axis=2) / np.maximum(variance, 1e-300)
+    alike = apart[int((apart < _ALIKE).sum(axis=1).argmax())] < _ALIKE
+    middle = np.median(rate[alike], axis=0)
+    for _ in range(5):
+        alike = ((rate - middle) ** 2).sum(axis=1) / np.maximum(variance, 1e-300) < _ALIKE
+        if not alike.any():
+            break
+        weight = 1.0 / np.maximum(variance[alike], 1e-300)
+        middle = np.average(rate[alike], axis=0, weights=weight)
+    return np.asarray(middle)
+
+
+def _forms(time: Array, known: NDArray[np.bool_], span: float) -> list[tuple[str, Array]]:
+    """Return changes over time besides a steady one."""
+    times = np.unique(time[known])
+    if len(times) < 6:
+        return []
+    inside = times[2:-1]
+    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _STEPS).round().astype(int))]
+    found = [("step", (time >= one).astype(float)) for one in chosen]
+    if span >= _WAVE:
+        found += [("yearly", 0.5 * wave(2 * np.pi * time)) for wave in (np.cos, np.sin)]
+    return found

@@ -1,0 +1,232 @@
+r"""The network of a stack: one correction for each date, from all edges together.
+
+The trends of edges are :math:`y = G p + e`, where G says which dates an edge compares. Weights are the errors of each
+edge alone: errors of a date are the same in all of its edges and move its correction, whatever the weights. With
+:math:`p = Q y` the covariance is :math:`Q \Sigma Q^T`. The full :math:`\Sigma` includes what edges with a common date
+share.
+
+An edge is accepted if it closes the loop: if it differs from what all other edges say of its two dates by no more than
+their common error explains. The first solution minimises the sum of lengths, so that wrong edges hardly move it. Then
+edges leave and come back until none changes.
+
+Source: Baarda 1968 (tests of single observations); Huber 1981 (robust start); Liang and Zeger 1986 (sandwich).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, sparse
+from scipy.sparse import csgraph
+from scipy.stats import chi2
+
+from ortho_pipeline.block.stack.components import Components
+from ortho_pipeline.block.stack.edges import Edges
+from ortho_pipeline.block.stack.trends import Trends
+from ortho_pipeline.models.base import Array
+
+#: Chance that a right edge is rejected.
+CHANCE = 1e-4
+_START, _ROUNDS = 30, 8
+#: Part of the errors of its dates that an edge has in its weight, so that no weight is infinite.
+_LEAST = 0.1
+#: An edge with a smaller redundancy is in no loop.
+_IN_LOOP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Closures:
+    """How edges close loops with all other edges.
+
+    Parameters
+    ----------
+    error : (E, 2)
+        What an edge measured minus what the other edges say, px; NaN where no loop tests it.
+    ratio : (E,)
+        Squared error in units of its covariance; NaN where no loop tests it.
+    accepted : (E,) of bool
+    """
+
+    error: Array
+    ratio: Array
+    accepted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """Corrections of dates.
+
+    Parameters
+    ----------
+    value : (T, 3, 2)
+        Shift at the middle and slopes, px; 0 where a term is not estimated.
+    covariance : (2, 3 T, 3 T)
+        Along both axes.
+    part : (T,) of int
+        Dates with the same number are connected by accepted edges.
+    """
+
+    value: Array
+    covariance: Array
+    part: NDArray[np.int_]
+
+    def relative_to(self, weights: Array) -> Network:
+        """Return corrections of which the mean with weights ``(T,)``, with a sum of 1, is zero."""
+        change = np.kron(np.eye(len(self.value)) - weights, np.eye(3))
+        value = self.value - np.einsum("t,tmc->mc", weights, self.value)
+        return replace(self, value=value, covariance=np.array([change @ one @ change.T for one in self.covariance]))
+
+
+def accepted_edges(
+    edges: Edges, trends: Trends, components: Components, place: Array, dates: int
+) -> tuple[Closures, Components]:
+    """Return which edges close loops, and components with the error that only loops show."""
+    incidence = edges.incidence(dates)
+    value, usable = trends.value[:, 0], trends.good
+    accepted = usable.copy()
+    left = value - incidence @ _shortest(incidence, value, usable)
+    for turn in range(_ROUNDS):
+        both = [components.covariance(axis, edges, _shifts(trends), place) for axis in (0, 1)]
+        if turn == 0:
+            total = np.array([one.diagonal() for one, _ in both]).T
+            rest = np.median(left[usable] ** 2, axis=0) / chi2.median(1) if usable.any() else np.zeros(2)
+            components = replace(components, constant=_more(rest, np.median(total[usable], axis=0)))
+            ratio = (left**2 / np.maximum(total + components.constant, 1e-12)).sum(axis=1)
+            again = usable & (ratio < chi2.isf(CHANCE, 2))
+        else:
+            closures, constant = _closed(incidence, value, both, usable, accepted)
+            components = replace(components, constant=np.maximum(components.constant + constant, 0.0))
+            again = usable & ~(closures.ratio > chi2.isf(CHANCE, 2))
+            if (again == accepted).all() and turn > 2:
+                break
+        accepted = again
+    return closures, components
+
+
+def _more(seen: Array, expected: Array) -> Array:
+    return np.asarray(np.maximum(seen - expected, 0.0))
+
+
+def _shifts(trends: Trends) -> Trends:
+    """Return the first terms of trends alone."""
+    return replace(trends, weights=np.ascontiguousarray(trends.weights[:, :, :1]), value=trends.value[:, :1])
+
+
+def _shortest(incidence: sparse.csr_matrix, value: Array, usable: NDArray[np.bool_]) -> Array:
+    """Return shifts of dates ``(T, 2)`` with the least sum of lengths of what is left of edges."""
+    weight, found = usable.astype(float), np.zeros((incidence.shape[1], 2))
+    for _ in range(_START):
+        normal = (incidence.T @ incidence.multiply(weight[:, None])).toarray()
+        found = linalg.lstsq(normal, incidence.T @ (weight[:, None] * value), check_finite=False)[0]
+        length = np.hypot(*(value - incidence @ found).T)
+        floor = max(float(np.median(length[usable])) * 0.1, 1e-6) if usable.any() else 1.0
+        weight = usable / np.maximum(length, floor)
+    return np.asarray(found)
+
+
+def _parts(incidence: sparse.csr_matrix, accepted: NDArray[np.bool_]) -> NDArray[np.int_]:
+    some = abs(incidence[np.flatnonzero(accepted)])
+    return np.asarray(csgraph.connected_components(some.T @ some, directed=False)[1])
+
+
+def _closed(
+    incidence: sparse.csr_matrix,
+    value: Array,
+    both: list[tuple[sparse.csr_matrix, Array]],
+    usable: NDArray[np.bool_],
+    accepted: NDArray[np.bool_],
+) -> tuple[Closures, Array]:
+    """Return the closures of edges, and by how much the constant variance ``(2,)`` of edges is to change."""
+    index = np.flatnonzero(accepted)
+    count, part = incidence.shape[1], _parts(incidence, accepted)
+    connected = part[incidence.indices[::2]] == part[incidence.indices[1::2]]
+    member = (part[:, None] == np.arange(part.max() + 1)).astype(float)
+    error, ratio, constant = np.full(value.shape, np.nan), np.zeros(len(value)), np.zeros(2)
+    for axis, (sigma, own) in enumerate(both):
+        weight = 1.0 / _weighed(sigma.diagonal(), own[:, 0, 0])
+        some = incidence[index]
+        scaled = some.multiply(weight[index, None])
+        inverse = np.linalg.inv((some.T @ scaled).toarray() + member @ member.T)
+        gain = inverse @ scaled.T.toarray()  # (T, n)
+        found = gain @ value[index, axis]
+        left = value[:, axis] - incidence @ found
+        reduced = np.eye(len(index)) - some @ gain
+        inside = sigma[index][:, index]
+        spread = reduced @ inside
+        variance = sigma.diagonal() + ((incidence @ (gain @ inside @ gain.T)) * incidence.toarray()).sum(axis=1)
+        variance[index] = np.einsum("ij,ij->i", spread, reduced)
+        redundancy = np.ones(len(value))
+        redundancy[index] = reduced.diagonal()
+        tested = connected & usable & (redundancy > _IN_LOOP)
+        safe = np.where(tested, redundancy, 1.0)
+        error[:, axis] = np.where(tested, left / safe, np.nan)
+        ratio += np.where(tested, left**2 / np.maximum(variance, 1e-12), np.nan)
+        # Of the weighted sum of squares of what is left, E = tr(R' W R Sigma): what is more is a constant of each edge.
+        squares = weight[index] @ (left[index] ** 2)
+        expected = weight[index] @ variance[index]
+        slope = (weight[index, None] * reduced**2).sum()
+        constant[axis] = (squares - expected) / max(slope, 1e-12)
+    assert count
+    return Closures(error, ratio, accepted), constant
+
+
+def _weighed(total: Array, own: Array) -> Array:
+    """Return the variances of which weights are the inverse."""
+    return np.asarray(np.maximum(own + _LEAST * (total - own), 1e-12))
+
+
+def solve(
+    edges: Edges,
+    trends: Trends,
+    components: Components,
+    place: Array,
+    accepted: NDArray[np.bool_],
+    sloped: NDArray[np.bool_],
+) -> Network:
+    """Return the corrections of dates, with slopes of those that are `sloped` ``(T,)``; the mean shift is zero."""
+    dates, terms = len(sloped), trends.design.shape[1]
+    index = np.flatnonzero(accepted)
+    some = edges.select(index)
+    kept = replace(trends, **{name: getattr(trends, name)[index] for name in ("weights", "value", "residual", "used")})
+    limited = replace(components, factor=components.factor[index])
+    part = _parts(edges.incidence(dates), accepted)
+    free = np.zeros((dates, 3), dtype=bool)
+    free[:, 0] = True
+    free[:, 1:] = sloped[:, None] & (terms == 3)
+    columns = np.flatnonzero(free.ravel())
+    design = sparse.kron(some.incidence(dates), np.eye(terms, 3)).tocsr()[:, columns]
+    value, covariance = np.zeros((dates * 3, 2)), np.zeros((2, dates * 3, dates * 3))
+    datum = _datum(part, free)[:, columns]
+    for axis in (0, 1):
+        sigma, own = limited.covariance(axis, some, kept, place)
+        weight = _block_weights(sigma, own)
+        normal = (design.T @ weight @ design).toarray()
+        level = float(np.trace(normal)) / len(normal)
+        gain = np.linalg.solve(normal + level * datum.T @ datum, (design.T @ weight).toarray())
+        value[columns, axis] = gain @ kept.value[:, :, axis].ravel()
+        covariance[axis][np.ix_(columns, columns)] = gain @ (sigma @ gain.T)
+    return Network(value.reshape(dates, 3, 2), covariance, part)
+
+
+def _datum(part: NDArray[np.int_], free: NDArray[np.bool_]) -> Array:
+    """Return rows ``(n, 3 T)`` of what no edge determines: the mean of terms of connected dates that are all free."""
+    rows = []
+    for number in range(int(part.max()) + 1):
+        here = part == number
+        for term in range(3):
+            if free[here, term].all():
+                row = np.zeros(free.shape)
+                row[here, term] = 1.0 / np.sqrt(here.sum())
+                rows.append(row.ravel())
+    return np.array(rows)
+
+
+def _block_weights(sigma: sparse.csr_matrix, own: Array) -> sparse.csr_matrix:
+    count, terms = own.shape[:2]
+    index = np.arange(count * terms).reshape(count, terms)
+    rows, columns = np.repeat(index, terms, axis=1).ravel(), np.tile(index, (1, terms)).ravel()
+    total = np.asarray(sigma[rows, columns]).reshape(count, terms, terms)
+    blocks = np.linalg.inv(own + _LEAST * (total - own) + 1e-12 * np.eye(terms))
+    return sparse.csr_matrix((blocks.ravel(), (rows, columns)), shape=sigma.shape)
