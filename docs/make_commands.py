@@ -131,6 +131,11 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "transform": "Bands differ by something other than a projective transformation.",
     },
     "Many scenes": {
+        "datum": "One date of a stack, or a reference, must keep its place.",
+        "date-pattern": "The dates of a stack are in the file names.",
+        "neighbours": "Clouds or seasons leave too few pairs of dates that match.",
+        "corrections-only": "The pixels of a stack must stay as they are.",
+        "rebuild": "You do not trust the records of an earlier stack.",
         "list": "You want to see the state of each scene.",
         "schema": "You want to know what a pipeline file may contain.",
         "executor": "You do not want one process for each processor.",

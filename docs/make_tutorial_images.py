@@ -22,6 +22,8 @@ from sessions import run
 import ortho_pipeline as op
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.network.drawing import plot_network
+from ortho_pipeline.report.stack.page import timeline
+from ortho_pipeline.report.stack.records import StackRecord
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -297,6 +299,15 @@ def panoramic(path: Path) -> None:
         save(figure, path)
 
 
+# -- time series -----------------------------------------------------------------------------------------------------
+
+
+def corrections(path: Path) -> None:
+    """Draw the timeline as the page of the stack does."""
+    record = StackRecord.read(json.loads(Path("stacked/stack.json").read_text()))
+    path.write_bytes(timeline(record).png(scale=1.2))
+
+
 # -- all -------------------------------------------------------------------------------------------------------------
 
 
@@ -331,10 +342,11 @@ FIGURES: dict[str, dict[str, Callable[[Path], None]]] = {
     "stereo-and-blocks.md": {"block.png": network, "heights.png": heights},
     "sensor-of-your-own.md": {"panoramic.png": panoramic},
     "many-scenes.md": {"run.jpg": run_page, "mosaic.jpg": mosaic},
+    "time-series.md": {"timeline.png": corrections},
 }
 
 #: Pictures of what a later step changes, and after which step they are drawn.
-EARLY = {"run.jpg": 9}
+EARLY = {"run.jpg": 9, "timeline.png": 7}
 
 if __name__ == "__main__":
     main()

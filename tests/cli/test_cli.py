@@ -272,7 +272,7 @@ COMMANDS = [
     "simulate ikonos -o out", "reproduce bilsat", "register a.tif b.tif -o out", "dem-check a.tif --points b.csv",
     "match a.tif --reference b.tif --height 5 -o c.csv", "ties a.tif b.tif --height 5 -o c.csv",
     "measure a.tif --reference b.tif --height 5 -o c.geojson", "mosaic a.tif b.tif -o c.tif",
-    "cache list",
+    "cache list", "stack a.tif b.tif -o out",
     "verify a.tif --reference b.tif", "align a.tif --reference b.tif -o out",
 ]  # fmt: skip
 

@@ -18,9 +18,15 @@ from ortho_pipeline.cli.survey.examples import EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: What takes seconds.
-SLOW = ("match", "ties", "--reference", "edge", "register")
+SLOW = ("match", "stack", "ties", "--reference", "edge", "register")
 #: What has to be there before.
 BEFORE = {
+    "stack": [
+        "ortho rectify scene.tif --dem dem.tif -tr 5 5 -o raw",
+        "ortho rectify scene.tif --gcps gcps.geojson --dem dem.tif -tr 5 5 -o fitted",
+        "ortho mosaic raw/scene_ortho.tif -o series/ortho_20240105.tif",
+        "ortho mosaic fitted/scene_ortho.tif -o series/ortho_20240310.tif",
+    ],
     "mosaic": [
         f"ortho rectify scene.tif --height 800 -t_srs EPSG:32636 -tr 10 10 -te {box} -o {name}"
         for name, box in (("west", "530000 4121500 532000 4123500"), ("east", "531000 4121500 533000 4123500"))

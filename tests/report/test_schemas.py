@@ -20,11 +20,13 @@ from ortho_pipeline.files.json.records import Record
 from ortho_pipeline.options import BlockOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.report.block_records import BlockReport
 from ortho_pipeline.report.records import SceneReport
+from ortho_pipeline.report.stack.records import StackRecord
 
 DOCS = Path(__file__).resolve().parent.parent.parent / "docs"
 SCHEMAS: dict[str, tuple[type[Record], str]] = {
     "report.schema.json": (SceneReport, "Accuracy report of ortho-pipeline, schema version 1"),
     "block_report.schema.json": (BlockReport, "Block report of ortho-pipeline, schema version 1"),
+    "stack.schema.json": (StackRecord, "Stack of ortho-pipeline, schema version 1"),
 }
 
 

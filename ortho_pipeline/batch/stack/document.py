@@ -179,10 +179,6 @@ def _notices(dates: Sequence[Dated], stack: Adjusted, matched: Sequence[Pair], t
     if lost:
         text = f"no accepted pair connects {counted(len(lost), 'date')} with the others, so they are not corrected"
         found.append(Notice("stack-not-connected", text, dates=lost))
-    rejected = int((~stack.closures.accepted).sum())
-    if rejected > 0.2 * max(len(matched), 1):
-        text = f"{rejected} of {counted(len(matched), 'pair')} contradict the others"
-        found.append(Notice("stack-pairs-contradict", text, rejected=rejected, pairs=len(matched)))
     if len(matched) < 0.7 * tried:
         text = f"only {len(matched)} of {counted(tried, 'pair')} could be matched"
         found.append(Notice("stack-pairs-unmatched", text, matched=len(matched), pairs=tried))

@@ -111,8 +111,8 @@ def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Com
     shapes = _Shapes(edges, trends, place, left)
     shared, own = np.empty((2, 1 + len(_RANGES))), np.empty((2, 1 + len(_RANGES)))
     seen = np.zeros(2)
-    for axis in (0, 1):
-        shared[axis], own[axis], parts = shapes.variances(axis)
+    for axis, (of_date, of_edge, parts) in enumerate(shapes.variances()):
+        shared[axis], own[axis] = of_date, of_edge
         seen += parts / 2
     whole = float(seen.sum())
     if whole > 0:
@@ -152,43 +152,42 @@ class _Shapes:
         self.single = _spread(good, _EDGES)
         self.pairs = _spread(_with_common_date(edges, good), _PAIRS)
 
-    def variances(self, axis: int) -> tuple[Array, Array, Array]:
-        """Return variances of a date ``(4,)`` and of an edge ``(4,)``, and their parts ``(2,)`` of a residual."""
-        same, seen, number = self._sums([(e, e, 1.0) for e in self.single], axis)
-        between, cross, many = self._sums(self.pairs, axis)
-        none = np.zeros_like(between)
-        design = np.vstack([np.hstack([2 * same, same]), np.hstack([between, none])])
+    def variances(self) -> list[tuple[Array, Array, Array]]:
+        """Return variances of a date and of an edge ``(4,)`` along both axes, and their parts ``(2,)`` of a residual."""
+        same, seen, number = self._sums([(e, e, 1.0) for e in self.single])
+        between, cross, many = self._sums(self.pairs)
+        design = np.vstack([np.hstack([2 * same, same]), np.hstack([between, np.zeros_like(between)])])
         weight = 1.0 / np.sqrt(np.maximum(np.concatenate([number, many]), 1.0))
         columns = design * weight[:, None]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-        found = optimize.nnls(columns / size, np.concatenate([seen, cross]) * weight)[0] / size
-        shared, own = np.split(found, 2)
         here = same[0] / max(float(number[0]), 1.0)
-        return shared, own, np.array([2 * here @ shared, here @ own])
+        result = []
+        for axis in (0, 1):
+            products = np.concatenate([seen[:, axis], cross[:, axis]]) * weight
+            shared, own = np.split(optimize.nnls(columns / size, products)[0] / size, 2)
+            result.append((shared, own, np.array([2 * here @ shared, here @ own])))
+        return result
 
-    def _sums(self, pairs: list[tuple[int, int, float]], axis: int) -> tuple[Array, Array, Array]:
-        """Return expected sums ``(classes, 4)`` per unit of variance, those seen ``(classes,)``, and numbers."""
+    def _sums(self, pairs: list[tuple[int, int, float]]) -> tuple[Array, Array, Array]:
+        """Return expected sums ``(classes, 4)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
         classes, terms = len(_CLASSES) + 1, 1 + len(_RANGES)
-        expected, seen, number = np.zeros((classes, terms)), np.zeros(classes), np.zeros(classes)
+        expected, seen, number = np.zeros((classes, terms)), np.zeros((classes, 2)), np.zeros(classes)
         design, relative = self.trends.design, np.sqrt(self.edges.relative)
         for one, other, sign in pairs:
             rows, columns = (np.flatnonzero(self.trends.used[edge]) for edge in (one, other))
             block = np.ix_(rows, columns)
             place = self.classes[block].ravel()
-            product = sign * np.outer(self.left[one, rows, axis], self.left[other, columns, axis])
-            seen += np.bincount(place, product.ravel(), classes)
             number += np.bincount(place, minlength=classes)
-            out = [
-                design[index] @ self.trends.weights[edge, index].T for edge, index in ((one, rows), (other, columns))
-            ]
-            for term in range(terms):
-                if term:
-                    kernel = self.correlations[term - 1][block]
-                else:
-                    kernel = (rows[:, None] == columns) * np.outer(relative[one, rows], relative[other, columns])
-                kernel = kernel - out[0] @ kernel
-                kernel = kernel - kernel @ out[1].T
-                expected[:, term] += np.bincount(place, kernel.ravel(), classes)
+            for axis in (0, 1):
+                product = sign * np.outer(self.left[one, rows, axis], self.left[other, columns, axis])
+                seen[:, axis] += np.bincount(place, product.ravel(), classes)
+            before = design[rows] @ self.trends.weights[one, rows].T
+            behind = design[columns] @ self.trends.weights[other, columns].T
+            noise = (rows[:, None] == columns) * np.outer(relative[one, rows], relative[other, columns])
+            for term, kernel in enumerate([noise, *self.correlations[:, block[0], block[1]]]):
+                left = kernel - before @ kernel
+                left = left - left @ behind.T
+                expected[:, term] += np.bincount(place, left.ravel(), classes)
         return expected, seen, number
 
 

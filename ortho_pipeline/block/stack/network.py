@@ -32,6 +32,9 @@ CHANCE = 1e-4
 _START, _ROUNDS = 30, 8
 #: Part of the errors of its dates that an edge has in its weight, so that no weight is infinite.
 _LEAST = 0.1
+_LIMIT = float(chi2.isf(CHANCE, 2))
+#: The constant error of edges is settled if it changes by less than this part of their variance.
+_SMALL = 0.01
 #: An edge with a smaller redundancy is in no loop.
 _IN_LOOP = 1e-6
 
@@ -85,28 +88,23 @@ def accepted_edges(
     """Return which edges close loops, and components with the error that only loops show."""
     incidence = edges.incidence(dates)
     value, usable = trends.value[:, 0], trends.good
-    accepted = usable.copy()
+    both = [components.covariance(axis, edges, _shifts(trends), place) for axis in (0, 1)]
     left = value - incidence @ _shortest(incidence, value, usable)
-    for turn in range(_ROUNDS):
-        both = [components.covariance(axis, edges, _shifts(trends), place) for axis in (0, 1)]
-        if turn == 0:
-            total = np.array([one.diagonal() for one, _ in both]).T
-            rest = np.median(left[usable] ** 2, axis=0) / chi2.median(1) if usable.any() else np.zeros(2)
-            components = replace(components, constant=_more(rest, np.median(total[usable], axis=0)))
-            ratio = (left**2 / np.maximum(total + components.constant, 1e-12)).sum(axis=1)
-            again = usable & (ratio < chi2.isf(CHANCE, 2))
-        else:
-            closures, constant = _closed(incidence, value, both, usable, accepted)
-            components = replace(components, constant=np.maximum(components.constant + constant, 0.0))
-            again = usable & ~(closures.ratio > chi2.isf(CHANCE, 2))
-            if (again == accepted).all() and turn > 2:
-                break
+    total = np.array([one.diagonal() for one, _ in both]).T
+    constant = np.zeros(2)
+    if usable.any():
+        constant = np.median(left[usable] ** 2, axis=0) / chi2.median(1) - np.median(total[usable], axis=0)
+    constant = np.maximum(constant, 0.0)
+    accepted = usable & ((left**2 / np.maximum(total + constant, 1e-12)).sum(axis=1) < _LIMIT)
+    for _ in range(_ROUNDS):
+        closures, more = _closed(edges, incidence, value, both, constant, accepted)
+        again = usable & ~(closures.ratio > _LIMIT)
+        stands = bool((again == accepted).all()) and bool((np.abs(more) < _SMALL * total.mean(axis=0)).all())
+        constant = np.maximum(constant + more, 0.0)
+        if stands:
+            break
         accepted = again
-    return closures, components
-
-
-def _more(seen: Array, expected: Array) -> Array:
-    return np.asarray(np.maximum(seen - expected, 0.0))
+    return replace(closures, accepted=accepted), replace(components, constant=constant)
 
 
 def _shifts(trends: Trends) -> Trends:
@@ -132,44 +130,50 @@ def _parts(incidence: sparse.csr_matrix, accepted: NDArray[np.bool_]) -> NDArray
 
 
 def _closed(
+    edges: Edges,
     incidence: sparse.csr_matrix,
     value: Array,
     both: list[tuple[sparse.csr_matrix, Array]],
-    usable: NDArray[np.bool_],
+    constant: Array,
     accepted: NDArray[np.bool_],
 ) -> tuple[Closures, Array]:
     """Return the closures of edges, and by how much the constant variance ``(2,)`` of edges is to change."""
-    index = np.flatnonzero(accepted)
-    count, part = incidence.shape[1], _parts(incidence, accepted)
-    connected = part[incidence.indices[::2]] == part[incidence.indices[1::2]]
+    index, part = np.flatnonzero(accepted), _parts(incidence, accepted)
+    connected = part[edges.first] == part[edges.second]
     member = (part[:, None] == np.arange(part.max() + 1)).astype(float)
-    error, ratio, constant = np.full(value.shape, np.nan), np.zeros(len(value)), np.zeros(2)
+    error, ratio, more = np.full(value.shape, np.nan), np.zeros(len(value)), np.zeros(2)
     for axis, (sigma, own) in enumerate(both):
-        weight = 1.0 / _weighed(sigma.diagonal(), own[:, 0, 0])
+        total = sigma.diagonal() + constant[axis]
+        weight = 1.0 / _weighed(total, own[:, 0, 0] + constant[axis])[index]
         some = incidence[index]
-        scaled = some.multiply(weight[index, None])
-        inverse = np.linalg.inv((some.T @ scaled).toarray() + member @ member.T)
-        gain = inverse @ scaled.T.toarray()  # (T, n)
-        found = gain @ value[index, axis]
-        left = value[:, axis] - incidence @ found
-        reduced = np.eye(len(index)) - some @ gain
-        inside = sigma[index][:, index]
-        spread = reduced @ inside
-        variance = sigma.diagonal() + ((incidence @ (gain @ inside @ gain.T)) * incidence.toarray()).sum(axis=1)
-        variance[index] = np.einsum("ij,ij->i", spread, reduced)
+        normal = (some.T @ some.multiply(weight[:, None])).toarray() + member @ member.T
+        gain = np.linalg.solve(normal, some.multiply(weight[:, None]).T.toarray())  # (T, n)
+        left = value[:, axis] - incidence @ (gain @ value[index, axis])
+        moved = (sigma[index][:, index] @ gain.T).T + constant[axis] * gain
+        variance = total + _between(edges, moved @ gain.T)
+        variance[index] -= 2.0 * _across(edges, moved, index)
+        leverage, squared = _across(edges, gain, index), _between(edges, gain @ gain.T)[index]
         redundancy = np.ones(len(value))
-        redundancy[index] = reduced.diagonal()
-        tested = connected & usable & (redundancy > _IN_LOOP)
-        safe = np.where(tested, redundancy, 1.0)
-        error[:, axis] = np.where(tested, left / safe, np.nan)
+        redundancy[index] = 1.0 - leverage
+        tested = connected & (redundancy > _IN_LOOP)
+        error[:, axis] = np.where(tested, left / np.where(tested, redundancy, 1.0), np.nan)
         ratio += np.where(tested, left**2 / np.maximum(variance, 1e-12), np.nan)
         # Of the weighted sum of squares of what is left, E = tr(R' W R Sigma): what is more is a constant of each edge.
-        squares = weight[index] @ (left[index] ** 2)
-        expected = weight[index] @ variance[index]
-        slope = (weight[index, None] * reduced**2).sum()
-        constant[axis] = (squares - expected) / max(slope, 1e-12)
-    assert count
-    return Closures(error, ratio, accepted), constant
+        excess = weight @ (left[index] ** 2 - variance[index])
+        more[axis] = excess / max(float(weight @ (1.0 - 2.0 * leverage + squared)), 1e-12)
+    return Closures(error, ratio, accepted), more
+
+
+def _between(edges: Edges, covariance: Array) -> Array:
+    """Return the variance ``(E,)`` of the difference of the dates of each edge."""
+    own = covariance.diagonal()
+    return np.asarray(own[edges.first] + own[edges.second] - 2.0 * covariance[edges.first, edges.second])
+
+
+def _across(edges: Edges, matrix: Array, index: NDArray[np.int_]) -> Array:
+    """Return, of some edges, the difference of their dates in their own columns of a matrix ``(T, n)``."""
+    columns = np.arange(len(index))
+    return np.asarray(matrix[edges.first[index], columns] - matrix[edges.second[index], columns])
 
 
 def _weighed(total: Array, own: Array) -> Array:

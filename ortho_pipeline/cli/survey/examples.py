@@ -105,6 +105,12 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
             "ortho align out/scene_ortho.tif --reference reference.tif -o aligned",
         ),
     ),
+    "stack": (
+        (
+            "Make the orthos of a folder agree, with dates from their names:",
+            "ortho stack series --date-pattern %Y%m%d -o stacked",
+        ),
+    ),
     "dem-check": (("Compare a DEM with surveyed heights:", "ortho dem-check dem.tif --points gcps.csv"),),
     "sensors": (("List the supported products:", "ortho sensors"),),
     "models": (("List the models, with the number of points that each needs:", "ortho models"),),

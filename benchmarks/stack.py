@@ -1,0 +1,181 @@
+"""Stacks of known truth: what `ortho stack` finds, compared with aligning each date with one master.
+
+    python benchmarks/stack.py network --seeds 0:20 --dates 40
+    python benchmarks/stack.py network --seeds 0:1 --dates 300
+    python benchmarks/stack.py images --dates 20 --side 500 --out images.jsonl
+
+`network` draws edges (tests/stack/networks.py) and runs the network alone. `images` draws rasters
+(tests/stack/scenes.py), matches them and measures misfit, moving ground and time. Misfit is the length of the error
+between any two dates, in px.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path += [str(ROOT / "tests" / "matching"), str(ROOT / "tests" / "stack")]
+
+from networks import Truth  # noqa: E402
+from scenes import Rasters  # noqa: E402
+
+from ortho_pipeline.batch.stack.command import stack  # noqa: E402
+from ortho_pipeline.block.stack.adjustment import adjust  # noqa: E402
+from ortho_pipeline.commands.orthos.aligning import align  # noqa: E402
+from ortho_pipeline.errors import OrthoError  # noqa: E402
+from ortho_pipeline.options import MatchOptions, OutputOptions  # noqa: E402
+
+#: What `network` draws besides errors of up to 20 px.
+KINDS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "moving": {"moving": 0.1},
+    "hard": {"moving": 0.4, "wrong": 0.05, "hidden": 0.3},
+    "rough": {"length": 0.05, "of_date": 0.1, "of_edge": 0.1},
+    "long": {"length": 0.3, "of_date": 0.1, "of_edge": 0.1},
+    "sloped": {"sloped": 5},
+    "step": {"scatter": 0.5, "step": 2.0},
+}
+
+
+def misfit(errors: np.ndarray) -> np.ndarray:
+    """Return the lengths of the errors between any two dates; errors ``(T, 2)``."""
+    one, other = np.triu_indices(len(errors), 1)
+    return np.asarray(np.hypot(*(errors[one] - errors[other]).T))
+
+
+def network(seed: int, dates: int, kind: str) -> dict[str, Any]:
+    """Return what the network finds of one draw."""
+    made = Truth(seed=seed, dates=dates, **KINDS[kind]).made()
+    begin = time.process_time()
+    found = adjust(made.truth.cells, made.edges, made.years.tolist())
+    seconds = time.process_time() - begin
+    errors = found.network.value[:, 0] - (made.shift - made.shift.mean(axis=0))
+    apart, moving = misfit(errors), found.motion.moving
+    drift = np.polyfit(made.years, errors, 1)[0] * np.ptp(made.years) if dates > 2 else np.zeros(2)
+    return {
+        "seed": seed, "kind": kind, "edges": len(made.edges), "seconds": seconds,
+        "squares": float(((errors / found.sigma) ** 2).mean()),
+        "median": float(np.median(apart)), "p95": float(np.quantile(apart, 0.95)),
+        "drift": float(np.abs(drift).max()),
+        "wrong": int(made.wrong.sum()), "wrong_found": int((made.wrong & ~found.closures.accepted).sum()),
+        "right_lost": int((~made.wrong & ~found.closures.accepted).sum()),
+        "moving": int(made.moving.sum()), "moving_found": int((made.moving & moving).sum()),
+        "still_moving": int((~made.moving & moving).sum()),
+        "steps": len(found.steps), "step_found": any(abs(one.date - dates // 2) <= 1 for one in found.steps),
+    }  # fmt: skip
+
+
+def told(rows: list[dict[str, Any]]) -> str:
+    """Return what rows of one kind say together."""
+
+    def sums(name: str) -> int:
+        return sum(row[name] for row in rows)
+
+    def mean(name: str) -> float:
+        return float(np.mean([row[name] for row in rows]))
+
+    return (
+        f"{rows[0]['kind']}: {len(rows)} stacks of {rows[0]['edges']} edges; spread {np.sqrt(mean('squares')):.2f}; "
+        f"misfit median {mean('median'):.3f}, 95 % {mean('p95'):.3f} px; drift by moving ground {mean('drift'):.3f} px; "
+        f"wrong edges {sums('wrong_found')} of {sums('wrong')} found, {sums('right_lost')} right ones lost; "
+        f"moving cells {sums('moving_found')} of {sums('moving')} found, {sums('still_moving')} false; "
+        f"stacks with steps {sum(row['steps'] > 0 for row in rows)}, right ones {sums('step_found')}; "
+        f"CPU {np.median([row['seconds'] for row in rows]):.1f} s"
+    )
+
+
+def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
+    """Return what `ortho stack` finds of one drawn stack, next to the usual way."""
+    rasters = Rasters(
+        seed=seed, side=given.side, dates=given.dates, interval=given.interval, error=20.0, seasons=4, clouds=0.3,
+        noise=0.02, moving=given.moving, rate=1.0, ground=("country", "woods", "town")[seed % 3],
+        wrong=(given.dates // 3,) if given.wrong else (),
+    )  # fmt: skip
+    true = rasters.shifts()
+    kept = np.array([number not in rasters.wrong for number in range(given.dates)])
+    output = OutputOptions(resampling="cubic", threads=1, format="GTiff")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        paths = rasters.write(folder / "in")
+        begin = time.process_time()
+        document = stack([folder / "in"], folder / "out", match=MatchOptions(search=60.0), output=output).document
+        seconds = time.process_time() - begin
+        found = np.array([one["shift_px"] or (np.nan, np.nan) for one in document["dates"]])
+        sigma = np.array([one["sigma_px"] or (np.nan, np.nan) for one in document["dates"]])
+        usual = _usual(paths, folder, output)
+    known = kept & np.isfinite(found).all(axis=1)
+    errors = (found - true)[known]
+    errors = errors - errors.mean(axis=0)
+    usual = (usual - (true - true[given.dates // 2]))[kept]
+    cells = np.array([one["place"] for one in document["cells"]])
+    moving, tested = (np.array([one[name] for one in document["cells"]]) for name in ("moving", "tested"))
+    truth = rasters.moves(cells) & tested
+    status = [one["status"] for one in document["pairs"]]
+    return {
+        "seed": seed, "dates": given.dates, "side": given.side, "pairs": len(status),
+        **{one.replace(" ", "_"): status.count(one) for one in ("accepted", "rejected", "not matched", "untested")},
+        "known": int(known.sum()), "of": int(kept.sum()),
+        "spread": float(np.sqrt(((errors / sigma[known]) ** 2).mean())),
+        "median": float(np.median(misfit(errors))), "p95": float(np.quantile(misfit(errors), 0.95)),
+        "usual_known": int(np.isfinite(usual).all(axis=1).sum()),
+        "usual_median": float(np.median(misfit(usual[np.isfinite(usual).all(axis=1)]))),
+        "usual_p95": float(np.quantile(misfit(usual[np.isfinite(usual).all(axis=1)]), 0.95)),
+        "moving": int(truth.sum()), "moving_found": int((truth & moving).sum()),
+        "still_moving": int((~truth & moving).sum()), "steps": len(document["steps"]), "seconds": seconds,
+    }  # fmt: skip
+
+
+def _usual(paths: list[Path], folder: Path, output: OutputOptions) -> np.ndarray:
+    """Return shifts of all dates relative to the middle one, each matched with it alone; NaN where that fails."""
+    found = np.full((len(paths), 2), np.nan)
+    master = len(paths) // 2
+    found[master] = 0.0
+    for number, path in enumerate(paths):
+        if number == master:
+            continue
+        match = MatchOptions(reference=(str(paths[master]),), search=60.0)
+        try:
+            done = align(path, folder / "usual", match=match, output=output, correction="shift", resample=False)
+        except OrthoError:
+            continue
+        found[number] = done.document["correction"]["shift_px"]
+    return found
+
+
+def main() -> None:
+    """Run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["network", "images"])
+    parser.add_argument("--seeds", default="0:1", help="first:last, the last not included")
+    parser.add_argument("--dates", type=int, default=20)
+    parser.add_argument("--kinds", default=",".join(KINDS), help="of network, with commas")
+    parser.add_argument("--side", type=int, default=500, help="columns and rows of images")
+    parser.add_argument("--interval", type=float, default=50.0, help="mean days between images")
+    parser.add_argument("--moving", type=float, default=0.2, help="share of the images that moves")
+    parser.add_argument("--wrong", action="store_true", help="one date shows another place")
+    parser.add_argument("--out", type=Path, help="a line of JSON for each stack")
+    given = parser.parse_args()
+    seeds = range(*map(int, given.seeds.split(":")))
+    for kind in given.kinds.split(",") if given.what == "network" else [""]:
+        rows = []
+        for seed in seeds:
+            rows.append(network(seed, given.dates, kind) if kind else images(given, seed))
+            if given.out:
+                with given.out.open("a") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+            if not kind:
+                print(json.dumps(rows[-1], indent=1), flush=True)
+        if kind:
+            print(told(rows), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""`ortho stack` on rasters of known truth: corrections, outputs, resuming, and identical results."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from osgeo import gdal
+from scenes import Rasters
+
+from ortho_pipeline.batch.stack import matching
+from ortho_pipeline.batch.stack.command import stack
+from ortho_pipeline.commands.orthos.measuring import measure_ortho
+from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.options import MatchOptions, OutputOptions
+from ortho_pipeline.report.stack.records import StackRecord
+
+gdal.UseExceptions()
+RASTERS = Rasters(side=240, dates=4, error=4.0)
+#: Few matches, so that tests are fast.
+MATCH = MatchOptions(points=120)
+
+
+def run(given: Any, folder: Path, **more: Any) -> Any:
+    settings = {"match": MATCH, "output": OutputOptions(resampling="cubic", threads=1, format="GTiff"), **more}
+    return stack(given, folder, **settings)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[list[Path], Path]:
+    folder = tmp_path_factory.mktemp("stack")
+    paths = RASTERS.write(folder / "in")
+    run([folder / "in"], folder / "out")
+    return paths, folder / "out"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and "record" not in path.name and path.name != ".lock"
+    }
+
+
+@pytest.fixture
+def counted(monkeypatch) -> list[tuple[str, str]]:
+    """Pairs that are matched."""
+    found: list[tuple[str, str]] = []
+
+    def matched(image: Any, match: MatchOptions, **more: Any) -> Any:
+        found.append((Path(image.path).name, Path(match.reference[0]).name))
+        return measure_ortho(image, match, **more)
+
+    monkeypatch.setattr(matching, "measure_ortho", matched)
+    return found
+
+
+def test_corrections_are_the_errors(made):
+    document = json.loads((made[1] / "stack.json").read_text())
+    record = StackRecord.read(document)
+    assert record.to_json() == document
+    true = RASTERS.shifts() - RASTERS.shifts().mean(axis=0)
+    np.testing.assert_allclose([one.shift_px for one in record.dates], true, atol=0.03)
+    assert all(max(one.sigma_px) < 0.05 for one in record.dates)
+    assert [one.status for one in record.pairs] == ["accepted"] * 6
+    assert record.closure_after.loops == 4
+    page = (made[1] / "stack.html").read_text()
+    assert "4 dates agree with the mean of all dates within" in page
+    assert 'data-plot="timeline"' in page
+
+
+def test_aligned_orthos_agree_in_their_pixels(made):
+    images = [gdal.Open(str(path)) for path in sorted((made[1] / "aligned").glob("*.tif"))]
+    assert len({image.GetGeoTransform() for image in images}) == 1
+    inner = [image.ReadAsArray()[12:-12, 12:-12].astype(float) for image in images]
+    for other in inner[1:]:
+        assert np.corrcoef(inner[0].ravel(), other.ravel())[0, 1] > 0.97
+
+
+def test_a_second_run_matches_nothing_and_writes_the_same(made, counted):
+    before = contents(made[1])
+    run([made[0][0].parent], made[1])
+    assert counted == []
+    assert contents(made[1]) == before
+
+
+def test_neither_order_nor_threads_change_a_byte(made, tmp_path):
+    output = OutputOptions(resampling="cubic", threads=2, format="GTiff")
+    run(made[0][::-1], tmp_path / "out", output=output)
+    assert contents(tmp_path / "out") == contents(made[1])
+
+
+def test_a_date_that_is_added_is_matched_alone(made, tmp_path, counted):
+    run(made[0][:3], tmp_path / "out")
+    first = len(counted)
+    run(made[0], tmp_path / "out")
+    assert first == 3
+    assert all(made[0][3].name in pair for pair in counted[first:])
+    assert len(counted) == 6
+    assert contents(tmp_path / "out") == contents(made[1])
+
+
+def test_a_changed_ortho_is_matched_again(made, tmp_path, counted):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for path in made[0][:3]:
+        (folder / path.name).write_bytes(path.read_bytes())
+    run([folder], tmp_path / "out")
+    with gdal.OpenEx(str(folder / made[0][1].name), gdal.OF_UPDATE | gdal.OF_RASTER) as image:
+        image.GetRasterBand(1).WriteArray(image.ReadAsArray() + 1)
+    counted.clear()
+    run([folder], tmp_path / "out")
+    assert len(counted) == 2
+    assert all(made[0][1].name in pair for pair in counted)
+
+
+def test_a_killed_run_resumes_to_the_same_result(made, tmp_path):
+    words = ["stack", str(made[0][0].parent), "-o", str(tmp_path / "out"), "--match-points", "120", "--threads", "1"]
+    killed = subprocess.Popen([sys.executable, "-m", "ortho_pipeline", *words], stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 120
+    while time.monotonic() < end and killed.poll() is None:
+        if len(list((tmp_path / "out").glob("pairs/*.record.json"))) >= 2:
+            break
+        time.sleep(0.01)
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(killed.pid, signal.SIGKILL)
+    killed.wait()
+    assert not (tmp_path / "out" / "stack.json").exists()
+    run([made[0][0].parent], tmp_path / "out")
+    assert contents(tmp_path / "out") == contents(made[1])
+
+
+def test_corrections_only_keep_the_pixels(made, tmp_path):
+    result = run(made[0][:2], tmp_path / "out", corrections_only=True, datum="scene_" + f"{RASTERS.days()[0]:%Y%m%d}")
+    source = gdal.Open(str(made[0][1]))
+    moved = gdal.Open(str(tmp_path / "out" / result.document["dates"][1]["output"]))
+    np.testing.assert_array_equal(moved.ReadAsArray(), source.ReadAsArray())
+    apart = np.subtract(source.GetGeoTransform(), moved.GetGeoTransform())[[0, 3]]
+    true = (RASTERS.shifts()[1] - RASTERS.shifts()[0]) * (1, -1)
+    np.testing.assert_allclose(apart, true, atol=0.03)
+
+
+def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
+    with pytest.raises(InputError, match="no ortho is of 1999-01-01"):
+        run(made[0], tmp_path / "out", datum="1999-01-01")
+    with pytest.raises(InputError, match="no reference"):
+        run(made[0], tmp_path / "out", datum="reference")
+    other = tmp_path / "other_20210101.tif"
+    gdal.Warp(str(other), str(made[0][0]), dstSRS="EPSG:32734")
+    with pytest.raises(CrsError, match="another CRS"):
+        run([made[0][0], other], tmp_path / "out")
+    assert not (tmp_path / "out" / "stack.json").exists()

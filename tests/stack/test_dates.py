@@ -1,0 +1,79 @@
+"""Dates of a stack: lists, file names, documents next to an ortho, metadata."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from osgeo import gdal, osr
+
+from ortho_pipeline.batch.stack.dates import by_pattern, dated_orthos, read_list, time_of
+from ortho_pipeline.errors import InputError
+
+gdal.UseExceptions()
+
+
+def ortho(path: Path, **metadata: str) -> Path:
+    made = gdal.GetDriverByName("GTiff").Create(str(path), 8, 8, 1)
+    reference = osr.SpatialReference()
+    reference.ImportFromEPSG(32735)
+    made.SetProjection(reference.ExportToWkt())
+    made.SetGeoTransform((500_000.0, 1.0, 0.0, 7_000_000.0, 0.0, -1.0))
+    made.GetRasterBand(1).WriteArray(np.ones((8, 8), dtype=np.uint8))
+    made.SetMetadata(metadata)
+    return path
+
+
+def test_dates_come_from_metadata_and_documents_in_order_of_time(tmp_path):
+    ortho(tmp_path / "late.tif", TIFFTAG_DATETIME="2022:05:03 10:12:00")
+    ortho(tmp_path / "early_ortho.tif")
+    (tmp_path / "early_stac.json").write_text(json.dumps({"properties": {"datetime": "2020-01-02T00:00:00Z"}}))
+    ortho(tmp_path / "middle.tif")
+    (tmp_path / "middle_report.json").write_text(json.dumps({"scene": {"facts": {"acquired": "2021-01-01"}}}))
+    found = dated_orthos([tmp_path])
+    assert [one.name for one in found] == ["early_ortho", "middle", "late"]
+    assert [one.source for one in found] == ["early_stac.json", "middle_report.json", "TIFFTAG_DATETIME"]
+    assert found[2].time.isoformat() == "2022-05-03T10:12:00+00:00"
+
+
+def test_a_list_and_a_pattern_count_more_than_metadata(tmp_path):
+    for day in ("20200105", "20200301"):
+        ortho(tmp_path / f"a_{day}.tif", TIFFTAG_DATETIME="1999:01:01 00:00:00")
+    found = dated_orthos([tmp_path / "a_*.tif"], "_%Y%m%d")
+    assert [one.time.date().isoformat() for one in found] == ["2020-01-05", "2020-03-01"]
+    (tmp_path / "list.csv").write_text("file,date\na_20200105.tif,2001-02-03\na_20200301.tif,2000-01-01\n")
+    found = dated_orthos([tmp_path / "list.csv"])
+    assert [one.name for one in found] == ["a_20200301", "a_20200105"]
+    assert {one.source for one in found} == {"list"}
+
+
+def test_an_ortho_without_a_date_is_an_error(tmp_path):
+    ortho(tmp_path / "a.tif")
+    ortho(tmp_path / "b.tif", TIFFTAG_DATETIME="2022:05:03 10:12:00")
+    with pytest.raises(InputError, match="has no date") as error:
+        dated_orthos([tmp_path])
+    assert "--date-pattern" in str(error.value.remedy)
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "day"),
+    [("x_2020-061.tif", "%Y-%j", "2020-03-01"), ("S2A_20240503T101201_B04.jp2", "_%Y%m%dT%H%M%S", "2024-05-03")],
+)
+def test_patterns(name, pattern, day):
+    assert by_pattern(name, pattern).date().isoformat() == day
+
+
+@pytest.mark.parametrize(("name", "pattern"), [("a.tif", "%Y"), ("a_2020.tif", "%q"), ("a_20201399.tif", "%Y%m%d")])
+def test_patterns_that_do_not_fit_are_refused(name, pattern):
+    with pytest.raises(InputError):
+        by_pattern(name, pattern)
+
+
+def test_what_is_no_date_or_list_is_refused(tmp_path):
+    with pytest.raises(InputError, match="not a date"):
+        time_of("yesterday")
+    (tmp_path / "list.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="no column of files"):
+        read_list(tmp_path / "list.csv")

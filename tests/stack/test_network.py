@@ -1,0 +1,131 @@
+"""The network of a stack, on edges of known truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from networks import Made, Truth
+
+from ortho_pipeline.block.stack.adjustment import Adjusted, adjust
+from ortho_pipeline.block.stack.edges import Cells
+from ortho_pipeline.block.stack.graph import pairs_of
+from ortho_pipeline.block.stack.steps import steps_of
+
+
+def solved(**given: Any) -> tuple[Made, Adjusted]:
+    made = Truth(**given).made()
+    return made, adjust(made.truth.cells, made.edges, made.years.tolist())
+
+
+def errors(made: Made, stack: Adjusted) -> np.ndarray:
+    return stack.network.value[:, 0] - (made.shift - made.shift.mean(axis=0))
+
+
+def spread(stacks: list[tuple[Made, Adjusted]]) -> float:
+    ratio = np.concatenate([errors(made, stack) / stack.sigma for made, stack in stacks])
+    return float(np.sqrt((ratio**2).mean()))
+
+
+def test_sigmas_hold_and_dates_agree():
+    stacks = [solved(seed=seed, dates=16) for seed in range(20, 28)]
+    assert 0.85 < spread(stacks) < 1.15
+    misfit = np.concatenate(
+        [np.hypot(*(e - e[:, None])[np.triu_indices(16, 1)].T) for e in (errors(*s) for s in stacks)]
+    )
+    assert np.median(misfit) < 0.1
+    assert np.quantile(misfit, 0.95) < 0.25
+
+
+def test_wrong_edges_are_rejected_and_right_ones_kept():
+    made, stack = solved(seed=1, dates=20, wrong=0.1)
+    assert made.wrong.sum() > 3
+    np.testing.assert_array_equal(stack.closures.accepted, ~made.wrong)
+    assert np.abs(errors(made, stack)).max() < 0.15
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_moving_ground_is_found_and_moves_no_date(share):
+    made, stack = solved(seed=2, dates=24, interval=30.0, moving=share, wrong=0.05)
+    found = stack.motion.moving
+    assert (found & made.moving).sum() >= 0.9 * found.sum()
+    assert (found & made.moving).sum() >= 0.9 * made.moving.sum()
+    error = errors(made, stack)
+    # A rate that got into the corrections would grow with time.
+    drift = np.polyfit(made.years, error, 1)[0] * np.ptp(made.years)
+    assert np.abs(drift).max() < 0.1
+    left = stack.motion.rate[made.moving & found] - made.rate[made.moving & found]
+    assert np.abs(left).max() < 0.25
+
+
+def test_still_ground_is_not_moving():
+    assert sum(solved(seed=seed, dates=16)[1].motion.moving.sum() for seed in (30, 31, 32)) <= 2
+
+
+def test_only_dates_with_significant_slopes_get_them():
+    made, stack = solved(seed=4, dates=16, sloped=3)
+    np.testing.assert_array_equal(stack.sloped, np.abs(made.slopes).max(axis=(1, 2)) > 0)
+    np.testing.assert_allclose(stack.network.value[:, 1:], made.slopes, atol=0.12)
+
+
+def test_a_date_as_datum_keeps_its_place():
+    made = Truth(seed=5, dates=10).made()
+    stack = adjust(made.truth.cells, made.edges, made.years.tolist(), datum=3)
+    np.testing.assert_allclose(stack.network.value[3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(stack.sigma[3], 0.0, atol=1e-9)
+    np.testing.assert_allclose(stack.network.value[:, 0], made.shift - made.shift[3], atol=0.2)
+    np.testing.assert_allclose(stack.sigma_between(1, 3), stack.sigma[1], rtol=1e-6)
+
+
+def test_a_date_without_pairs_is_not_determined():
+    made = Truth(seed=6, dates=10).made()
+    kept = (made.edges.first != 7) & (made.edges.second != 7)
+    stack = adjust(made.truth.cells, made.edges.select(kept), made.years.tolist())
+    np.testing.assert_array_equal(stack.determined, np.arange(10) != 7)
+    assert np.isnan(stack.sigma[7]).all()
+    np.testing.assert_array_equal(stack.network.value[7], 0.0)
+
+
+def test_the_unit_of_pixels_does_not_matter():
+    made = Truth(seed=7, dates=8, moving=0.2).made()
+    edges = made.edges
+    scaled = dataclasses.replace(edges, value=2 * edges.value, variance=4 * edges.variance)
+    cells = Cells.over(np.zeros(2), np.full(2, 2000.0))
+    one, other = (
+        adjust(where, which, made.years.tolist()) for where, which in ((made.truth.cells, edges), (cells, scaled))
+    )
+    np.testing.assert_allclose(other.network.value, 2 * one.network.value, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(other.sigma, 2 * one.sigma, rtol=1e-5)
+
+
+def test_a_step_is_found_and_scatter_is_none():
+    random, found, false = np.random.default_rng(0), 0, 0
+    for _ in range(40):
+        scatter = random.normal(0.0, 0.5, (40, 2))
+        false += bool(steps_of(scatter, np.zeros((2, 40, 40))))
+        scatter[20:, 0] += 2.0
+        steps = steps_of(scatter, np.zeros((2, 40, 40)))
+        found += len(steps) == 1 and abs(steps[0].date - 20) <= 1 and abs(steps[0].size[0] - 2.0) < 0.8
+    assert found >= 38
+    assert false <= 1
+
+
+def test_a_date_that_is_added_makes_pairs_only_with_itself():
+    days = np.sort(np.random.default_rng(0).uniform(0, 2000, 60))
+    before = {(days[one], days[other]) for one, other in pairs_of(days.tolist())}
+    for new in (-5.0, 777.7, 2005.0):
+        longer = np.sort([*days, new])
+        after = {(longer[one], longer[other]) for one, other in pairs_of(longer.tolist())}
+        assert all(new in pair for pair in after - before)
+        assert any(new in pair for pair in after)
+
+
+def test_pairs_connect_all_dates_and_seasons():
+    days = np.arange(0.0, 1500.0, 16.0)
+    pairs = pairs_of(days.tolist())
+    assert {one for one, _ in pairs} == set(range(1, len(days)))
+    apart = np.array([days[one] - days[other] for one, other in pairs])
+    assert (np.abs(apart - 365.25) < 20).sum() > 50
+    assert len(pairs) < 7 * len(days)
