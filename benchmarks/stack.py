@@ -5,7 +5,7 @@
     python benchmarks/stack.py images --dates 20 --side 500 --out images.jsonl
 
 `network` draws edges (tests/stack/networks.py) and runs the network alone. `images` draws rasters
-(tests/stack/scenes.py), matches them and measures misfit, moving ground and time. Misfit is the length of the error
+(tests/stack/rasters.py), matches them and measures misfit, moving ground and time. Misfit is the length of the error
 between any two dates, in px.
 """
 
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path += [str(ROOT / "tests" / "matching"), str(ROOT / "tests" / "stack")]
 
 from networks import Truth  # noqa: E402
-from scenes import Rasters  # noqa: E402
+from rasters import Rasters  # noqa: E402
 
 from ortho_pipeline.batch.stack.command import stack  # noqa: E402
 from ortho_pipeline.block.stack.adjustment import adjust  # noqa: E402
@@ -84,7 +84,7 @@ def told(rows: list[dict[str, Any]]) -> str:
 
     return (
         f"{rows[0]['kind']}: {len(rows)} stacks of {rows[0]['edges']} edges; spread {np.sqrt(mean('squares')):.2f}; "
-        f"misfit median {mean('median'):.3f}, 95 % {mean('p95'):.3f} px; drift by moving ground {mean('drift'):.3f} px; "
+        f"misfit median {mean('median'):.3f}, 95 % {mean('p95'):.3f} px; drift {mean('drift'):.3f} px; "
         f"wrong edges {sums('wrong_found')} of {sums('wrong')} found, {sums('right_lost')} right ones lost; "
         f"moving cells {sums('moving_found')} of {sums('moving')} found, {sums('still_moving')} false; "
         f"stacks with steps {sum(row['steps'] > 0 for row in rows)}, right ones {sums('step_found')}; "

@@ -34,6 +34,8 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch.records import FileState, RunRecord
+from ortho_pipeline.batch.stack.dates import read_list
+from ortho_pipeline.batch.stack.matching import read_matches
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CrsError
@@ -506,6 +508,9 @@ READERS = (
     Reader("model-frame", "json", "m_model.json", _frame_model, _model),
     Reader("report", "json", "one_report.json", _report_seed, _report),
     Reader("pipeline-file", "json", "pipeline.yaml", _yaml_seed, _yaml),
+    Reader("stack-list", "text", "list.csv", _text("file,date\na.tif,2020-01-05\nb.tif,2020-03-01\n"), read_list),
+    Reader("stack-pair", "json", "a__b.json", _text(seeds.STACK_PAIR), lambda path: read_matches(path).arrays,
+           of_files=False),
     Reader("run-record", "json", "one.json", _record_seed, _record, of_files=False),
     Reader("result", "json", "one.json", _record_seed, state.read_result, of_files=False),
     Reader("lease", "json", "one.json", state.lease, state.read_lease, of_files=False),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from osgeo import gdal
-from scenes import Rasters
+from rasters import Rasters
 
 from ortho_pipeline.batch.stack import matching
 from ortho_pipeline.batch.stack.command import stack

@@ -15,7 +15,7 @@ from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked
 from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, time_of
 from ortho_pipeline.batch.stack.document import record_of
 from ortho_pipeline.batch.stack.matching import Matcher, Pair
-from ortho_pipeline.batch.stack.placing import Placed, geotransform_of
+from ortho_pipeline.batch.stack.placing import Placed, geotransform_of, pixel_of
 from ortho_pipeline.block.stack.adjustment import Adjusted, adjust
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.graph import NEIGHBOURS, pairs_of
@@ -146,7 +146,7 @@ def _adjusted(
     for pair in matched:
         assert pair.matches is not None
         place, shown, sigma = pair.matches.arrays
-        own = np.sqrt(abs(np.linalg.det(_matrix(nodes[pair.first])))) / step
+        own = pixel_of(nodes[pair.first]) / step
         at = placed.at(place)
         mean, spread = cells.sampled(at, placed.at(shown) - at, sigma * own)
         value.append(mean)
@@ -159,11 +159,6 @@ def _adjusted(
     years = [one.days / _DAYS_A_YEAR for one in nodes]
     years = [year if number < len(dates) else np.nan for number, year in enumerate(years)]
     return adjust(cells, edges, years, datum, affine=affine)
-
-
-def _matrix(one: Dated) -> np.ndarray:
-    _, a, b, _, c, d = getattr(one.scene.model, "geotransform")  # noqa: B009
-    return np.array([[a, b], [c, d]])
 
 
 class _Writer:

@@ -111,14 +111,20 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[Path, str | None]]:
         If it has no column of files, or a row has no file.
     """
     text = decoded(read_bounded(path, _BYTES, remedy="give a list of files"))
-    rows = [row for row in csv.reader(io.StringIO(text)) if any(cell.strip() for cell in row)]
+    lines = csv.reader(io.StringIO(text))
+    try:
+        rows = [row for row in lines if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"this is not CSV ({error})", file=path, field=f"line {lines.line_num}") from error
     if not rows:
-        raise InputError("this list is empty", file=path)
+        raise InputError("this list is empty", file=path, field="line 1")
     header = [cell.strip().lower() for cell in rows[0]]
     file = next((header.index(name) for name in _FILE if name in header), None)
     date = next((header.index(name) for name in _DATE if name in header), None)
     if file is None:
-        raise InputError("this list has no column of files", file=path, remedy="name the columns file and date")
+        raise InputError(
+            "this list has no column of files", file=path, field="line 1", remedy="name the columns file and date"
+        )
     found: list[tuple[Path, str | None]] = []
     for number, row in enumerate(rows[1:], start=2):
         if len(row) <= file or not row[file].strip() or "\0" in row[file]:

@@ -150,9 +150,13 @@ def read_matches(path: Path) -> EdgeMatches:
     InputError
         If it cannot be read.
     """
+    remedy = "delete this file and run again"
     try:
-        return EdgeMatches.read(read_json(path, _BYTES, "delete this file and run again"))
+        found = EdgeMatches.read(read_json(path, _BYTES, remedy))
     except ValueError as error:
         raise InputError(
-            f"these are not the matches of a pair ({error})", file=path, remedy="delete this file and run again"
+            f"these are not the matches of a pair ({error})", file=path, field="pair", remedy=remedy
         ) from error
+    if not len(found.place) == len(found.shown) == len(found.sigma_px):
+        raise InputError("the matches of this pair have unequal lengths", file=path, field="pair", remedy=remedy)
+    return found

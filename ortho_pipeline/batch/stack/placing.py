@@ -100,6 +100,11 @@ def geotransform_of(model: ImageCorrection) -> tuple[float, ...]:
     return (origin[0], across[0], down[0], origin[1], across[1], down[1])
 
 
+def pixel_of(one: Dated) -> float:
+    """Return the size of a pixel of an ortho, in units of its map."""
+    return float(np.sqrt(np.prod(_pixel(map_grid_of(one)))))
+
+
 def _pixel(model: MapGrid) -> tuple[float, float]:
     _, a, b, _, c, d = model.geotransform
     return float(np.hypot(a, c)), float(np.hypot(b, d))

@@ -77,6 +77,8 @@ class Components:
         for date, scale in enumerate(self.scale):
             part = slice(incidence.indptr[date], incidence.indptr[date + 1])
             rows, signs = incidence.indices[part], incidence.data[part]
+            if not len(rows):
+                continue
             flat = (signs[:, None, None] * trends.weights[rows]).transpose(0, 2, 1).reshape(len(rows) * terms, -1)
             noise = (signs[:, None, None] * noisy[rows]).transpose(0, 2, 1).reshape(len(rows) * terms, -1)
             block = scale * (flat @ smooth @ flat.T + self.shared[axis, 0] * noise @ noise.T)
@@ -149,12 +151,12 @@ class _Shapes:
         distance = spatial.distance.cdist(place, place)
         self.classes = np.searchsorted(_CLASSES, distance)
         good = np.flatnonzero(trends.good)
-        self.single = _spread(good, _EDGES)
+        self.single = _spread([(edge, edge, 1.0) for edge in good.tolist()], _EDGES)
         self.pairs = _spread(_with_common_date(edges, good), _PAIRS)
 
     def variances(self) -> list[tuple[Array, Array, Array]]:
-        """Return variances of a date and of an edge ``(4,)`` along both axes, and their parts ``(2,)`` of a residual."""
-        same, seen, number = self._sums([(e, e, 1.0) for e in self.single])
+        """Return variances of a date and of an edge ``(4,)``, and their parts ``(2,)`` of a residual, of both axes."""
+        same, seen, number = self._sums(self.single)
         between, cross, many = self._sums(self.pairs)
         design = np.vstack([np.hstack([2 * same, same]), np.hstack([between, np.zeros_like(between)])])
         weight = 1.0 / np.sqrt(np.maximum(np.concatenate([number, many]), 1.0))
@@ -205,9 +207,8 @@ def _with_common_date(edges: Edges, good: Array) -> list[tuple[int, int, float]]
     ]
 
 
-def _spread(items: list[tuple[int, int, float]] | Array, most: int) -> list:  # type: ignore[type-arg]
+def _spread(items: list[tuple[int, int, float]], most: int) -> list[tuple[int, int, float]]:
     """Return at most so many items, spread evenly."""
-    listed = list(items)
-    if len(listed) <= most:
-        return listed
-    return [listed[place] for place in np.linspace(0, len(listed) - 1, most).round().astype(int)]
+    if len(items) <= most:
+        return items
+    return [items[place] for place in np.linspace(0, len(items) - 1, most).round().astype(int)]
