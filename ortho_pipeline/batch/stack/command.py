@@ -107,7 +107,7 @@ def _with_datum(
 ) -> tuple[list[Dated], int | None]:
     """Return the dates, with the reference after them if it is the datum, and the number of the datum."""
     if (datum == "reference") != bool(match.reference):
-        setting = Text("give both: ", Setting("match.reference", "FILE"), " and `--datum reference`")
+        setting = Text("give both: ", Setting("match.reference", "FILE"), " and ", Setting("datum", "reference"))
         what = "no reference" if datum == "reference" else "a reference, but another datum"
         raise InputError(f"there is {what}", field="datum", remedy=setting)
     if datum == "mean":

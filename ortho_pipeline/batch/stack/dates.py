@@ -16,6 +16,7 @@ from typing import Any
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.orthos.verifying import RASTERS
 from ortho_pipeline.errors import InputError, reads
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import decoded, read_bounded, read_json
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions
@@ -153,8 +154,10 @@ def _date(path: Path, stated: str | None, pattern: str | None, options: SceneOpt
         "this ortho has no date: no STAC item and no report are next to it, and its metadata state none",
         file=path,
         field="date",
-        remedy="give a CSV file with the columns file and date, or the place of the date in the file names: "
-        "`--date-pattern %Y%m%d`",
+        remedy=Text(
+            "give a CSV file with the columns file and date, or the place of the date in the file names: ",
+            Setting("date_pattern", "%Y%m%d"),
+        ),
     )
 
 

@@ -29,12 +29,12 @@ from ortho_pipeline.models.base import Array
 
 #: Chance that a right edge is rejected.
 CHANCE = 1e-4
-_START, _ROUNDS = 30, 8
+_START, _ROUNDS = 30, 5
 #: Part of the errors of its dates that an edge has in its weight, so that no weight is infinite.
 _LEAST = 0.1
 _LIMIT = float(chi2.isf(CHANCE, 2))
 #: The constant error of edges is settled if it changes by less than this part of their variance.
-_SMALL = 0.01
+_SMALL = 0.03
 #: An edge with a smaller redundancy is in no loop.
 _IN_LOOP = 1e-6
 
@@ -99,9 +99,10 @@ def accepted_edges(
     for _ in range(_ROUNDS):
         closures, more = _closed(edges, incidence, value, both, constant, accepted)
         again = usable & ~(closures.ratio > _LIMIT)
-        stands = bool((again == accepted).all()) and bool((np.abs(more) < _SMALL * total.mean(axis=0)).all())
-        constant = np.maximum(constant + more, 0.0)
-        if stands:
+        better = np.maximum(constant + more, 0.0)
+        settled = (again == accepted).all() and (np.abs(better - constant) < _SMALL * total.mean(axis=0)).all()
+        constant = better
+        if settled:
             break
         accepted = again
     return replace(closures, accepted=accepted), replace(components, constant=constant)
@@ -115,9 +116,13 @@ def _shifts(trends: Trends) -> Trends:
 def _shortest(incidence: sparse.csr_matrix, value: Array, usable: NDArray[np.bool_]) -> Array:
     """Return shifts of dates ``(T, 2)`` with the least sum of lengths of what is left of edges."""
     weight, found = usable.astype(float), np.zeros((incidence.shape[1], 2))
+    part = _parts(incidence, usable)
+    member = (part[:, None] == np.arange(part.max() + 1)).astype(float)
     for _ in range(_START):
         normal = (incidence.T @ incidence.multiply(weight[:, None])).toarray()
-        found = linalg.lstsq(normal, incidence.T @ (weight[:, None] * value), check_finite=False)[0]
+        level = max(float(normal.diagonal().mean()), 1.0)
+        right = incidence.T @ (weight[:, None] * value)
+        found = linalg.solve(normal + level * member @ member.T, right, assume_a="pos")
         length = np.hypot(*(value - incidence @ found).T)
         floor = max(float(np.median(length[usable])) * 0.1, 1e-6) if usable.any() else 1.0
         weight = usable / np.maximum(length, floor)
@@ -146,8 +151,9 @@ def _closed(
         total = sigma.diagonal() + constant[axis]
         weight = 1.0 / _weighed(total, own[:, 0, 0] + constant[axis])[index]
         some = incidence[index]
-        normal = (some.T @ some.multiply(weight[:, None])).toarray() + member @ member.T
-        gain = np.linalg.solve(normal, some.multiply(weight[:, None]).T.toarray())  # (T, n)
+        scaled = some.multiply(weight[:, None]).tocsr()
+        level = float(weight.mean()) if len(weight) else 1.0
+        gain = (scaled @ np.linalg.inv((some.T @ scaled).toarray() + level * member @ member.T)).T  # (T, n)
         left = value[:, axis] - incidence @ (gain @ value[index, axis])
         moved = (sigma[index][:, index] @ gain.T).T + constant[axis] * gain
         variance = total + _between(edges, moved @ gain.T)
@@ -206,9 +212,10 @@ def solve(
     for axis in (0, 1):
         sigma, own = limited.covariance(axis, some, kept, place)
         weight = _block_weights(sigma, own)
-        normal = (design.T @ weight @ design).toarray()
+        scaled = weight @ design
+        normal = (design.T @ scaled).toarray()
         level = float(np.trace(normal)) / len(normal)
-        gain = np.linalg.solve(normal + level * datum.T @ datum, (design.T @ weight).toarray())
+        gain = (scaled @ np.linalg.inv(normal + level * datum.T @ datum)).T
         value[columns, axis] = gain @ kept.value[:, :, axis].ravel()
         covariance[axis][np.ix_(columns, columns)] = gain @ (sigma @ gain.T)
     return Network(value.reshape(dates, 3, 2), covariance, part)

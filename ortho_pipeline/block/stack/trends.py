@@ -42,7 +42,7 @@ class Trends:
     @property
     def good(self) -> NDArray[np.bool_]:
         """Which edges have a trend."""
-        return self.used.any(axis=1)
+        return np.asarray(self.used.any(axis=1), dtype=np.bool_)
 
 
 def design_of(place: Array, terms: int) -> Array:
@@ -68,7 +68,7 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
         used = again
     used &= (used.sum(axis=1) >= max(FEWEST, _PER_TERM * design.shape[1]))[:, None]
     weights = _functionals(design, base * used)
-    used &= np.isfinite(weights).all(axis=(1, 2))[:, None]
+    used &= weights.any(axis=(1, 2))[:, None]
     weights = np.where(used[:, :, None], weights, 0.0)
     trend = np.einsum("ekm,ekc->emc", weights, value)
     left = np.where(used[:, :, None], value - np.einsum("km,emc->ekc", design, trend), 0.0)
@@ -80,13 +80,14 @@ def _near(left: Array, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     length = np.where(allowed, np.hypot(left[..., 0], left[..., 1]), np.nan)
     length[~allowed.any(axis=1)] = 0.0
     scale = np.nanmedian(length, axis=1) / np.sqrt(2.0 * np.log(2.0))
-    return np.asarray(allowed & (length <= _SIGMAS * np.maximum(scale, 1e-6)[:, None]))
+    near: NDArray[np.bool_] = allowed & np.less_equal(length, _SIGMAS * np.maximum(scale, 1e-6)[:, None])
+    return near
 
 
 def _functionals(design: Array, weight: Array) -> Array:
-    """Return the weights ``(E, K, m)`` that make the terms of a trend of values; NaN where they are not determined."""
+    """Return the weights ``(E, K, m)`` that make the terms of a trend of values; 0 where they are not determined."""
     normal = np.einsum("ek,km,kn->emn", weight, design, design)
     values, vectors = np.linalg.eigh(normal)
     sound = values[:, 0] > 1e-3 * values[:, -1]
-    inverse = np.einsum("eij,ej,ekj->eik", vectors, 1.0 / np.where(sound[:, None], values, np.nan), vectors)
+    inverse = np.einsum("eij,ej,ekj->eik", vectors, 1.0 / np.where(sound[:, None], values, np.inf), vectors)
     return np.asarray(np.einsum("ek,kn,emn->ekm", weight, design, inverse))
