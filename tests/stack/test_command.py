@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 from osgeo import gdal
@@ -25,6 +26,7 @@ from ortho_pipeline.options import MatchOptions, OutputOptions
 from ortho_pipeline.report.stack.records import StackRecord
 
 gdal.UseExceptions()
+ROOT = Path(__file__).resolve().parent.parent.parent
 RASTERS = Rasters(side=240, dates=4, error=4.0)
 #: Few matches, so that tests are fast.
 MATCH = MatchOptions(points=120)
@@ -68,6 +70,8 @@ def test_corrections_are_the_errors(made):
     document = json.loads((made[1] / "stack.json").read_text())
     record = StackRecord.read(document)
     assert record.to_json() == document
+    schema = json.loads((ROOT / "docs" / "stack.schema.json").read_text())
+    jsonschema.validate(document, schema, cls=jsonschema.Draft202012Validator)
     true = RASTERS.shifts() - RASTERS.shifts().mean(axis=0)
     np.testing.assert_allclose([one.shift_px for one in record.dates], true, atol=0.03)
     assert all(max(one.sigma_px) < 0.05 for one in record.dates)

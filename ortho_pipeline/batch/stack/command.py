@@ -34,6 +34,7 @@ from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.report.stack.page import write_page
 from ortho_pipeline.report.stack.records import StackRecord
 from ortho_pipeline.runtime.process_limits import one_blas_thread
+from ortho_pipeline.stores.delivery import address_of
 
 _EDGES, _ALIGNED = "pairs", "aligned"
 _DAYS_A_YEAR = 365.25
@@ -79,6 +80,10 @@ def stack(
     InputError
         If an ortho has no date, the CRS differ, or no pair can be matched.
     """
+    if address_of(folder) is not None:
+        raise InputError(
+            "a stack is written to a folder on this machine", file=str(folder), field="folder", remedy="give a folder"
+        )
     dates = dated_orthos(orthos, date_pattern, scene)
     nodes, fixed = _with_datum(dates, datum, match, scene)
     placed, folder = Placed.of(nodes[: len(dates)]), Path(folder)
@@ -88,18 +93,16 @@ def stack(
         wanted = pairs_of([one.days for one in dates], neighbours)
         if len(nodes) > len(dates):
             wanted += [(date, len(dates)) for date in range(len(dates))]
-        pairs = matcher.pairs(nodes, wanted, lambda done, of: told(f"pair {done} of {of}", done / of))
+        pairs = matcher.pairs(nodes, wanted, lambda done, of: told("matching", done / of))
         solved = _adjusted(nodes, dates, placed, pairs, fixed, affine)
         writer = _Writer(folder / _ALIGNED, placed, scene, output, corrections_only, rebuild)
         outputs = writer.write(dates, solved, told)
         record = record_of(dates, placed, pairs, solved, outputs, datum)
-        files = {"json": folder / "stack.json", "html": folder / "stack.html"}
+        files = {"aligned": folder / _ALIGNED, "json": folder / "stack.json", "html": folder / "stack.html"}
         with together(folder, "stack"):
             write_json(files["json"], record.to_json())
             write_page(record, files["html"])
-    made = {name: folder / path for name, path in outputs.items()} if len(outputs) <= 3 else {}
-    fresh = sum(pair.fresh for pair in pairs)
-    return Result({**made, **files}, record.to_json(), summary(record, fresh))
+    return Result(files, record.to_json(), summary(record, sum(pair.fresh for pair in pairs)))
 
 
 def _with_datum(
@@ -183,7 +186,7 @@ class _Writer:
         for number, one in enumerate(dates):
             if solved.determined[number]:
                 found[one.name] = self._one(one, solved, number)
-            told(f"ortho {number + 1} of {len(dates)}", (number + 1) / len(dates))
+            told("writing", (number + 1) / len(dates))
         return found
 
     def _one(self, one: Dated, solved: Adjusted, number: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.batch.stack.matching import Pair
@@ -133,7 +134,7 @@ def _pairs(dates: Sequence[Dated], pairs: Sequence[Pair], stack: Adjusted) -> li
     return found
 
 
-def closures(stack: Adjusted, shifts: Array, some: Array) -> ClosureRecord:
+def closures(stack: Adjusted, shifts: Array, some: NDArray[np.bool_]) -> ClosureRecord:
     """Return the closing errors of loops of three of some edges ``(E,)``."""
     edges = stack.edges
     number = {(int(a), int(b)): e for e, (a, b) in enumerate(zip(edges.first, edges.second, strict=True)) if some[e]}

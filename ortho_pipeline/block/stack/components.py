@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import optimize, sparse, spatial
 
 from ortho_pipeline.block.stack.edges import Edges
@@ -125,7 +126,7 @@ def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Com
     return Components(shared * typical**2, own * typical**2, scale, factor, np.zeros(2))
 
 
-def _scales(edges: Edges, good: Array, square: Array, seen: Array, dates: int) -> tuple[Array, Array]:
+def _scales(edges: Edges, good: NDArray[np.int_], square: Array, seen: Array, dates: int) -> tuple[Array, Array]:
     """Return scales of dates and edges, from squared sizes of residuals and the parts of dates and edges in them."""
     scale, first, second = np.ones(dates), edges.first[good], edges.second[good]
     for _ in range(_ROUNDS):
@@ -193,7 +194,7 @@ class _Shapes:
         return expected, seen, number
 
 
-def _with_common_date(edges: Edges, good: Array) -> list[tuple[int, int, float]]:
+def _with_common_date(edges: Edges, good: NDArray[np.int_]) -> list[tuple[int, int, float]]:
     """Return pairs of edges with a common date, and the sign of its part in their product."""
     ends: dict[int, list[tuple[int, float]]] = {}
     for edge in good.tolist():

@@ -155,7 +155,8 @@ def _left(edges: Edges, network: Array, components: Components, accepted: NDArra
 
 def _noisier(rest: Array, weight: Array) -> Array:
     """Return by how much the variance of each place ``(K,)`` is larger than the one of most."""
-    square = np.where((weight > 0)[:, :, None], rest**2 * weight[:, :, None], np.nan)
+    seen: NDArray[np.bool_] = np.greater(weight, 0.0)
+    square = np.where(seen[:, :, None], rest**2 * weight[:, :, None], np.nan)
     flat = square.transpose(1, 0, 2).reshape(square.shape[1], -1)
     flat = np.where(np.isfinite(flat).any(axis=1)[:, None], flat, 0.0)
     return np.asarray(np.maximum(np.nanmedian(flat, axis=1) / chi2.median(1), 1.0))

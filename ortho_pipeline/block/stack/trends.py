@@ -52,7 +52,7 @@ def design_of(place: Array, terms: int) -> Array:
 
 def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
     """Return the trend of each edge at stable places ``(K,)``; places that contradict the majority take no part."""
-    allowed = edges.measured & stable
+    allowed: NDArray[np.bool_] = np.logical_and(edges.measured, stable)
     value = np.where(allowed[:, :, None], np.nan_to_num(edges.value), 0.0)
     base = 1.0 / (1.0 + edges.relative)
     some = np.where(allowed.any(axis=1)[:, None, None], np.where(allowed[:, :, None], value, np.nan), 0.0)
