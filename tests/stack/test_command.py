@@ -119,8 +119,9 @@ def test_a_changed_ortho_is_matched_again(made, tmp_path, counted):
     for path in made[0][:3]:
         (folder / path.name).write_bytes(path.read_bytes())
     run([folder], tmp_path / "out")
-    with gdal.OpenEx(str(folder / made[0][1].name), gdal.OF_UPDATE | gdal.OF_RASTER) as image:
-        image.GetRasterBand(1).WriteArray(image.ReadAsArray() + 1)
+    image = gdal.OpenEx(str(folder / made[0][1].name), gdal.OF_UPDATE | gdal.OF_RASTER)
+    image.GetRasterBand(1).WriteArray(image.ReadAsArray() + 1)
+    image = None
     counted.clear()
     run([folder], tmp_path / "out")
     assert len(counted) == 2

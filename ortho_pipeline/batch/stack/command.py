@@ -27,7 +27,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import write_moved
-from ortho_pipeline.files import together, write_json
+from ortho_pipeline.files import clear_up, together, write_json
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.source import open_dataset
@@ -193,12 +193,14 @@ class _Writer:
         model = self.placed.corrected(one, solved, number)
         name = f"{one.name}_aligned{'.vrt' if self.corrections_only else '.tif'}"
         path, place = self.folder / name, self.folder / f"{one.name}.record.json"
+        files = [path, path.with_name(f"{one.name}_model.json")]
+        for file in (*files, place):
+            clear_up(file)
         inputs = (FileState.of("ortho", one.path.absolute(), DIGESTS),)
         key = key_of(inputs, self._configuration(model.to_dict()), self.software)
         record = None if self.rebuild else RunRecord.at(place)
         if record is None or record.key != key or not record.intact(self.folder):
             self._written(one, model, path)
-            files = [path, path.with_name(f"{one.name}_model.json")]
             outputs = tuple(FileState.of(file.suffix[1:], file, name=file.name) for file in files)
             RunRecord(name=one.name, key=key, status="done", inputs=inputs, outputs=outputs).write(place)
         return f"{self.folder.name}/{name}"

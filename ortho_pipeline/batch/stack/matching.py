@@ -15,7 +15,7 @@ from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError, error_document
-from ortho_pipeline.files import read_json, write_json
+from ortho_pipeline.files import clear_up, read_json, write_json
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
@@ -85,6 +85,8 @@ class Matcher:
         first, second = dates[one], dates[other]
         name = f"{first.name}__{second.name}"
         data, place = self.folder / f"{name}.json", self.folder / f"{name}.record.json"
+        clear_up(data)
+        clear_up(place)
         record = None if self.rebuild else RunRecord.at(place)
         if record is not None:
             DIGESTS.learn(record.inputs)
