@@ -40,7 +40,7 @@ class Placed:
                     f"this ortho has another CRS than {dates[0].path.name}",
                     file=one.path,
                     field="orthos",
-                    remedy="reproject it to the same CRS with gdalwarp, or leave it out",
+                    remedy="reproject it to the same CRS, or leave it out",
                 )
         first = models[0]
         step = np.array(_pixel(first))
