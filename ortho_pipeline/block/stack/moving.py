@@ -158,7 +158,7 @@ def _noisier(rest: Array, weight: Array) -> Array:
     seen: NDArray[np.bool_] = np.greater(weight, 0.0)
     square = np.where(seen[:, :, None], rest**2 * weight[:, :, None], np.nan)
     flat = square.transpose(1, 0, 2).reshape(square.shape[1], -1)
-    flat = np.where(np.isfinite(flat).any(axis=1)[:, None], flat, 0.0)
+    flat = np.where(np.asarray(np.isfinite(flat).any(axis=1))[:, None], flat, 0.0)
     return np.asarray(np.maximum(np.nanmedian(flat, axis=1) / chi2.median(1), 1.0))
 
 

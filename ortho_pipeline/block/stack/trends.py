@@ -55,7 +55,7 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
     allowed: NDArray[np.bool_] = np.logical_and(edges.measured, stable)
     value = np.where(allowed[:, :, None], np.nan_to_num(edges.value), 0.0)
     base = 1.0 / (1.0 + edges.relative)
-    some = np.where(allowed.any(axis=1)[:, None, None], np.where(allowed[:, :, None], value, np.nan), 0.0)
+    some = np.where(np.asarray(allowed.any(axis=1))[:, None, None], np.where(allowed[:, :, None], value, np.nan), 0.0)
     left = np.where(allowed[:, :, None], value - np.nanmedian(some, axis=1)[:, None], 0.0)
     used = _near(left, allowed)
     for _ in range(_ROUNDS):
@@ -68,7 +68,7 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
         used = again
     used &= (used.sum(axis=1) >= max(FEWEST, _PER_TERM * design.shape[1]))[:, None]
     weights = _functionals(design, base * used)
-    used &= weights.any(axis=(1, 2))[:, None]
+    used &= np.asarray(weights.any(axis=(1, 2)))[:, None]
     weights = np.where(used[:, :, None], weights, 0.0)
     trend = np.einsum("ekm,ekc->emc", weights, value)
     left = np.where(used[:, :, None], value - np.einsum("km,emc->ekc", design, trend), 0.0)
