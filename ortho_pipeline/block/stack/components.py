@@ -28,7 +28,7 @@ from ortho_pipeline.models.base import Array
 _RANGES = 0.2, 0.45, 1.0
 _CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
 #: Edges and pairs of edges whose products are taken, at most.
-_EDGES, _PAIRS = 160, 240
+_EDGES, _PAIRS = 120, 180
 #: Limits of the scale of an edge, relative to the mean of its dates.
 _SCALES = 0.25, 25.0
 _ROUNDS = 30

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -106,12 +107,12 @@ class Edges:
     def __len__(self) -> int:
         return len(self.first)
 
-    @property
+    @functools.cached_property
     def measured(self) -> NDArray[np.bool_]:
         """Which values ``(E, K)`` are measured."""
         return np.asarray(np.isfinite(self.value).all(axis=2))
 
-    @property
+    @functools.cached_property
     def relative(self) -> Array:
         """Variances ``(E, K)`` in units of their median, 1 where nothing is measured."""
         middle = float(np.median(self.variance[self.measured])) if self.measured.any() else 1.0
@@ -126,4 +127,4 @@ class Edges:
 
     def select(self, index: NDArray[np.int_] | NDArray[np.bool_]) -> Edges:
         """Return some edges."""
-        return replace(self, **{name: getattr(self, name)[index] for name in vars(self)})
+        return replace(self, **{field.name: getattr(self, field.name)[index] for field in fields(self)})

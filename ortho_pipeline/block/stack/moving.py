@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from ortho_pipeline.block.stack.components import Components
 from ortho_pipeline.block.stack.edges import Cells, Edges
+from ortho_pipeline.block.stack.trends import median_of
 from ortho_pipeline.models.base import Array
 
 #: Chance that a stable place is found to move, over all forms.
@@ -156,10 +157,9 @@ def _left(edges: Edges, network: Array, components: Components, accepted: NDArra
 def _noisier(rest: Array, weight: Array) -> Array:
     """Return by how much the variance of each place ``(K,)`` is larger than the one of most."""
     seen: NDArray[np.bool_] = np.greater(weight, 0.0)
-    square = np.where(seen[:, :, None], rest**2 * weight[:, :, None], np.nan)
-    flat = square.transpose(1, 0, 2).reshape(square.shape[1], -1)
-    flat = np.where(np.asarray(np.isfinite(flat).any(axis=1))[:, None], flat, 0.0)
-    return np.asarray(np.maximum(np.nanmedian(flat, axis=1) / chi2.median(1), 1.0))
+    square = (rest**2 * weight[:, :, None]).transpose(1, 0, 2).reshape(weight.shape[1], -1)
+    middle = median_of(square, np.repeat(seen.T, 2, axis=1))
+    return np.asarray(np.maximum(middle / chi2.median(1), 1.0))
 
 
 def _majority(rate: Array, variance: Array) -> Array:

@@ -55,8 +55,8 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
     allowed: NDArray[np.bool_] = np.logical_and(edges.measured, stable)
     value = np.where(allowed[:, :, None], np.nan_to_num(edges.value), 0.0)
     base = 1.0 / (1.0 + edges.relative)
-    some = np.where(np.asarray(allowed.any(axis=1))[:, None, None], np.where(allowed[:, :, None], value, np.nan), 0.0)
-    left = np.where(allowed[:, :, None], value - np.nanmedian(some, axis=1)[:, None], 0.0)
+    middle = np.stack([median_of(value[..., axis], allowed) for axis in (0, 1)], axis=1)
+    left = np.where(allowed[:, :, None], value - middle[:, None], 0.0)
     used = _near(left, allowed)
     for _ in range(_ROUNDS):
         weights = _functionals(design, base * used)
@@ -75,11 +75,18 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
     return Trends(design, weights, trend, left, used)
 
 
+def median_of(value: Array, some: NDArray[np.bool_]) -> Array:
+    """Return the median ``(n,)`` of some values of each row ``(n, m)``; 0 without any."""
+    ordered, count = np.sort(np.where(some, value, np.inf), axis=1), some.sum(axis=1)
+    rows = np.arange(len(value))
+    ends = [ordered[rows, np.maximum(place, 0)] for place in ((count - 1) // 2, count // 2)]
+    return np.where(count > 0, (ends[0] + np.where(count > 0, ends[1], ends[0])) / 2, 0.0)
+
+
 def _near(left: Array, allowed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which values ``(E, K)`` are near the trend, for noise of the size that the median shows."""
-    length = np.where(allowed, np.hypot(left[..., 0], left[..., 1]), np.nan)
-    length[~allowed.any(axis=1)] = 0.0
-    scale = np.nanmedian(length, axis=1) / np.sqrt(2.0 * np.log(2.0))
+    length = np.hypot(left[..., 0], left[..., 1])
+    scale = median_of(length, allowed) / np.sqrt(2.0 * np.log(2.0))
     near: NDArray[np.bool_] = allowed & np.less_equal(length, _SIGMAS * np.maximum(scale, 1e-6)[:, None])
     return near
 
