@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.equations.problem import BlockProblem, State
+from ortho_pipeline.block.equations.problem import BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.local_frame import GEODETIC
@@ -15,7 +14,7 @@ from ortho_pipeline.block.points import Index
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
@@ -152,27 +151,22 @@ class DemHeights:
         return np.asarray(1.0 + _SHARED * (counts[which.ravel()] - 1.0))
 
 
-def starts(
-    source: DemHeights, problem: BlockProblem, models: Sequence[SensorModel], near: Array, rays: Mask, of: Mask
-) -> Array:
-    """Return where points `of` a mask ``(N,)`` are ``(N, 3)``: where the first ray of each meets the DEM.
+def starts(source: DemHeights, problem: BlockProblem, rays: Mask) -> Array:
+    """Return where ties are ``(N, 3)``: where the first ray of each meets the DEM, as far as all its rays see it there.
 
-    Nearly parallel rays of models that are a few pixels off meet anywhere, even if `near` ``(N, 3)``; the DEM is right
-    to a few metres.
+    Nearly parallel rays of models that are a few pixels off meet anywhere; the DEM is right to a few metres. NaN for
+    other points and where the DEM has no height.
     """
-    points, frame = problem.points, problem.frame
-    ground = frame.geodetic(near)
-    heights = source.heights(ground)
+    points, frame, models = problem.points, problem.frame, problem.models
+    of = points.tie & ~problem.placed
+    ground, heights = np.full((len(points), 3), np.nan), np.full(len(points), np.nan)
     left = np.flatnonzero(_first_rays(points.point, rays & of[points.point]))
-    seen = np.zeros(len(points), dtype=bool)
-    seen[points.point[left]] = True
     for _ in range(_FOLLOWED):
         for image in np.unique(points.image[left]):
             model, used = models[image], left[points.image[left] == image]
             of_points = points.point[used]
             at = np.where(np.isfinite(heights[of_points]), heights[of_points], model.reference_height)
-            ground[of_points] = model.image_to_ground(points.measured[used], at)
-            ground[of_points] = ground_transform(model.crs, GEODETIC)(ground[of_points])
+            ground[of_points] = ground_transform(model.crs, GEODETIC)(model.image_to_ground(points.measured[used], at))
             heights[of_points] = at
         there = source.heights(ground[points.point[left]])
         far = np.abs(there - heights[points.point[left]]) > _NEAR_ENOUGH
@@ -180,9 +174,11 @@ def starts(
         left = left[far]
         if not len(left):
             break
-    good = seen & np.isfinite(heights) & np.isfinite(ground).all(axis=1)
-    on_dem = frame.of_geodetic(np.column_stack([ground[:, :2], heights]))
-    return np.where(good[:, None], on_dem, np.nan)
+    good: Mask = np.array(np.isfinite(heights) & np.isfinite(ground).all(axis=1), dtype=bool)
+    found = np.where(good[:, None], frame.of_geodetic(np.column_stack([ground[:, :2], heights])), np.nan)
+    seen = np.isfinite(predict(frame, models, points, found)).all(axis=1)
+    found[points.point[rays & ~seen]] = np.nan
+    return found
 
 
 def _first_rays(point: Index, used: Mask) -> Mask:
@@ -190,15 +186,6 @@ def _first_rays(point: Index, used: Mask) -> Mask:
     rays, first = np.flatnonzero(used), np.zeros(len(point), dtype=bool)
     first[rays[np.unique(point[rays], return_index=True)[1]]] = True
     return first
-
-
-def started(source: DemHeights, problem: BlockProblem, state: State, rays: Mask) -> Array:
-    """Return the places ``(N, 3)`` of a state with points on the DEM, as far as all their rays see them there."""
-    found = starts(source, problem, state.models, state.local, rays, problem.points.tie & ~problem.placed)
-    seen = np.isfinite(predict(problem.frame, state.models, problem.points, found)).all(axis=1)
-    good: Mask = np.array(np.isfinite(found).all(axis=1), dtype=bool)
-    good[problem.points.point[rays & ~seen]] = False
-    return np.where(good[:, None], found, state.local)
 
 
 def _interpolated(distance: Array) -> Array:
