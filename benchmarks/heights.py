@@ -13,6 +13,7 @@ The estimate never sees the truth (models, ground, errors of the DEM).
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import tempfile
@@ -28,7 +29,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "block"))
 
-from chains import Block, Chain, apart, dem, fly, misfits, neighbours, with_control
+from chains import Block, Chain, apart, dem, fly, misfits, neighbours, spots_of, with_control
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
@@ -52,7 +53,8 @@ DETERMINED = 0.2
 class Kind:
     """Errors of a DEM as they are, and as they are stated: sigma, and options of `DemHeights`.
 
-    A `bias` (m) is the standard deviation of one, `off` (m) a shift in a random direction.
+    A `bias` (m) is the standard deviation of one, `off` (m) a shift in a random direction. Of the share `spots` of the
+    ties, heights of 0.3 m are known.
     """
 
     sigma: float = 2.0
@@ -61,12 +63,15 @@ class Kind:
     errors: dict[str, float] = field(default_factory=lambda: {"white": 2.0})
     bias: float = 0.0
     off: float = 0.0
+    spots: float = 0.0
 
 
 _KNOWN = {"bias": 0.0, "shift": 0.0}
 KINDS: dict[str, Kind] = {
     "white": Kind(stated=_KNOWN),
     "white, default options": Kind(),
+    # A bias as large as that of a height, and half a sample along each axis.
+    "as default options assume": Kind(bias=2.0, off=CELL / math.sqrt(2.0)),
     "flat ground (0°)": Kind(stated=_KNOWN, flown={"relief": 0.0}),
     "gentle slopes (4°)": Kind(stated=_KNOWN, flown={"relief": 10.0}),
     "steep slopes (45°)": Kind(stated=_KNOWN, flown={"relief": 150.0}),
@@ -75,8 +80,18 @@ KINDS: dict[str, Kind] = {
     "correlated over 1 km": Kind(3.0, {**_KNOWN, "correlation": 1e3}, errors={"correlated": 3.0, "length": 1e3}),
     "correlated over 10 km": Kind(3.0, {**_KNOWN, "correlation": 1e4}, errors={"correlated": 3.0, "length": 1e4}),
     "10 % of ties on trees": Kind(stated=_KNOWN, flown={"trees": 0.1}),
-    "10 % of ties on roofs": Kind(stated=_KNOWN, flown={"roofs": 0.1}),
+    "10 % of ties on roofs": Kind(stated={"shift": 0.0}, flown={"roofs": 0.1}),
+    "10 % on roofs, no bias": Kind(stated=_KNOWN, flown={"roofs": 0.1}),
     "half a cell off": Kind(stated={"bias": 0.0}, off=CELL / 2.0),
+    "spot heights": Kind(bias=5.0, off=CELL / math.sqrt(2.0), spots=0.02),
+    "spots, correlated over 1 km": Kind(
+        3.0,
+        {"correlation": 1e3},
+        errors={"correlated": 3.0, "length": 1e3},
+        bias=5.0,
+        off=CELL / math.sqrt(2.0),
+        spots=0.02,
+    ),
 }
 
 
@@ -243,8 +258,8 @@ def spreads(convergence: tuple[float, ...], kinds: list[str], seeds: range, fold
     print(
         "spread of error/sigma (1 is right) and share of 95 % intervals with the truth, absolute and between\n"
         "neighbours; RMS between neighbours, px; share of heights that were left out\n"
-        f"{'':31s}|        ties alone             |        with heights\n"
-        f"{'':31s}| absolute    neighbours    RMS  | absolute    neighbours    RMS  left out"
+        f"{'':34s}|        ties alone             |        with heights\n"
+        f"{'':34s}| absolute    neighbours    RMS  | absolute    neighbours    RMS  left out"
     )
     for angle in convergence:
         for name in kinds:
@@ -253,7 +268,7 @@ def spreads(convergence: tuple[float, ...], kinds: list[str], seeds: range, fold
                 block, heights = drawn(KINDS[name], angle, seed, folder / "dem.tif")
                 alone.add(block, adjust(block.start, block.points, hold=HOLD))
                 together.add(block, adjust(block.start, block.points, heights=heights, hold=HOLD))
-            print(f"{angle:4.0f}°  {name:25s}| {alone.row}  | {together.row} {together.left_out:7.3f}", flush=True)
+            print(f"{angle:4.0f}°  {name:28s}| {alone.row}  | {together.row} {together.left_out:7.3f}", flush=True)
 
 
 def drawn(kind: Kind, angle: float, seed: int, path: Path) -> tuple[Block, DemHeights]:
@@ -266,7 +281,8 @@ def drawn(kind: Kind, angle: float, seed: int, path: Path) -> tuple[Block, DemHe
     path.unlink(missing_ok=True)
     errors: Any = kind.errors
     surface = dem(block, path, seed, bias=bias, shift=shift, cell=CELL, **errors).with_sigma(kind.sigma)
-    return block, DemHeights(surface, **kind.stated)
+    spots = spots_of(block, kind.spots, 0.3, random) if kind.spots else None
+    return block, DemHeights(surface, spots=spots, **kind.stated)
 
 
 class Normalised:

@@ -28,6 +28,8 @@ _FOLLOWED, _NEAR_ENOUGH = 6, 1.0
 _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
 #: The heights for a slope are so many of their sigmas apart, from one to so many samples.
 _SLOPE, _WIDEST = 8.0, 3.0
+#: Water that a DEM has flattened is this even (m), and has no larger slope; that of the geoid is smaller.
+_EVEN, _LEVEL = 0.002, 1e-3
 #: Interpolated errors are alike over so many samples (an integral of their correlation).
 _SHARED = 2.25
 _CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
@@ -105,10 +107,20 @@ class DemHeights:
         side, known = self.surface.sample_size, sigmas[np.isfinite(sigmas)]
         return float(np.clip(_SLOPE * np.median(known), side, _WIDEST * side)) if len(known) else side
 
-    def slopes(self, ground: Array, spacing: float) -> Array:
-        """Return the slopes ``(n, 2)`` to the east and north of planes through nine heights; NaN next to a void."""
+    def slopes(self, ground: Array, spacing: float) -> tuple[Array, Mask]:
+        """Return the slopes ``(n, 2)`` to the east and north of planes through nine heights; NaN next to a void.
+
+        And where ``(n,)`` four of these heights, on one side, are equal, as on water that a DEM has flattened.
+        """
         heights = self._around(ground, _NINE, np.full(len(ground), spacing))
-        return np.asarray(heights.T @ _NINE) / (6.0 * spacing)
+        quarters = heights.reshape(3, 3, -1)
+        south, north = quarters[:2], quarters[1:]
+        southwest, southeast, northwest, northeast = south[:, :2], south[:, 1:], north[:, :2], north[:, 1:]
+        with np.errstate(invalid="ignore"):
+            level = np.abs(southwest - southeast - northwest + northeast) < _EVEN
+            for one, other in ((southwest, southeast), (southwest, northwest)):
+                level &= np.abs(one - other) < _LEVEL * spacing
+        return np.asarray(heights.T @ _NINE) / (6.0 * spacing), level.any(axis=(0, 1))
 
     def slope_variance(self, spacing: float) -> float:
         """Return the variance of such a slope by errors of the heights, over their variance."""
