@@ -173,6 +173,25 @@ def test_slopes_of_interpolated_heights_err_as_predicted(tmp_path: Path) -> None
         assert np.var(slopes) == pytest.approx(4.0 * source.slope_variance(spacing), rel=0.25)
 
 
+@pytest.mark.parametrize("ties", [150, 400, 1000])
+def test_heights_between_the_same_samples_share_information(tmp_path: Path, ties: int) -> None:
+    """The variance of a weighted mean is what its weights claim, for the correlation of interpolated errors."""
+    block = fly(Chain(images=4, ties=ties), 0)
+    surface = dem(block, tmp_path / "dem.tif", 0, white=1.0)
+    weights = 1.0 / DemHeights(surface).sharing(ground_transform("EPSG:32636", "EPSG:4979")(block.ground))
+    samples = surface.samples_at(block.ground[:, :2])
+    # Errors of samples by their weights in the heights.
+    shares = np.zeros((ties, *surface.shape))
+    cells, parts = np.floor(samples).astype(int), samples % 1.0
+    for east in (0, 1):
+        for south in (0, 1):
+            share = np.abs(1 - east - parts[:, 0]) * np.abs(1 - south - parts[:, 1])
+            shares[np.arange(ties), cells[:, 1] + south, cells[:, 0] + east] = share
+    shares = shares.reshape(ties, -1)
+    alike = shares @ shares.T / np.mean(np.sum(shares**2, axis=1))
+    assert weights @ alike @ weights / weights.sum() == pytest.approx(1.0, abs=0.12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("made", "sigma", "told"),

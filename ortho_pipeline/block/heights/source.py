@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,8 +31,8 @@ _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_
 _SLOPE, _WIDEST = 8.0, 3.0
 #: Water that a DEM has flattened is this even (m), and has no larger slope; that of the geoid is smaller.
 _EVEN, _LEVEL = 0.002, 1e-3
-#: Interpolated errors are alike over so many samples (an integral of their correlation).
-_SHARED = 2.25
+#: Mean correlation (`_interpolated`) along an axis of errors in one cell, in the next, and in the one after that.
+_SHARED = (0.825, 0.325, 0.0125)
 _CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 _NINE = np.array([(east, north) for north in (-1.0, 0.0, 1.0) for east in (-1.0, 0.0, 1.0)])
 
@@ -155,12 +156,20 @@ class DemHeights:
     def sharing(self, ground: Array) -> Array:
         """Return how many of the places, lon, lat ``(n, 2+)``, share the information of each ``(n,)``.
 
-        Those between the same four samples, and those that share one or two of these.
+        The sum of the correlations with all others, by the mean of two places in cells of four samples.
         """
         places = np.column_stack([ground[:, :2], np.zeros(len(ground))])
         samples = np.floor(np.nan_to_num(self.surface.sampler(GEODETIC)(places))).astype(np.int64)
-        _, which, counts = np.unique(samples, axis=0, return_inverse=True, return_counts=True)
-        return np.asarray(1.0 + _SHARED * (counts[which.ravel()] - 1.0))
+        cells, which, counts = np.unique(samples, axis=0, return_inverse=True, return_counts=True)
+        row = int(np.ptp(cells[:, 1])) + 2 * len(_SHARED) if len(cells) else 1
+        numbers, near = cells @ (row, 1), range(1 - len(_SHARED), len(_SHARED))
+        found = np.full(len(cells), 1.0 - _SHARED[0] ** 2)
+        for across, down in itertools.product(near, near):
+            wanted = numbers + across * row + down
+            place = np.minimum(np.searchsorted(numbers, wanted), len(numbers) - 1)
+            there = np.where(numbers[place] == wanted, counts[place], 0)
+            found += _SHARED[abs(across)] * _SHARED[abs(down)] * there
+        return np.asarray(found[which.ravel()])
 
 
 def starts(source: DemHeights, problem: BlockProblem, rays: Mask) -> Array:
