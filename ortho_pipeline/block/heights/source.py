@@ -121,7 +121,7 @@ class DemHeights:
             level = np.abs(southwest - southeast - northwest + northeast) < _EVEN
             for one, other in ((southwest, southeast), (southwest, northwest)):
                 level &= np.abs(one - other) < _LEVEL * spacing
-        return np.asarray(heights.T @ _NINE) / (6.0 * spacing), level.any(axis=(0, 1))
+        return np.asarray(heights.T @ _NINE) / (6.0 * spacing), np.asarray(level.any(axis=(0, 1)))
 
     def slope_variance(self, spacing: float) -> float:
         """Return the variance of such a slope by errors of the heights, over their variance."""
