@@ -92,6 +92,7 @@ GDAL_MODULES = {
     "raster.pixel_types",
     "raster.ortho",
     "raster.regridded",
+    "raster.pansharpened",
     "surface.dem_file",
     "testing",
 }
