@@ -42,7 +42,8 @@ class Overlap:
     grid : Grid
         Whole panchromatic pixels that both cover.
     whole : Grid
-        The same area widened to whole multispectral pixels, if the pixels of both nest; else `grid`.
+        The same area widened by the kernel of the upsampling to whole multispectral pixels, if the pixels of both
+        nest; else `grid`.
     ratio : int
         Panchromatic pixels along a multispectral one if they nest, else 0.
     """
@@ -71,9 +72,16 @@ class Overlap:
         ratio = _nesting(pan, colours, left, top)
         if not ratio:
             return cls(grid, grid, 0)
-        begin = [round(edge) + (at - round(edge)) // ratio * ratio for at, edge in ((first, left), (upper, top))]
-        end = [round(edge) - (round(edge) - at) // ratio * ratio for at, edge in ((last, left), (lower, top))]
-        return cls(grid, _part(pan, *begin, end[0] - begin[0], end[1] - begin[1]), ratio)
+        across = _widened(first, last, round(left), round(right), ratio)
+        down = _widened(upper, lower, round(top), round(bottom), ratio)
+        return cls(grid, _part(pan, across[0], down[0], across[1] - across[0], down[1] - down[0]), ratio)
+
+
+def _widened(first: int, last: int, begin: int, end: int, ratio: int) -> tuple[int, int]:
+    """Return a range widened to whole multispectral pixels and the kernel about it, within those from begin to end."""
+    low = begin + ((first - begin) // ratio - _REACH) * ratio
+    high = begin + (-(-(last - begin) // ratio) + _REACH) * ratio
+    return max(low, begin), min(high, end)
 
 
 def _part(grid: Grid, left: int, top: int, width: int, height: int) -> Grid:

@@ -16,6 +16,8 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 
 #: Displacement (panchromatic px, RMS) beyond which colours are visibly beside their objects.
 LIMIT = 0.5
+#: Matches to try. An error that all of them share limits the mean, so more of them do not improve it.
+_MATCHES = 200
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def measure_agreement(
     InputError
         If they do not match.
     """
-    measured = measure_ortho(pan, MatchOptions(reference=(colours,)), scene=scene, output=output)
+    measured = measure_ortho(pan, MatchOptions(reference=(colours,), points=_MATCHES), scene=scene, output=output)
     verified = Verified.of(measured)
     # Of each draw of the field: metres to east and north, in pixels.
     pixels = np.einsum("pa,kma->kmp", np.linalg.inv(measured.metres), verified.draws)
@@ -72,9 +74,7 @@ def measure_agreement(
     return Agreement((column, row), (across, down), rmse, len(measured.image), tried)
 
 
-def displaced(
-    agreement: Agreement, pan: str | os.PathLike[str], colours: str | os.PathLike[str]
-) -> Notice | None:
+def displaced(agreement: Agreement, pan: str | os.PathLike[str], colours: str | os.PathLike[str]) -> Notice | None:
     """Return the warning about orthos that do not agree; None if they do."""
     if agreement.rmse <= LIMIT:
         return None

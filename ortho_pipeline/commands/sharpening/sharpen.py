@@ -80,7 +80,9 @@ def sharpen(
     """
     paths = [place(located(path, allow_network=scene.allow_network)) for path in (pan, colours)]
     stem = Path(pan).stem
-    files = {name: Path(folder) / f"{stem}_sharpened{ending}" for name, ending in (("ortho", ".tif"), ("json", ".json"))}
+    files = {
+        name: Path(folder) / f"{stem}_sharpened{ending}" for name, ending in (("ortho", ".tif"), ("json", ".json"))
+    }
     for path in (pan, colours):
         check_paths(files, Request(path, scene, output=output))
     ledger = Ledger(begun=states(path for path in paths if not Location(path).is_far))
@@ -150,7 +152,8 @@ class Pair:
         access = {**scene.access, "memory": output.memory}
         sharp, wide = RasterSource(pan, **access), RasterSource(colours, **access)
         own, bands = colour_bands(sharp), colour_bands(wide)
-        _require_bands(own, bands, sharp, wide)
+        require_one(own, pan)
+        require_several(bands, colours)
         grids = grid_of(pan, **scene.access), grid_of(colours, **scene.access)
         sources = RasterSource(pan, bands=own, **access), RasterSource(colours, bands=bands, **access)
         try:
@@ -161,9 +164,7 @@ class Pair:
                 file=colours,
                 remedy="give both orthos of one acquisition; `ortho info ORTHO` shows where an ortho is",
             ) from error
-        return cls(
-            (pan, colours), sources, grids, bands, _ratio_of(grids, sharp, wide, ratio), overlap, scene, output
-        )
+        return cls((pan, colours), sources, grids, bands, _ratio_of(grids, sharp, wide, ratio), overlap, scene, output)
 
     @property
     def whole_ratio(self) -> int:
@@ -194,17 +195,22 @@ class Pair:
         return read_samples(pan, colours, self.bands, self.coarse, self.whole_ratio)
 
 
-def _require_bands(own: Sequence[int], bands: Sequence[int], pan: RasterSource, colours: RasterSource) -> None:
-    if len(own) != 1:
+def require_one(bands: Sequence[int], pan: str | os.PathLike[str]) -> None:
+    """Refuse a panchromatic image unless it has one band."""
+    if len(bands) != 1:
         raise InputError(
-            f"this ortho has {counted(len(own), 'band')}; a panchromatic ortho has one",
-            file=pan.path,
-            remedy="give the panchromatic ortho first, then the multispectral one",
+            f"this image has {counted(len(bands), 'band')}; a panchromatic image has one",
+            file=pan,
+            remedy="give the panchromatic image first, then the multispectral one",
         )
+
+
+def require_several(bands: Sequence[int], colours: str | os.PathLike[str]) -> None:
+    """Refuse a multispectral image with one band."""
     if len(bands) < 2:
         raise InputError(
-            f"this ortho has {counted(len(bands), 'band')}; a multispectral ortho has at least two",
-            file=colours.path,
+            f"this image has {counted(len(bands), 'band')}; a multispectral image has at least two",
+            file=colours,
             remedy="combine single bands first: `gdalbuildvrt -separate ms.vrt BLUE GREEN RED NIR`",
         )
 
