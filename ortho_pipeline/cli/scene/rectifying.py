@@ -77,6 +77,8 @@ def rectify(
 
     if weights is not None and sharpen is None:
         raise click.UsageError("--weights are for pan-sharpening: also give --sharpen.")
+    if dry_run and sharpen is not None:
+        raise click.UsageError("--dry-run checks one image: leave out --sharpen.")
     if dry_run:
         checked = commands.check(image, scene=scene, points=points, surface=surface, match=match, output=output)
         return print_json(checked) if as_json else say(checked_text(Path(image).name, checked))

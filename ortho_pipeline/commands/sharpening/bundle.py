@@ -132,11 +132,12 @@ def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
     delivered = adjusted.model if isinstance(adjusted, ImageCorrection) else adjusted
     middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), scene.model.reference_height)
     there = ground_transform(scene.model.crs, delivered.crs)(middle)
-    # Pixels in a square metre of the ground.
-    fine, coarse = (
-        float(abs(np.linalg.det(metre_partials(model, ground)[0][0])))
-        for model, ground in ((delivered, there), (scene.model, middle))
-    )
+    # Pixels in a square metre of the ground; NaN where a model does not reach.
+    with np.errstate(invalid="ignore"):
+        fine, coarse = (
+            float(abs(np.linalg.det(metre_partials(model, ground)[0][0])))
+            for model, ground in ((delivered, there), (scene.model, middle))
+        )
     ratio = np.sqrt(fine / coarse)
     if not np.isfinite(ratio):
         raise InputError(
@@ -150,7 +151,9 @@ def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
             f"the pixels of this image are {ratio:.2g} times as wide as the panchromatic ones, so it is not coarser",
             file=scene.path,
             field="sharpen",
-            remedy="give the panchromatic image as IMAGE and the multispectral one after --sharpen",
+            remedy=Text(
+                "give the multispectral image with ", Setting("sharpen"), ", and the panchromatic one as IMAGE"
+            ),
         )
     if not isinstance(adjusted, ImageCorrection):
         return scene.model, round(ratio)

@@ -21,7 +21,7 @@ from ortho_pipeline.commands.sharpening.registration import Agreement, displaced
 from ortho_pipeline.commands.sharpening.samples import Sample, Weights, read_samples, regress
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, TooFewPoints
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import states, together, write_json
 from ortho_pipeline.files.locations import Location, located, place
 from ortho_pipeline.geodesy.naming import crs_text
@@ -98,6 +98,7 @@ def sharpen(
     document = _document(pair, chosen, regression, weights is not None)
     document["registration"] = None if agreement is None else agreement.to_json()
     document["quality"] = reduced_quality(samples, chosen, pair.whole_ratio)
+    notices += _no_gain(document["quality"])
     samples.clear()
     with together(folder, stem):
         document["valid_pixels"] = _write(pair, chosen, files["ortho"], stage)
@@ -239,8 +240,11 @@ def _ratio_of(grids: tuple[Grid, Grid], pan: RasterSource, colours: RasterSource
             "both orthos have the same pixel size, so there is no detail to add",
             file=colours.path,
             field="ratio",
-            remedy="give the multispectral ortho in its own resolution, or state with --ratio how many panchromatic "
-            "pixels made one of its pixels before it was resampled",
+            remedy=Text(
+                "give the multispectral ortho in its own resolution, or state with ",
+                Setting("ratio"),
+                " how many panchromatic pixels an original multispectral pixel is wide",
+            ),
         )
     return own
 
@@ -291,6 +295,18 @@ def _agreement(pair: Pair, regression: Weights) -> tuple[Agreement | None, list[
         text = f"the multispectral bands explain only {share:.0%} of the panchromatic variance; colours can be wrong"
         notices.append(Notice("sharpen-unlike", text, explained=share))
     return agreement, notices
+
+
+def _no_gain(quality: Mapping[str, Any] | None) -> list[Notice]:
+    """Return a warning if upsampling alone is closer to the truth at reduced resolution."""
+    if quality is None or quality["sharpened"]["ergas"] < quality["upsampled"]["ergas"]:
+        return []
+    ergas = tuple(quality[name]["ergas"] for name in ("upsampled", "sharpened"))
+    text = (
+        f"at 1/{quality['ratio']} resolution, upsampling alone is closer to the true colours than pan-sharpening "
+        f"(ERGAS {ergas[0]:.2f} and {ergas[1]:.2f})"
+    )
+    return [Notice("sharpen-no-gain", text, upsampled=ergas[0], sharpened=ergas[1])]
 
 
 # -- pixels ----------------------------------------------------------------------------------------------------------
