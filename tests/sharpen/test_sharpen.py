@@ -140,7 +140,7 @@ def test_another_grid_is_resampled_to_its_place(tmp_path: Path) -> None:
 # -- weights and quality ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40))])
 def test_drawn_bundles_are_better_than_upsampling(seed: int, tmp_path: Path) -> None:
     random = np.random.default_rng([seed, 9])
     ratio = int(random.choice([2, 3, 4, 5]))
@@ -203,6 +203,18 @@ def test_a_displacement_of_a_third_of_a_pixel_is_measured(done: tuple[Bundle, Pa
     assert 0 < found["sigma_column_px"] < 0.05
     assert found["rmse_px"] == pytest.approx(0.3, abs=0.05)
     assert document["notices"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12))
+def test_displacements_of_drawn_bundles_are_measured(seed: int, tmp_path: Path) -> None:
+    random = np.random.default_rng([seed, 4])
+    angle, ratio = random.uniform(0, 2 * np.pi), int(random.choice([2, 4, 5]))
+    shift = 0.3 * np.cos(angle), 0.3 * np.sin(angle)
+    bundle = Bundle(seed=100 + seed, side=800, ratio=ratio, own=float(random.uniform(0.05, 0.6)), shift=shift)
+    found = registration.measure_agreement(*bundle.write(tmp_path), SceneOptions(), OutputOptions(threads=1))
+    np.testing.assert_allclose(found.shift, -np.array(shift), atol=0.05)
+    assert (np.abs(np.add(found.shift, shift)) < 4 * np.array(found.sigma)).all()
 
 
 def test_the_ortho_is_a_cog_with_names_of_bands_and_a_mask(done: tuple[Bundle, Path, dict[str, Any]]) -> None:
