@@ -103,21 +103,23 @@ def _refuse_options(
             "both images have the same name, so their orthos would have, too",
             file=colours,
             field="sharpen",
-            remedy="make each ortho in its own folder, then use `ortho sharpen`",
+            remedy="make each ortho in its own folder, and sharpen the orthos",
         )
     for name in _OF_ONE:
         if getattr(scene, name) is not None:
             raise InputError(
                 Text(Setting(f"scene.{name}"), " opens one image, and these are two"),
                 field=f"scene.{name}",
-                remedy="leave it out; or make each ortho, then use `ortho sharpen`",
+                remedy="leave it out; or make each ortho by itself, and sharpen the orthos",
             )
     if points.correction == "model" or points.fit_model is not None:
         field = "points.fit_model" if points.fit_model is not None else "points.correction"
         raise InputError(
             "the multispectral image can take over a correction in the image only",
             field=field,
-            remedy=Text("use ", Setting("points.correction", "affine"), "; or make each ortho, then `ortho sharpen`"),
+            remedy=Text(
+                "use ", Setting("points.correction", "affine"), "; or make each ortho by itself, and sharpen the orthos"
+            ),
         )
 
 

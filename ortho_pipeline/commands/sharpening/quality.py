@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ortho_pipeline.commands.sharpening.samples import Sample
 from ortho_pipeline.imaging.spectral_quality import QualitySums
@@ -36,9 +37,7 @@ def reduced_quality(samples: Iterable[Sample], weights: Sequence[float], ratio: 
         }
         rim = _RIM * ratio
         part = (slice(rim, -rim), slice(rim, -rim))
-        valid = np.isfinite(colours).all(axis=0)
-        for image in images.values():
-            valid = valid & np.isfinite(image).all(axis=0)
+        valid: NDArray[np.bool_] = np.isfinite(np.concatenate([colours, *images.values()])).all(axis=0)
         for name, image in images.items():
             sums[name].add(colours[:, *part], np.nan_to_num(image)[:, *part], valid[part])
     found = {name: one.quality(ratio) for name, one in sums.items()}

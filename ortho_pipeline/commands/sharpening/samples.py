@@ -104,7 +104,7 @@ def regress(samples: Iterable[Sample], count: int) -> Weights:
         raise InputError(
             "the panchromatic and the multispectral ortho have no valid pixels in common",
             field="nodata",
-            remedy="check the nodata values and masks of both with `gdalinfo`",
+            remedy="check the nodata values and masks of both",
         )
     values = _non_negative(normal, right)
     if not values.any():

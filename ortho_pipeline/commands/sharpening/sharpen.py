@@ -163,7 +163,7 @@ class Pair:
             raise InputError(
                 f"{error.message} ({crs_text(grids[0].crs)}, {crs_text(grids[1].crs)})",
                 file=colours,
-                remedy="give both orthos of one acquisition; `ortho info ORTHO` shows where an ortho is",
+                remedy="give both orthos of one acquisition",
             ) from error
         return cls((pan, colours), sources, grids, bands, _ratio_of(grids, sharp, wide, ratio), overlap, scene, output)
 
