@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,8 @@ def sharpen(
     for path in (pan, colours):
         check_paths(files, Request(path, scene, output=output))
     ledger = Ledger(begun=states(path for path in paths if not Location(path).is_far))
+    # Half of the memory for caches: windows are read once and in order, and what matches takes the rest.
+    output = replace(output, memory=output.memory // 2)
     pair = Pair.open(pan, colours, scene, output, ratio)
     stage = progress or (lambda name, share: None)
     stage("Weights", 0.0)
