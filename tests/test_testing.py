@@ -77,6 +77,12 @@ def test_good_models_pass():
     check_sensor_model(corrected, ground)
 
 
+@pytest.mark.parametrize(("names", "points"), [(0, 0), (1, 1), (2, 1), (3, 2), (9, 5)])
+def test_a_point_gives_two_equations(monkeypatch, names, points):
+    monkeypatch.setattr(Plane, "param_names", tuple("abcdefghi"[:names]))
+    assert Plane().minimum_points == points
+
+
 def wrong_shape(model, ground):
     return Plane.ground_to_image(model, ground)[:, 0]
 
