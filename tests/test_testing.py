@@ -183,6 +183,21 @@ def image(tmp_path):
     return tmp_path / "a.tif"
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_rpc_whose_slope_is_wrong_by_a_ten_thousandth_is_found(monkeypatch, axis):
+    def projected(model, ground):
+        image, partials = RPC.projected(model, ground)
+        return image, partials * (1 + 1e-4 * np.eye(3)[axis])
+
+    wrong = {"projected": projected, "ground_partials": lambda model, ground: projected(model, ground)[1]}
+    broken = type("Broken", (RPC,), {**wrong, "kind": "test-broken"})
+    monkeypatch.setitem(KINDS, "test-broken", broken)
+    rpc = make_rpc()
+    centre, half = rpc.domain
+    with pytest.raises(AssertionError, match=f"along axis {axis} differs from finite differences"):
+        check_sensor_model(broken.from_dict(rpc.to_dict()), centre + GROUND * half)
+
+
 def test_model_that_cannot_be_pickled_is_found(monkeypatch):
     local = type("Local", (Plane,), {"kind": "test-local"})
     monkeypatch.setitem(KINDS, "test-local", local)
