@@ -7,6 +7,8 @@
 #   make check    formatting, lint, types, tests
 #   make page-types  the types of the scripts of `ortho measure`, by TypeScript (npx fetches it)
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
+#   make mutants  small deliberate errors, and which of them no test catches (COUNT=300 of them, drawn by SEED=1); a run
+#                 that was stopped goes on where it was
 #   make bench    speed and memory against gdalwarp, of adjustments, of many scenes: docs/performance.json (an hour)
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
@@ -39,7 +41,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all faults check page-types fuzz bench packages docs images constraints pin-image clean
+.PHONY: help setup demo test test-all faults mutants check page-types fuzz bench packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -70,6 +72,12 @@ test-all: setup
 faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup
 	@$(BIN)/python tests/attack/faults.py --limits $(N) --kills $$(( $(N) * 3 / 4 ))
+
+SEED ?= 1
+COUNT ?= 300
+mutants: setup
+	@$(BIN)/python tools/mutants.py --record
+	$(BIN)/python tools/mutants.py --seed $(SEED) --count $(COUNT)
 
 check: setup
 	@$(BIN)/ruff format --check .
