@@ -29,12 +29,11 @@ class Recorder:
         self.folder, self.entered = folder, set[Any]()
         self.files: dict[str, dict[str, Any]] = defaultdict(lambda: {"setup": set(), "tests": {}})
 
-    def called(self, frame: Any, event: str, _: object) -> None:
-        """Note a call, as `sys.setprofile` has it."""
-        if event == "call":
-            self.entered.add(frame.f_code)
-            if frame.f_code.co_qualname == "Kernel.__call__":
-                self.entered.add(frame.f_locals["self"].py_func.__code__)
+    def called(self, frame: Any, *_: object) -> None:
+        """Note a call, as `sys.settrace` has it; it returns no function for the lines, which would take longer."""
+        self.entered.add(frame.f_code)
+        if frame.f_code.co_name == "__call__" and frame.f_code.co_qualname == "Kernel.__call__":
+            self.entered.add(frame.f_locals["self"].py_func.__code__)
 
     def pytest_runtest_logstart(self) -> None:
         """Begin with a test."""
@@ -42,7 +41,7 @@ class Recorder:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Keep what a phase of a test has entered."""
-        sys.setprofile(None)
+        sys.settrace(None)
         file = self.files[report.nodeid.partition("::")[0]]
         # A copy at once: threads of the test may still run.
         seen = {_key(code) for code in list(self.entered) if f"/{HOST}/" in code.co_filename}
@@ -54,7 +53,7 @@ class Recorder:
 
     def pytest_sessionfinish(self) -> None:
         """Write the records."""
-        sys.setprofile(None)
+        sys.settrace(None)
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, file in self.files.items():
             found = {"digest": _digest(Path(name)), "setup": sorted(file["setup"]), "tests": file["tests"]}
@@ -62,8 +61,8 @@ class Recorder:
 
     def _watch(self) -> None:
         self.entered.clear()
-        sys.setprofile(self.called)
-        threading.setprofile(self.called)
+        sys.settrace(self.called)
+        threading.settrace(self.called)
 
 
 def pytest_configure(config: Any) -> None:
