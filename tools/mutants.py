@@ -64,7 +64,7 @@ class Mutant(NamedTuple):
     @property
     def id(self) -> str:
         """What tells it from others."""
-        return f"{self.path}:{self.line}: {self.before} -> {self.text}"
+        return f"{self.path}:{self.line} ({self.start}): {self.before} -> {self.text}"
 
 
 def mutants_of(path: str, source: bytes) -> Iterator[Mutant]:
@@ -207,10 +207,10 @@ def chosen(entered: Entered, mutant: Mutant, limit: float) -> list[str]:
 
 
 def try_all(copy: Copy, words: argparse.Namespace, records: Path) -> None:
-    """Draw mutants, and try out those that have no record."""
+    """Draw mutants, and try out those that have no record, or with `words.again` were not caught."""
     modules = [path for room in words.rooms for path in sorted((copy.root / HOST / room).rglob("*.py"))]
     every = [one for path in modules for one in mutants_of(str(path.relative_to(copy.root)), path.read_bytes())]
-    done = {json.loads(row)["id"] for row in records.read_text().splitlines()} if records.is_file() else set()
+    done = {name for name, row in read(records).items() if row["caught"] or not words.again}
     entered = Entered(words.folder / "map", copy.root)
     for mutant in random.Random(words.seed).sample(every, min(words.count, len(every))):
         if mutant.id in done:
@@ -219,22 +219,26 @@ def try_all(copy: Copy, words: argparse.Namespace, records: Path) -> None:
         ended, said = copy.try_out(mutant, tests, 60 + 5 * words.limit) if tests else ("no test", "")
         by = next((row[:200] for row in said.splitlines() if row.startswith(("FAILED", "ERROR"))), "")
         seconds = round(time.monotonic() - began)
-        row = {"id": mutant.id, "ended": ended, "tests": len(tests), "by": by, "seconds": seconds}
+        caught = ended in ("failed", "too long")
+        row = {"id": mutant.id, "ended": ended, "caught": caught, "tests": len(tests), "by": by, "seconds": seconds}
         with records.open("a") as file:
             file.write(json.dumps(row) + "\n")
         print(f"{ended:8} {seconds:4} s  {mutant.id}", flush=True)
 
 
+def read(records: Path) -> dict[str, dict[str, Any]]:
+    """Return the last record of each mutant."""
+    rows = map(json.loads, records.read_text().splitlines() if records.is_file() else ())
+    return {row["id"]: row for row in rows}
+
+
 def report(records: Path) -> None:
     """Print the share that was caught, and what was not."""
-    rows = [json.loads(row) for row in records.read_text().splitlines()]
-    left = sorted(f"  {row['id']}  [{row['tests']} tests]" for row in rows if row["ended"] in ("passed", "no test"))
-    share = 1 - len(left) / len(rows)
-    print(
-        f"{records.stem}: {len(rows)} mutants, {len(rows) - len(left)} caught ({share:.1%}). Not caught:",
-        *left,
-        sep="\n",
-    )
+    rows = read(records).values()
+    left = sorted(f"  {row['id']}  [{row['tests']} tests]" for row in rows if not row["caught"])
+    caught = len(rows) - len(left)
+    print(f"{records.stem}: {len(rows)} mutants, {caught} caught ({caught / max(len(rows), 1):.1%}). Not caught:")
+    print(*left, sep="\n")
 
 
 def main() -> None:
@@ -246,6 +250,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "mutants")
     parser.add_argument("--rooms", nargs="*", default=ROOMS)
     parser.add_argument("--record", nargs="*", metavar="TESTS", help="files or folders of tests; all without")
+    parser.add_argument("--again", action="store_true", help="try out once more what was not caught")
     parser.add_argument("--report", action="store_true")
     words = parser.parse_args()
     words.folder = words.folder.resolve()
