@@ -692,6 +692,14 @@ def test_ikonos_geo_corner():
     assert np.abs(image[1] - image[0] - 1000).max() < 0.02
 
 
+@pytest.mark.parametrize(
+    ("bias", "random", "metres"), [(0.3, 0.4, 0.5), (0.6, -1.0, 0.6), (0.0, 0.8, 0.8), (-1.0, 0.0, None)]
+)
+def test_the_stated_accuracy_is_that_of_both_errors(bias, random, metres):
+    """RPC00B: ERR_BIAS and ERR_RAND are standard deviations of independent errors; -1 is unknown, and so is 0."""
+    assert make_rpc(err_bias=bias, err_rand=random).stated_accuracy == pytest.approx(metres)
+
+
 def test_a_geom_file_counts_from_the_centre_of_the_first_pixel(tmp_path):
     """As RPC00B does: GDAL, given the same numbers, finds the same pixels, which it measures from the corner."""
     rpc, path = make_rpc(), tmp_path / "a.geom"
