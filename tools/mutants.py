@@ -1,7 +1,7 @@
 """Small deliberate errors, and whether the tests catch them: `python tools/mutants.py --seed 1 --count 300`.
 
 An error (a mutant) changes one place of a copy of the checkout: an operator, a comparison, a constant, a sign, a root.
-Then the tests that enter the changed function run, the room's own first, then the shortest, until `--limit` seconds of
+Then the tests that enter the changed function run, those of its module and room first, until `--limit` seconds of
 them are used. An error is caught if one of them fails or takes too long.
 
 `--record` finds which test enters which function (`tools/entered.py`), again for files of tests that have changed.
@@ -196,10 +196,14 @@ class Copy:
 
 
 def chosen(entered: Entered, mutant: Mutant, limit: float) -> list[str]:
-    """Return tests for so many seconds, at least one: those of the room first, then the shortest."""
-    tests, room = entered.by(f"{mutant.path}:{mutant.function}", mutant.names), mutant.path.split("/")[1]
+    """Return tests for so many seconds, at least one: of the module, then of its room, then the shortest."""
+    room, own = f"/{mutant.path.split('/')[1]}/", f"/test_{Path(mutant.path).stem}.py"
+
+    def order(test: str) -> tuple[bool, bool, float, str]:
+        return own not in test, room not in test, entered.seconds[test], test
+
     left, some = limit, list[str]()
-    for test in sorted(tests, key=lambda test: (f"/{room}/" not in test, entered.seconds[test], test)):
+    for test in sorted(entered.by(f"{mutant.path}:{mutant.function}", mutant.names), key=order):
         if not some or entered.seconds[test] <= left:
             left -= entered.seconds[test]
             some.append(test)
