@@ -109,8 +109,11 @@ class Entered:
                 self.seconds[test] = seconds
                 for function in {*functions, *file["setup"]}:
                     self._tests[function].add(test)
+        self._imported: dict[str, set[str]] = {}
         for path in (root / HOST).rglob("*.py"):
-            self._note_users(ast.parse(path.read_bytes()), str(path.relative_to(root)), "")
+            tree, name = ast.parse(path.read_bytes()), str(path.relative_to(root))
+            self._imported[name] = _imported(tree)
+            self._note_users(tree, name, "")
 
     def _note_users(self, node: ast.AST, path: str, function: str) -> None:
         for child in ast.iter_child_nodes(node):
@@ -123,13 +126,32 @@ class Entered:
 
         That is so of constants, and of functions that compiled ones call, or that are cached.
         """
-        found, left, seen = set(self._tests.get(function, ())), set(names), set[str]()
+        found, left = set(self._tests.get(function, ())), {(function.partition(":")[0], name) for name in names}
+        seen = set[tuple[str, str]]()
         while not found and left:
             seen |= left
-            users = {user for name in left for user in self._users[name]}
+            users = {user for path, name in left for user in self._users[name] if self._sees(user, path)}
             found = {test for user in users for test in self._tests.get(user, ())}
-            left = {user.rpartition(":")[2].rpartition(".")[2] for user in users} - seen
+            left = {(user.partition(":")[0], user.rpartition(":")[2].rpartition(".")[2]) for user in users} - seen
         return found
+
+    def _sees(self, user: str, path: str) -> bool:
+        """Return whether a function can mean a name of a module."""
+        own = user.partition(":")[0]
+        return (
+            own == path or path.removesuffix(".py").removesuffix("/__init__").replace("/", ".") in self._imported[own]
+        )
+
+
+def _imported(tree: ast.AST) -> set[str]:
+    """Return the modules that a module imports, or names from."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {str(node.module), *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
 
 
 def inside(node: ast.AST, child: ast.AST, name: str) -> str:
