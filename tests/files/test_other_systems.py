@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from osgeo import gdal
 
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.runtime.compilation import places
+from ortho_pipeline.runtime.compilation import cache_folders
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
@@ -111,8 +111,8 @@ def test_locks_keep_others_out(tmp_path: Path) -> None:
 
 def test_without_users_no_folder_of_kernels_is_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "geteuid")
-    assert places.own.__wrapped__() == (None, "this system does not say which user a file belongs to")
-    assert places.of_root.__wrapped__() is None
+    assert cache_folders.own.__wrapped__() == (None, "this system does not say which user a file belongs to")
+    assert cache_folders.of_root.__wrapped__() is None
 
 
 def test_the_sample_job_a_match_and_a_run_of_two_scenes(tmp_path: Path) -> None:
