@@ -692,6 +692,32 @@ def test_ikonos_geo_corner():
     assert np.abs(image[1] - image[0] - 1000).max() < 0.02
 
 
+@pytest.mark.parametrize(
+    ("bias", "random", "metres"), [(0.3, 0.4, 0.5), (0.6, -1.0, 0.6), (0.0, 0.8, 0.8), (-1.0, 0.0, None)]
+)
+def test_the_stated_accuracy_is_that_of_both_errors(bias, random, metres):
+    """RPC00B: ERR_BIAS and ERR_RAND are standard deviations of independent errors; -1 is unknown, and so is 0."""
+    assert make_rpc(err_bias=bias, err_rand=random).stated_accuracy == pytest.approx(metres)
+
+
+def test_a_geom_file_counts_from_the_centre_of_the_first_pixel(tmp_path):
+    """As RPC00B does: GDAL, given the same numbers, finds the same pixels, which it measures from the corner."""
+    rpc, path = make_rpc(), tmp_path / "a.geom"
+    fields = rpc_metadata(rpc)
+    lines = [f"{key.lower().replace('long_', 'lon_')}:  {value}" for key, value in fields.items() if "COEFF" not in key]
+    for key, value in fields.items():
+        if "COEFF" in key:
+            lines += [f"{key.lower()}_{k:02d}:  {number}" for k, number in enumerate(value.split())]
+    path.write_text("\n".join(["polynomial_format:  B", "type:  ossimRpcModel", *lines, "number_lines:  1600", ""]))
+    dataset = gdal.GetDriverByName("MEM").Create("", 2000, 1600)
+    dataset.SetMetadata(fields, "RPC")
+    transformer = gdal.Transformer(dataset, None, ["METHOD=RPC", "RPC_PIXEL_ERROR_THRESHOLD=1e-9"])
+    centre, half = rpc.domain
+    ground = centre + half * np.array([[-0.5, 0.4, 0.2], [0.6, -0.7, -0.9], [0.1, 0.2, 0.8]])
+    theirs = np.array([transformer.TransformPoint(1, *point)[1][:2] for point in ground.tolist()])
+    np.testing.assert_allclose(read_rpc(path).ground_to_image(ground), theirs, atol=1e-6)
+
+
 @pytest.mark.realdata
 @pytest.mark.parametrize(("name", "half"), [("ikonos/ikonos-1", 0.0), ("QB/qb-1", 0.0), ("pleiades/pleiades-1", -0.5)])
 def test_otb_localisations_are_reproduced(name, half):
