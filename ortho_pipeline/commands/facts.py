@@ -129,7 +129,7 @@ def _sensor_named(name: str, plugins: host.Host) -> Sensor:
             raise PluginError(
                 f"the plugin cannot be imported ({broken.error})",
                 field=broken.plugin,
-                remedy="correct the plugin; `ortho doctor` lists all plugins that fail",
+                remedy="correct its module, then test it again",
             )
     named = []
     for sensor in plugins.sensors.values():
