@@ -1,4 +1,4 @@
-"""Facts about a scene, an image, a DEM and this machine: `ortho info`, `edge`, `dem-check`, `doctor`, `cache`."""
+"""Facts about a scene, an image, a DEM, a sensor and this machine: `ortho info`, `edge`, `sensors`, `doctor`, ..."""
 
 from __future__ import annotations
 
@@ -123,9 +123,9 @@ def _sensor_named(name: str, plugins: host.Host) -> Sensor:
     """Return the sensor of this name, or the only one of the plugin, module or distribution of this name."""
     if name in plugins.sensors:
         return plugins.sensors[name]
-    wanted = name.lower().replace("_", "-")
+    wanted = _comparable(name)
     for broken in plugins.broken:
-        if wanted in (broken.plugin.lower(), broken.distribution.lower().replace("_", "-")):
+        if wanted in {_comparable(broken.plugin), _comparable(broken.distribution)}:
             raise PluginError(
                 f"the plugin cannot be imported ({broken.error})",
                 field=broken.plugin,
@@ -134,7 +134,7 @@ def _sensor_named(name: str, plugins: host.Host) -> Sensor:
     named = []
     for sensor in plugins.sensors.values():
         origin = plugins.provenance(sensor.name)
-        if wanted in {text.lower().replace("_", "-") for text in (origin.plugin, origin.module, origin.distribution)}:
+        if wanted in {_comparable(text) for text in (origin.plugin, origin.module, origin.distribution)}:
             named.append(sensor)
     if len(named) == 1:
         return named[0]
@@ -152,6 +152,11 @@ def _sensor_named(name: str, plugins: host.Host) -> Sensor:
     )
 
 
+def _comparable(name: str) -> str:
+    """Return the name of a distribution as indexes compare it."""
+    return name.lower().replace("_", "-").replace(".", "-")
+
+
 @contextlib.contextmanager
 def _contract_of(sensor: Sensor, remedy: str) -> Iterator[None]:
     """Turn a failed requirement, and any exception of the plugin, into a `PluginError` of the plugin's file."""
@@ -165,7 +170,7 @@ def _contract_of(sensor: Sensor, remedy: str) -> Iterator[None]:
         *_, (frame, _line) = traceback.walk_tb(error.__traceback__)
         of_contract = isinstance(error, AssertionError) and frame.f_globals["__name__"] == check_sensor.__module__
         text = str(error) if of_contract else f"the plugin failed ({errors.described(error, sensor.open_scene)})"
-        file = getattr(sys.modules.get(sensor.open_scene.__module__), "__file__", None)
+        file = getattr(sys.modules.get(getattr(sensor.open_scene, "__module__", "")), "__file__", None)
         raise PluginError(text, file=file, field=sensor.name, remedy=remedy) from error
 
 
