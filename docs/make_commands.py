@@ -89,6 +89,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
     "Which model": {
         "sensor": "No sensor recognises the image, or two do.",
         "sensor-option": "A sensor needs a value that the files do not state.",
+        "test": "You write a plugin, or you suspect one.",
         "rpc": "Tag and side-car differ, or the RPC is elsewhere.",
         "model": "An earlier run saved the model as `_model.json`.",
         "ortho": "The image is a finished ortho, such as Sentinel-2 or a national mosaic, and you treat it as a scene.",

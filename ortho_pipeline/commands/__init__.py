@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.facts import info as info
     from ortho_pipeline.commands.facts import kept_files as kept_files
     from ortho_pipeline.commands.facts import models as models
+    from ortho_pipeline.commands.facts import sensor_test as sensor_test
     from ortho_pipeline.commands.facts import sensors as sensors
     from ortho_pipeline.commands.facts import write_plots as write_plots
     from ortho_pipeline.commands.fitting import compare as compare
@@ -39,6 +40,7 @@ _NAMES = {
         "info",
         "kept_files",
         "models",
+        "sensor_test",
         "sensors",
         "write_plots",
     ),

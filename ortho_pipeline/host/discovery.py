@@ -174,15 +174,7 @@ class Host:
         options = dict(options or {})
         dataset = self.open_image(path, sensor, allow_network=allow_network, roots=roots)
         chosen = self.recognise(dataset, sensor, options)
-        for name in options:
-            if name not in chosen.options:
-                declared = ", ".join(chosen.options) or "none"
-                raise InputError(
-                    f"the sensor {chosen.name!r} has no option {name!r}; its options: {declared}",
-                    file=path,
-                    field=name,
-                    remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
-                )
+        require_declared(chosen, options, path)
         try:
             with completed(path, remedy=_COPY_IT):
                 scene = chosen.open_scene(dataset, **options)
@@ -257,6 +249,19 @@ def open_scene(
     return Host.discover().open_scene(
         path, sensor, options, allow_network=allow_network, roots=roots, crop_offset=crop_offset
     )
+
+
+def require_declared(sensor: Sensor, options: Iterable[str], path: str | PathLike[str]) -> None:
+    """Refuse options of a user that a sensor does not declare."""
+    for name in options:
+        if name not in sensor.options:
+            declared = ", ".join(sensor.options) or "none"
+            raise InputError(
+                f"the sensor {sensor.name!r} has no option {name!r}; its options: {declared}",
+                file=path,
+                field=name,
+                remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
+            )
 
 
 @functools.cache

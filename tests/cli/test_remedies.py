@@ -374,6 +374,18 @@ def _sensors(printed: Printed, folder: Path) -> None:
     assert "ikonos" in printed.paste(refused(open_scene, SAMPLE / "scene.tif", options={"no-such": "1"}))
 
 
+@case("commands", "ortho sensors")
+def _installed(printed: Printed, folder: Path) -> None:
+    assert "ikonos" in printed.paste(refused(commands.sensor_test, "no-such", None))
+
+
+@case("commands", "ortho sensors --test")
+def _tested(printed: Printed, folder: Path) -> None:
+    assert "passes" in printed.paste(refused(commands.sensor_test, "rpc", None), IMAGE=str(SAMPLE / "scene.tif"))
+    several = refused(commands.sensor_test, "ortho-pipeline", None).replace("asp", "rpc")
+    assert "passes" in printed.paste(several, IMAGE=str(SAMPLE / "scene.tif"))
+
+
 @case("imaging", "ortho info")
 def _elsewhere(printed: Printed, folder: Path) -> None:
     far = tiff(folder / "far.tif", GREY, dem=True)

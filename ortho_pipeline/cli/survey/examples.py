@@ -112,7 +112,10 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
         ),
     ),
     "dem-check": (("Compare a DEM with surveyed heights:", "ortho dem-check dem.tif --points gcps.csv"),),
-    "sensors": (("List the supported products:", "ortho sensors"),),
+    "sensors": (
+        ("List the supported products:", "ortho sensors"),
+        ("Test the plugin of a sensor with one of its images:", "ortho sensors --test rpc scene.tif"),
+    ),
     "models": (("List the models, with the number of points that each needs:", "ortho models"),),
     "doctor": (("Check the installation:", "ortho doctor"),),
     "cache list": (("List the cached files:", "ortho cache list"),),
