@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.rectification import check as check
     from ortho_pipeline.commands.rectification import export as export
     from ortho_pipeline.commands.rectification import rectify as rectify
+    from ortho_pipeline.commands.scene import block_formats as block_formats
     from ortho_pipeline.commands.scene import dem_check as dem_check
     from ortho_pipeline.commands.scene import doctor as doctor
     from ortho_pipeline.commands.scene import edge as edge
@@ -31,6 +32,7 @@ _NAMES = {
     "fitting": ("compare", "fit"),
     "rectification": ("check", "export", "rectify"),
     "scene": (
+        "block_formats",
         "dem_check",
         "doctor",
         "edge",
