@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from osgeo import gdal
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL = ROOT.parent / "shared" / "data" / "s2p"
@@ -199,9 +199,9 @@ def pleiades_rows() -> Iterator[str]:
     dsm = REAL / "expected_output" / "triplet" / "dsm.tif"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        heights, coarse, transform = _averaged(dsm, folder / "coarse.tif")
-        heights_of = {"mean of 30 m": folder / "coarse.tif", "DSM of s2p (0.5 m)": dsm}
-        fine = SurfaceOptions(dem=dsm, vertical="ellipsoid", fill="nearest")
+        heights, coarse, transform = _prepared(dsm, folder)
+        heights_of = {"mean of 30 m": folder / "coarse.tif", "DSM of s2p (0.5 m)": folder / "fine.tif"}
+        fine = SurfaceOptions(dem=folder / "fine.tif", vertical="ellipsoid", fill="mask")
         done = block.adjust(images, folder / "block", BlockOptions(ties="auto", dem_heights="off"), surface=fine)
         rows, columns = heights.shape
         west, north = transform[0], transform[3]
@@ -214,7 +214,7 @@ def pleiades_rows() -> Iterator[str]:
                     folder / "orthos",
                     scene=SceneOptions(model=done.files[f"{image.stem} model"]),
                     points=PointOptions(),
-                    surface=SurfaceOptions(dem=dem, vertical="ellipsoid", fill="nearest"),
+                    surface=SurfaceOptions(dem=dem, vertical="ellipsoid", fill="mask"),
                     output=OutputOptions(crs="EPSG:32631", resolution=(PIXEL, PIXEL), extent=extent, format="GTiff"),
                     overwrite=True,
                 )
@@ -229,21 +229,23 @@ def pleiades_rows() -> Iterator[str]:
                 yield from _by_relief(label, f"{angle:g}° apart", pixels[first], pixels[second], heights, coarse)
 
 
-def _averaged(dsm: Path, path: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
-    """Write the mean of 30 m of a DSM; return both as heights at the samples of the DSM, and its geotransform."""
+def _prepared(dsm: Path, folder: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
+    """Write a DSM with its holes filled by the nearest height, and its mean of 30 m.
+
+    Returns the heights as they were, the mean at the same samples, and the geotransform.
+    """
     dataset = gdal.Open(str(dsm))
     heights, transform = dataset.ReadAsArray(), dataset.GetGeoTransform()
+    nearest = distance_transform_edt(np.isnan(heights), return_distances=False, return_indices=True)
+    filled = heights[tuple(nearest)]
     cell = round(COARSE / transform[1])
-    rows, columns = (-(-count // cell) * cell for count in heights.shape)
-    padded = np.full((rows, columns), np.nan)
-    padded[: heights.shape[0], : heights.shape[1]] = heights
-    cells = padded.reshape(rows // cell, cell, -1, cell)
-    known = np.isfinite(cells).sum(axis=(1, 3))
-    mean = np.where(known > 0, np.nansum(cells, axis=(1, 3)) / np.maximum(known, 1), -32768.0)
-    write_dem(path, mean, (transform[0], transform[3]), COARSE, "EPSG:32631")
+    rows, columns = (count // cell * cell for count in heights.shape)
+    mean = filled[:rows, :columns].reshape(rows // cell, cell, -1, cell).mean(axis=(1, 3))
+    corner = (transform[0], transform[3])
+    write_dem(folder / "fine.tif", filled, corner, transform[1], "EPSG:32631")
+    write_dem(folder / "coarse.tif", mean, corner, COARSE, "EPSG:32631")
     at = (np.indices(heights.shape).reshape(2, -1) + 0.5) / cell - 0.5
-    filled = np.where(mean > -1000, mean, np.nan)
-    return heights, map_coordinates(filled, at, order=1, mode="nearest").reshape(heights.shape), transform
+    return heights, map_coordinates(mean, at, order=1, mode="nearest").reshape(heights.shape), transform
 
 
 def _by_relief(

@@ -121,11 +121,7 @@ def adjust(
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
     table, notes = gathered.table, [*placed, *gathered.notices]
-    heights = _heights(table)
-    starts = {
-        label: start_of(image, points, own, table.in_image(label), heights)
-        for label, image, own in zip(labels, images, scenes, strict=True)
-    }
+    starts = _starts(images, labels, scenes, points, table)
     fit = adjust_block(
         {label: start.model for label, start in starts.items()},
         table,
@@ -149,13 +145,11 @@ def adjust(
         warnings=[*_warnings(fit, starts), *notes, *complaints],
         join_limit=points.join_limit,
     )
-    pictures, told = _pictures(starts, scenes[0]), list[str]()
+    pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
         _write(files, report, fit, starts, exported, record)
-        if programs:
-            block = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0])
-            added, told = block.export(programs, Path(folder))
-            files |= added
+        block = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0])
+        told = block.export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
         if orthos is not None:
             under = [start.scene for start in starts.values()]
@@ -235,6 +229,20 @@ def intersect(
 def _heights(table: BlockPoints) -> tuple[float, float] | None:
     known = table.ground[np.isfinite(table.ground[:, 2]), 2]
     return (float(known.min()), float(known.max())) if len(known) else None
+
+
+def _starts(
+    images: Sequence[str | os.PathLike[str]],
+    labels: Sequence[str],
+    scenes: Sequence[SceneOptions],
+    points: BlockOptions,
+    table: BlockPoints,
+) -> dict[str, Start]:
+    heights = _heights(table)
+    return {
+        label: start_of(image, points, own, table.in_image(label), heights)
+        for label, image, own in zip(labels, images, scenes, strict=True)
+    }
 
 
 def _own(scene: Any, name: str | None) -> SensorModel:

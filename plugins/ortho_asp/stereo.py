@@ -32,7 +32,7 @@ def asp_text(block: BlockExport) -> str:
                 remedy="adjust images of one band, such as the panchromatic ones",
             )
     session = f"-t {_SESSIONS[block.models]}"
-    grid = f"--t_srs {block.crs} --tr {block.resolution:g}"
+    crs, step = block.crs, f"{block.resolution:g}"
     lines = ["#!/bin/sh", "# Heights are above the WGS 84 ellipsoid.", "set -e", 'cd "$(dirname "$0")"']
     pictures = {label: image.path for label, image in block.images.items()}
     if block.elevation is not None:
@@ -40,7 +40,7 @@ def asp_text(block: BlockExport) -> str:
         for label, image in block.images.items():
             pictures[label] = f"asp/{label}_map.tif"
             names = _quoted(image.path, image.model, pictures[label])
-            lines.append(f"mapproject {session} {grid} {dem} {names}")
+            lines.append(f"mapproject {session} --t_srs {crs} --tr {step} {dem} {names}")
     surfaces = []
     for pair in block.pairs:
         prefix = f"asp/{pair.first}-{pair.second}/run"
@@ -48,7 +48,8 @@ def asp_text(block: BlockExport) -> str:
         names = _quoted(pictures[pair.first], pictures[pair.second], *(image.model for image in both), prefix)
         ends = names if block.elevation is None else f"{names} {shlex.quote(block.elevation)}"
         lines.append(f"parallel_stereo {session} --stereo-algorithm asp_mgm --subpixel-mode 9 {ends}")
-        lines.append(f"point2dem {grid} --errorimage {_quoted(f'{prefix}-PC.tif')}")
+        cloud = shlex.quote(f"{prefix}-PC.tif")
+        lines.append(f"point2dem --t_srs {crs} --tr {step} --errorimage {cloud}")
         surfaces.append(f"{prefix}-DEM.tif")
     if len(surfaces) > 1:
         lines.append(f"dem_mosaic --median {_quoted(*surfaces)} -o asp/dsm.tif")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from osgeo import gdal
 from pair import Pair
 from programs import answer, executable
 from test_block_export import ground_of
@@ -16,8 +17,10 @@ from test_block_export import ground_of
 import ortho_pipeline as op
 from ortho_pipeline import commands
 from ortho_pipeline.commands.block import adjust
+from ortho_pipeline.commands.heights.surfaces import open_surface
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.surface.writing import write_dem
 
 #: rpcm: the centre of the first pixel is (0, 0), as its files have it.
 RPCM = """
@@ -43,12 +46,22 @@ for name, kind, path, ground in request:
     row, col, _ = GeoModel(path, "RPC").inverse_loc(lon, lat, height)
     answer[f"{name} {kind}"] = [np.asarray(col).tolist(), np.asarray(row).tolist()]
 """
+#: CARS checks a configuration by making its pipeline: it reads all images, models and the DEM, and changes defaults.
 CHECK = """
-import argparse, os
+import os
 from cars.pipelines.pipeline import Pipeline
 os.chdir(request["folder"])
-used = Pipeline("default", json.load(open("cars.json")), request["folder"])
-answer = {key: list(value) for key, value in used.used_conf.items() if isinstance(value, dict)}
+used = Pipeline("default", json.load(open("cars.json")), request["folder"]).used_conf
+def inputs_of(conf):
+    found = [conf] if "sensors" in conf and "pairing" in conf else []
+    return found + [one for value in conf.values() if isinstance(value, dict) for one in inputs_of(value)]
+first = inputs_of(used)[0]
+answer = {
+    "pairing": first["pairing"],
+    "elevation": first["initial_elevation"],
+    "models": {name: sensor["geomodel"] for name, sensor in first["sensors"].items()},
+    "images": {name: sensor["image"]["bands"]["b0"]["path"] for name, sensor in first["sensors"].items()},
+}
 """
 
 
@@ -119,36 +132,39 @@ def test_shareloc_counts_pixels_of_a_map_or_crop_as_the_model_does(tmp_path: Pat
 
 def test_cars_checks_its_configuration(exported: tuple[Pair, Any], tmp_path: Path) -> None:
     executable("cars")
+    pair, _ = exported
     checked = answer("cars", CHECK, {"folder": str(tmp_path / "out")})
-    assert {"sensors", "pairing", "initial_elevation"} <= set(checked["input"])
+    assert checked["pairing"] == [["aft", "fore"]]
+    assert checked["elevation"] == {"dem": str(tmp_path / "out" / "elevation.tif"), "geoid": None}
+    for name in pair.rpcs:
+        model = {"path": str(tmp_path / "out" / f"{name}.geom"), "model_type": "RPC"}
+        assert checked["models"][name] in (model, model["path"])
+        assert Path(checked["images"][name]).resolve() == pair.image(name).resolve()
 
 
 @pytest.mark.slow
 @pytest.mark.realdata
 def test_cars_makes_a_dsm_of_an_adjusted_pair_over_which_the_orthos_agree(real: Path, tmp_path: Path) -> None:
-    """Mont Ventoux: ties over SRTM, the DSM of CARS, and orthos over it without another option than --dem."""
+    """Pleiades: ties over a DEM of 30 m, the DSM of CARS, and true orthos over it without another option than --dem."""
     program = executable("cars", "cars")
-    folder, names = real / "shareloc", ("left_image", "right_image")
-    images = [folder / "image" / "phr_ventoux" / f"{name}.tif" for name in names]
-    scenes = [SceneOptions(rpc=str(folder / "rpc" / "phr_ventoux" / f"{name}.geom")) for name in names]
-    srtm = folder / "dtm" / "srtm_ventoux" / "srtm90_non_void_filled" / "N44E005.hgt"
-    done = adjust(
-        images, tmp_path / "out", BlockOptions(ties="auto"), scenes, export=["cars"],
-        surface=SurfaceOptions(dem=srtm, vertical="EPSG:5773"),
-    )  # fmt: skip
+    names = ("img_01", "img_03")
+    images = [real / "s2p" / "input_triplet" / f"{name}.tif" for name in names]
+    authority = real / "s2p" / "expected_output" / "triplet" / "dsm.tif"
+    surface = SurfaceOptions(dem=coarse_of(authority, tmp_path / "coarse.tif"), vertical="ellipsoid", fill="nearest")
+    done = adjust(images, tmp_path / "out", BlockOptions(ties="auto"), surface=surface, export=["cars"])
     ran = subprocess.run(
         [program, "--logtype", "plain", done.files["cars"]], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert ran.returncode == 0, ran.stdout[-3000:]
     dsm = tmp_path / "cars" / "dsm" / "dsm.tif"
-    heights = op.open_dem(dsm, fill="mask")
-    # SRTM is some metres off in mountains; the wrong datum would be 50 m off.
-    rows, columns = heights.shape
-    v, u = (axis.ravel() for axis in np.mgrid[0:rows:20, 0:columns:20])
-    places = np.column_stack(heights.grid.lonlat(u.astype(float), v.astype(float)))
-    apart = heights.heights(places, "EPSG:4326") - op.open_dem(srtm, "EPSG:5773").heights(places, "EPSG:4326")
-    assert np.isfinite(apart).mean() > 0.5
-    assert abs(np.nanmedian(apart)) < 10
+    assert open_surface(SurfaceOptions(dem=dsm, sigma=dsm.with_name("performance_map.tif"))).sigma is not None
+    # Another program made a DSM of these images with a third one; with the wrong datum it would be 49 m away.
+    lon, lat = np.meshgrid(np.linspace(5.441, 5.445, 60), np.linspace(43.2605, 43.2635, 60))
+    places = np.column_stack([lon.ravel(), lat.ravel()])
+    found = op.open_dem(dsm, fill="mask").heights(places, "EPSG:4326")
+    wanted = op.open_dem(authority, "ellipsoid", fill="mask").heights(places, "EPSG:4326")
+    assert np.isfinite(found - wanted).mean() > 0.3
+    assert abs(np.nanmedian(found - wanted)) < 5.0
     # The true orthos show the same ground: matching one with the other leaves less than a pixel.
     orthos = [
         commands.rectify(
@@ -159,3 +175,13 @@ def test_cars_makes_a_dsm_of_an_adjusted_pair_over_which_the_orthos_agree(real: 
     ]  # fmt: skip
     agreement = verify(orthos[0], match=MatchOptions(reference=[str(orthos[1])])).document
     assert agreement["relative"]["rmse_m"]["value"] < 0.5
+
+
+def coarse_of(dsm: Path, path: Path) -> Path:
+    """Write the mean of 30 m of a DSM, whose holes have the median height."""
+    dataset = gdal.Open(str(dsm))
+    heights, transform = dataset.ReadAsArray(), dataset.GetGeoTransform()
+    heights = np.where(np.isnan(heights), np.nanmedian(heights), heights)[:840, :840]
+    coarse = heights.reshape(14, 60, 14, 60).mean(axis=(1, 3))
+    write_dem(path, coarse, (transform[0], transform[3]), 30.0, "EPSG:32631")
+    return path

@@ -107,16 +107,18 @@ class AdjustedBlock:
         """Median height (m) of the ground points."""
         return float(np.nanmedian(self.fit.ground[:, 2]))
 
-    def export(self, formats: Sequence[BlockFormat], folder: Path) -> tuple[dict[str, Path], list[str]]:
-        """Write what the programs take, and return the files and what to run.
+    def export(self, formats: Sequence[BlockFormat], folder: Path, files: dict[str, Path]) -> list[str]:
+        """Write what the programs take, add it to `files`, and return what people read: pairs, and what to run.
 
         Raises
         ------
         InputError
             If a program cannot take the block.
         """
+        if not formats:
+            return []
         pairs, datasets = self.pairs(), {label: self._dataset(label) for label in self.starts}
-        files, lines = dict[str, Path](), list[str]()
+        lines = list[str]()
         pictures = {label: self._picture(label, dataset, folder, files) for label, dataset in datasets.items()}
         resolution, crs = self._grid()
         elevation = self._elevation(folder, files)
@@ -138,7 +140,7 @@ class AdjustedBlock:
             write_text(folder / chosen.file, chosen.text(block))
             files[chosen.name] = folder / chosen.file
             lines.append(f"{chosen.title}: `{chosen.command} {typed(folder / chosen.file)}`")
-        return files, [*_described(pairs), *lines]
+        return [*_described(pairs), *lines]
 
     def _dataset(self, label: str) -> Any:
         """Return the image, which other programs have to find on this machine."""
