@@ -338,7 +338,6 @@ COMMAND_LINE = re.compile(
     r"\b(ortho (adjust|doctor|fit|measure|rectify|run)|pyproj sync|projsync|gdal_calc\.py|"
     r"mapproject|parallel_stereo|point2dem|dem_mosaic) "
 )
-)
 
 
 def texts(path: Path) -> Iterator[str]:
