@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -107,19 +107,28 @@ def town() -> tuple[City, list[tuple[float, float, float]]]:
     return City(tuple(boxes), side), places
 
 
+def height_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the heights of the town over its ground, from the rule of the lattice."""
+    step = HOUSE + STREET
+    i, j = np.floor((x - STREET) / step).astype(int), np.floor((y - STREET) / step).astype(int)
+    roof = (x - STREET - i * step <= HOUSE) & (y - STREET - j * step <= HOUSE)
+    roof &= (i >= 0) & (j >= 0) & (i < HOUSES) & (j < HOUSES)
+    return np.where(roof, np.array(HEIGHTS[1:])[(i + 2 * j) % 4], 0.0)
+
+
 def photograph(city: City, paint: np.ndarray, angle: float, azimuth: float, seed: int) -> np.ndarray:
     """Return the image of a view: each ray is walked down to the first roof, wall or street."""
     east, north = towards(angle, azimuth)
     count = round(city.side / PIXEL)
     columns, rows = np.meshgrid(np.arange(count) + 0.5, np.arange(count) + 0.5)
     x, y, height = PIXEL * columns, city.side - PIXEL * rows, np.zeros((count, count))
-    for level in np.arange(max(HEIGHTS), 0.0, -0.125):
-        meets = city.heights(x + east * level, y + north * level) >= level
+    for level in np.arange(max(HEIGHTS), 0.0, -0.25):
+        meets = height_of(x + east * level, y + north * level) >= level
         height = np.where((height == 0) & meets, level, height)
     at_x, at_y = x + east * height, y + north * height
     pixels = map_coordinates(paint, [(city.side - at_y) / PIXEL - 0.5, at_x / PIXEL - 0.5], order=1, mode="nearest")
     noise = np.random.default_rng(seed).normal(0, 3, pixels.shape)
-    wall = np.abs(city.heights(at_x, at_y) - height) > 0.2
+    wall = np.abs(height_of(at_x, at_y) - height) > 0.3
     return np.clip(np.where(wall, 60, pixels) + noise, 1, 255).astype(np.uint8)
 
 
@@ -128,7 +137,7 @@ def surfaces_of(city: City, folder: Path) -> dict[str, Surface]:
     margin, step = 60.0, PIXEL
     count = int((city.side + 2 * margin) / step)
     x = -margin + step * (np.arange(count) + 0.5)
-    heights = FLOOR + city.heights(*np.meshgrid(x, city.side - x))
+    heights = FLOOR + height_of(*np.meshgrid(x, city.side - x))
     corner = (WEST - margin, NORTH + margin)
     random = np.random.default_rng(1)
     noise = gaussian_filter(random.normal(size=heights.shape), 2)
@@ -148,7 +157,7 @@ def surfaces_of(city: City, folder: Path) -> dict[str, Surface]:
     }
 
 
-def town_rows() -> Iterator[str]:
+def town_rows(angles: Sequence[float] = ANGLES) -> Iterator[str]:
     """Yield the rows of the town: two views from opposite sides at the same angle."""
     city, places = town()
     random = np.random.default_rng(7)
@@ -158,7 +167,7 @@ def town_rows() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as name:
         folder, grid = Path(name), city.grid(PIXEL)
         surfaces = surfaces_of(city, folder)
-        for angle in ANGLES:
+        for angle in angles:
             for azimuth in (90.0, 270.0):
                 path = folder / f"{azimuth:g}.tif"
                 made = gdal.GetDriverByName("GTiff").Create(str(path), count, count, 1, gdal.GDT_Byte)
@@ -254,8 +263,8 @@ def _by_relief(
     half, reach, classes = 10, 16, (0.0, 2.0, 5.0, 10.0, 30.0)
     moved: dict[int, list[np.ndarray]] = {number: [] for number in range(len(classes) - 1)}
     tried = dict.fromkeys(moved, 0)
-    for row in range(40, heights.shape[0] - 40, 12):
-        for column in range(40, heights.shape[1] - 40, 12):
+    for row in range(40, heights.shape[0] - 40, 24):
+        for column in range(40, heights.shape[1] - 40, 24):
             near = (heights - coarse)[row - half : row + half + 1, column - half : column + half + 1]
             if not np.isfinite(near).all() or near.std() > 1.5:
                 continue  # a roof or ground as a whole, no edge
@@ -277,10 +286,14 @@ def _by_relief(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--town", action="store_true")
+    parser.add_argument("--angle", type=float, action="append", help="angles of the town's views; default: all")
     parser.add_argument("--pleiades", action="store_true")
     chosen = parser.parse_args()
     print("| surface | object and views | median (m) | 90 % (m) | matched |\n|---|---|---|---|---|")
-    for part, rows in ((chosen.town, town_rows), (chosen.pleiades, pleiades_rows)):
+    for part, rows in (
+        (chosen.town, lambda: town_rows(chosen.angle or ANGLES)),
+        (chosen.pleiades, pleiades_rows),
+    ):
         if part:
             for text in rows():
                 print(text, flush=True)
