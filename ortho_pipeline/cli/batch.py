@@ -56,7 +56,7 @@ class _Shard(click.ParamType):
     "--threads",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Threads per scene.  [default: the cores divided by the jobs]",
+    help="Threads per scene.  [default: cores per job]",
 )
 @click.option(
     "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Memory per scene."

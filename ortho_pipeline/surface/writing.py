@@ -12,7 +12,7 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.geodesy.crs import Vertical
-from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.surface.base import Array, Surface
 
 #: Least step (degrees) of a coarse DEM, an arc second, and most posts along a side.

@@ -11,7 +11,7 @@ from pair import LAT, LON, PIXEL, Pair
 
 import ortho_pipeline as op
 from ortho_pipeline import commands
-from ortho_pipeline.commands.heights.surfaces import open_surface
+from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.errors import CoverageError, DatumError, InputError
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.surface.accuracy import typical_sigma

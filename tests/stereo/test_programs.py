@@ -17,7 +17,7 @@ from test_block_export import ground_of
 import ortho_pipeline as op
 from ortho_pipeline import commands
 from ortho_pipeline.commands.block import adjust
-from ortho_pipeline.commands.heights.surfaces import open_surface
+from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.surface.writing import write_dem
