@@ -243,7 +243,7 @@ def _prepared(dsm: Path, folder: Path) -> tuple[np.ndarray, np.ndarray, tuple[fl
 def _by_relief(
     label: str, angle: str, a: np.ndarray, b: np.ndarray, heights: np.ndarray, coarse: np.ndarray
 ) -> Iterator[str]:
-    half, reach, classes = 10, 16, (0.0, 2.0, 5.0, 10.0, 30.0)
+    half, reach, classes = 10, 16, (0.0, 2.0, 5.0, 10.0)
     moved: dict[int, list[np.ndarray]] = {number: [] for number in range(len(classes) - 1)}
     tried = dict.fromkeys(moved, 0)
     for row in range(40, heights.shape[0] - 40, 24):

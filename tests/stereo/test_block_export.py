@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 from pathlib import Path
 from xml.etree import ElementTree
@@ -11,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_csm.files import read_csm
 from osgeo import gdal
 from pair import BIAS, LAT, LON, SIZE, Pair
 
@@ -19,6 +21,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.errors import CoverageError, InputError, PluginError
 from ortho_pipeline.exchange.rpc import read_rpc
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import BlockFormat, hookimpl
 from ortho_pipeline.host import Host
 from ortho_pipeline.options import BlockOptions, SurfaceOptions
@@ -103,6 +106,20 @@ def test_asp_gets_a_script_and_cameras_as_its_own_writer_makes_them(pair: Pair, 
         assert len(image.findtext(f"{name}COEFList/{name}COEF", "").split()) == 20
 
 
+def test_asp_gets_states_of_rigorous_models(sample: Path, tmp_path: Path) -> None:
+    folder, out = sample / "cartosat", tmp_path / "out"
+    images = [folder / "BANDF.tif", folder / "BANDA.tif"]
+    done = adjust(images, out, BlockOptions(points=folder / "points.csv", model="pushbroom"), export=["asp"])
+    stereo = next(line for line in done.files["asp"].read_text().splitlines() if line.startswith("parallel_stereo"))
+    assert "-t csm" in stereo
+    assert "BANDF_csm.json BANDA_csm.json" in stereo
+    for name in ("BANDF", "BANDA"):
+        model, state = op.load_model(done.files[f"{name} model"]), read_csm(out / f"{name}_csm.json")
+        ground = ground_of(model)
+        seen = state.ground_to_image(ground_transform(model.crs, state.crs)(ground))
+        np.testing.assert_allclose(seen, model.ground_to_image(ground), rtol=0, atol=1e-6)
+
+
 def test_images_that_look_like_maps_are_given_without_their_georeference(pair: Pair, tmp_path: Path) -> None:
     pair.georeference()
     done = adjust(pair.images, tmp_path / "out", BlockOptions(points=pair.points()), export=["cars"])
@@ -119,7 +136,14 @@ def test_the_command_takes_several_programs_and_says_what_to_run(pair: Pair, tmp
     done = CliRunner().invoke(cli, [*words, "--export", "cars,asp", "--export", "s2p"])
     assert done.exit_code == 0, done.output
     assert f"CARS 1: `cars {tmp_path / 'out' / 'cars.json'}`" in done.output
-    assert "aft and fore: 28" in done.output.replace("27.", "28.") or "degrees apart" in done.output
+    directions = []
+    for rpc in pair.rpcs.values():
+        low, high = rpc.image_to_ground([[150.0, 150.0], [150.0, 150.0]], np.array([200.0, 800.0]))
+        directions.append((high - low) * [111_320 * np.cos(np.radians(LAT)), 110_850, 1])
+    cosine = directions[0] @ directions[1] / np.prod([np.linalg.norm(one) for one in directions])
+    said = re.search(r"Stereo pair aft and fore: (\S+) degrees apart", done.output)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(np.degrees(np.arccos(cosine)), abs=0.2)
     assert {"cars.json", "asp.sh", "s2p.json"} <= set(os.listdir(tmp_path / "out"))
     listed = " ".join(CliRunner().invoke(cli, ["adjust", "--help"]).stdout.split())
     assert "asp (Ames Stereo Pipeline 3), cars (CARS 1), s2p (s2p)" in listed
