@@ -21,6 +21,7 @@ from ortho_pipeline.cli.printing import print_result, progress
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.stores.delivery import address_of
 
 _models = click.option(
     "--models",
@@ -88,8 +89,14 @@ def adjust(
             field="orthos",
             remedy=Text("leave it out, or add ", Setting("orthos")),
         )
-    command = click.get_current_context().meta["command"]
     programs = [name.strip() for text in export for name in text.split(",")]
+    if programs and address_of(folder) is not None:
+        raise InputError(
+            "stereo programs read images and models from disk",
+            field="export",
+            remedy=Text("give a folder on disk, or leave out ", Setting("export")),
+        )
+    command = click.get_current_context().meta["command"]
     asked = output if orthos else None
     with progress() as shown:
         result = blocks.adjust(

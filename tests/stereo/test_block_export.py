@@ -175,6 +175,13 @@ def test_an_unknown_program_is_refused_before_any_work(pair: Pair, tmp_path: Pat
     assert "asp, cars, s2p" in str(caught.value.remedy)
 
 
+def test_an_export_into_a_store_of_objects_is_refused() -> None:
+    words = ["adjust", "a.tif", "b.tif", "--points", "p.csv", "--export", "cars", "-o", "s3://bucket/block"]
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == 2
+    assert "read images and models from disk" in done.output
+
+
 def test_asp_refuses_images_of_several_bands(tmp_path: Path) -> None:
     pair = Pair(tmp_path / "pair", bands=3)
     with pytest.raises(InputError, match="one band, but aft has 3"):
