@@ -21,7 +21,6 @@ from ortho_pipeline.cli.printing import print_result, progress
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.stores.delivery import address_of
 
 _models = click.option(
     "--models",
@@ -82,6 +81,7 @@ def adjust(
     orthos of all images. --export writes what stereo programs need to compute a surface.
     """
     from ortho_pipeline.commands import block as blocks
+    from ortho_pipeline.stores.delivery import address_of
 
     if not orthos and output != OutputOptions():
         raise InputError(
