@@ -1,11 +1,11 @@
 """The configurations that CARS and s2p take, from a `BlockExport`.
 
-=======  ==================  ==========================  =====================================================
-program  models              pixel origin in them        paths are relative to
-=======  ==================  ==========================  =====================================================
-CARS     OTB keyword list    centre of first pixel (0,0) the configuration; outputs: the folder of the caller
-s2p      RPC text            centre (0, 0)               the configuration
-=======  ==================  ==========================  =====================================================
+=======  ================  ============================  ==================================================
+program  models            pixel origin in them          paths are relative to
+=======  ================  ============================  ==================================================
+CARS     OTB keyword list  centre of first pixel (0, 0)  the configuration; outputs: the folder of the caller
+s2p      RPC text          centre of first pixel (0, 0)  the configuration
+=======  ================  ============================  ==================================================
 
 Both compute heights above the WGS 84 ellipsoid.
 
