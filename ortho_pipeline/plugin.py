@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.observations.prior import Prior as Prior
     from ortho_pipeline.estimation.observations.prior import priors_at as priors_at
     from ortho_pipeline.estimation.spatial.correlation import analyse_fit as analyse_fit
+    from ortho_pipeline.exchange.block_export import BlockExport as BlockExport
     from ortho_pipeline.exchange.export import Export as Export
     from ortho_pipeline.exchange.rpc import export_rpc as export_rpc
     from ortho_pipeline.exchange.rpc import has_rpc as has_rpc
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.geodesy.ellipsoid import geocentric as geocentric
     from ortho_pipeline.geodesy.ellipsoid import geodetic as geodetic
     from ortho_pipeline.geodesy.ellipsoid import orbital_from_ecef as orbital_from_ecef
+    from ortho_pipeline.hookspecs import BlockFormat as BlockFormat
     from ortho_pipeline.hookspecs import Format as Format
     from ortho_pipeline.hookspecs import Piece as Piece
     from ortho_pipeline.hookspecs import Scene as Scene
@@ -167,6 +169,7 @@ _NAMES = {
         "priors_at",
     ),
     "estimation.spatial.correlation": ("analyse_fit",),
+    "exchange.block_export": ("BlockExport",),
     "exchange.export": ("Export",),
     "exchange.rpc": (
         "export_rpc",
@@ -208,6 +211,7 @@ _NAMES = {
         "orbital_from_ecef",
     ),
     "hookspecs": (
+        "BlockFormat",
         "Format",
         "Piece",
         "Scene",

@@ -24,6 +24,7 @@ from ortho_pipeline.exchange.rpc import (
     write_tagged_copy,
     write_vrt,
 )
+from ortho_pipeline.exchange.rpc_files import write_geom, write_rpc_xml
 from ortho_pipeline.exchange.rpc_fit import domain_box, fit_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import SensorModel, as_ground
@@ -147,7 +148,19 @@ def test_crop_and_scale_move_the_model_as_the_pixels():
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("writer", "name"), [(write_rpc_txt, "a_RPC.TXT"), (write_rpb, "a.RPB")])
+def write_sized_geom(rpc: RPC, path: Path) -> None:
+    write_geom(rpc, (1200, 900), path)
+
+
+@pytest.mark.parametrize(
+    ("writer", "name"),
+    [
+        (write_rpc_txt, "a_RPC.TXT"),
+        (write_rpb, "a.RPB"),
+        (write_sized_geom, "a.geom"),
+        (write_rpc_xml, "a_rpc.xml"),
+    ],
+)
 def test_text_is_read_again_to_the_last_bit(tmp_path, writer, name):
     for seed in range(20):
         rpc = make_rpc(seed, err_rand=None if seed % 2 else 1 / 3, col_off=seed * 7001.1 + 1.1)
