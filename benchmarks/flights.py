@@ -5,8 +5,8 @@ python benchmarks/flights.py --photos 100        larger ones
 python benchmarks/flights.py --kinds rtk,focal   some kinds
 
 The truth is in ECEF, by PROJ and the formulas of this file; it shares no code with the sensor models. The estimator
-sees the photos' tags, the ties and the DEM only. "wrong" are flights whose orthos are off by more than `WRONG` pixels
-(RMS) without an error; "naive" is the ortho by the tags alone, on the same DEM.
+sees the photos' tags, the ties and the DEM only. "wrong" are flights that raise no error although neighbouring orthos
+do not fit, or the block is farther off than it claims; "naive" are the orthos by the tags alone, on the same DEM.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ MIDDLE, GROUND_HEIGHT = (33.1, 39.4), 900.0
 #: Standard deviation (px) of ties, share of ties with a gross error in one ray, its size (px), sigma of the DEM (m).
 TIE, OUTLIERS, GROSS, DEM_SIGMA = 0.3, 0.1, 30.0, 0.3
 PARTS = {"plan": ("X_L", "Y_L"), "up": ("Z_L",), "tilt": ("omega", "phi"), "head": ("kappa",)}
-#: RMS (px) of the orthos of a flight beyond which it is wrong.
-WRONG = 5.0
+#: A flight is wrong if its neighbouring orthos are apart by more than this (px, RMS), or its mean position by so many
+#: of the sigmas that it claims.
+WRONG, FAR = 1.0, 4.0
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_MAP = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:32636", always_xy=True)
 
@@ -139,7 +140,7 @@ def fly(kind: Kind, photos: int, seed: int, folder: Path) -> Flight:
         place = np.array([MIDDLE[0] + east / 86_000.0, MIDDLE[1] + north / 111_000.0, GROUND_HEIGHT + ABOVE])
         angles = np.add([180.0 * (strip % 2), -90.0, 0.0], random.normal(0, 2, 3))
         poses.append((place, turn_of(place, *angles)))
-        off = random.normal(0, kind.position, 3) + (0, 0, kind.datum)
+        off = np.add(random.normal(0, kind.position, 3), [0.0, 0.0, kind.datum])
         tags.append((place + off / (86_000.0, 111_000.0, 1.0), angles + random.normal(0, kind.angle, 3)))
     positions, turns = to_ecef(np.array([place for place, _ in poses])), np.array([turn for _, turn in poses])
     names = [f"p{k:03d}" for k in range(photos)]
@@ -223,16 +224,45 @@ def write_dem(path: Path, waves: Array, random: np.random.Generator) -> DemSurfa
 
 
 def off_by(flight: Flight, models: Any) -> Array:
-    """Return how far (px) true ground is from where each model shows it: ``(photos, n, 2)``, the error of an ortho."""
+    """Return how far (m, east and north) each ortho is from the true ground: ``(photos, n, 2)``; NaN where unseen.
+
+    It is where a model shows a ground point, from where the photo has it, turned into metres by the true photo.
+    """
+    lonlat = np.array(MIDDLE) + np.random.default_rng(0).uniform(-80, 80, (400, 2)) / (86_000.0, 111_000.0)
+    steps = np.array([[0.0, 0.0], [1.0 / 86_000.0, 0.0], [0.0, 1.0 / 111_000.0]])
+    places = [np.column_stack([lonlat + step, height(flight.waves, *(lonlat + step).T)]) for step in steps]
     found = []
-    lonlat = np.array(MIDDLE) + np.random.default_rng(0).uniform(-150, 150, (4000, 2)) / (86_000.0, 111_000.0)
-    places = np.column_stack([lonlat, height(flight.waves, *lonlat.T)])
-    ground = to_ecef(places)
     for name, position, turn in zip(flight.scenes, flight.positions, flight.turns, strict=True):
-        truth = seen(position, turn, ground)
-        inside = np.isfinite(truth).all(axis=1)
-        found.append(models[name].ground_to_image(places[inside]) - truth[inside])
-    return np.concatenate(found)
+        at, east, north = (seen(position, turn, to_ecef(place)) for place in places)
+        by_metre = np.stack([east - at, north - at], axis=2)
+        away = models[name].ground_to_image(places[0]) - at
+        away[~np.isfinite(by_metre).all(axis=(1, 2))] = np.nan
+        by_metre[~np.isfinite(by_metre)] = 1.0
+        found.append(-np.einsum("nij,nj->ni", np.linalg.pinv(by_metre), away))
+    return np.array(found)
+
+
+def figures(off: Array) -> tuple[float, float]:
+    """Return the RMS (px per axis) of orthos, and of neighbours on the ground that both show."""
+    pixel = ABOVE / FOCAL
+    mean = np.nanmean(off, axis=0)
+    counts = np.isfinite(off[:, :, 0]).sum(axis=0)
+    apart = (off - mean)[:, counts > 1] * np.sqrt(counts / np.maximum(counts - 1, 1))[None, counts > 1, None]
+    return float(np.sqrt(np.nanmean(off**2))) / pixel, float(np.sqrt(2 * np.nanmean(apart**2))) / pixel
+
+
+def of_block(flight: Flight, fit: BlockFit) -> float:
+    """Return the error of the mean position of the block over its sigma, the worst of east, north, up."""
+    worst = 0.0
+    for axis, parameter in enumerate(("X_L", "Y_L", "Z_L")):
+        picked = np.array([name == parameter for _, name in fit.parameters]) / len(flight.scenes)
+        errors = []
+        for name, position in zip(flight.scenes, flight.positions, strict=True):
+            model = fit.models[name]
+            axes = east_north_down(*model.origin[:2])[[1, 0, 2]] * np.array([[1.0], [1.0], [-1.0]])
+            errors.append(model.exterior[axis] - (axes @ (position - to_ecef(np.array([model.origin]))[0]))[axis])
+        worst = max(worst, abs(np.mean(errors)) / float(np.sqrt(picked @ fit.covariance @ picked)))
+    return worst
 
 
 def over_sigmas(flight: Flight, fit: BlockFit) -> dict[str, list[float]]:
@@ -266,13 +296,14 @@ def trial(kind: Kind, photos: int, seed: int) -> dict[str, Any]:
         flight = fly(kind, photos, seed, Path(folder))
         models = {name: scene.model for name, scene in flight.scenes.items()}
         priors = {name: scene.priors for name, scene in flight.scenes.items()}
-        naive = float(np.sqrt(np.nanmean(off_by(flight, models) ** 2)))
+        naive = figures(off_by(flight, models))
         try:
             fit = adjust(models, flight.points, priors=priors, heights=DemHeights(flight.dem))
         except OrthoError as error:
-            return {"naive": naive, "error": f"{type(error).__name__}: {error}"[:100]}
-        found = float(np.sqrt(np.nanmean(off_by(flight, fit.models) ** 2)))
-        return {"naive": naive, "found": found, "sigma0": fit.sigma0, "spread": over_sigmas(flight, fit)}
+            return {"naive": naive, "error": f"{type(error).__name__}: {error}"[:100].splitlines()[0]}
+        found, shift, spread = figures(off_by(flight, fit.models)), of_block(flight, fit), over_sigmas(flight, fit)
+        wrong = found[1] > WRONG or shift > FAR
+        return {"naive": naive, "found": found, "shift": shift, "wrong": wrong, "sigma0": fit.sigma0, "spread": spread}
 
 
 def main() -> int:
@@ -281,7 +312,9 @@ def main() -> int:
     parser.add_argument("--flights", type=int, default=20)
     parser.add_argument("--kinds", default=",".join(KINDS))
     given = parser.parse_args()
-    print("kind        converged  wrong  ortho px  naive px  sigma0  error / sigma: position, height, tilt, heading")
+    print(
+        "kind       converged wrong  ortho px (naive)  neighbours px (naive)  sigma0  shift/sigma  plan, up, tilt, head"
+    )
     for name in given.kinds.split(","):
         trials = [trial(KINDS[name], given.photos, seed) for seed in range(given.flights)]
         good = [one for one in trials if "found" in one]
@@ -294,10 +327,14 @@ def main() -> int:
             part: np.sqrt(np.mean([v**2 for one in good for parameter in of for v in one["spread"][parameter]]))
             for part, of in PARTS.items()
         }
+        ortho, apart, naive_ortho, naive_apart = (
+            np.median([one[key][k] for one in good]) for key in ("found", "naive") for k in (0, 1)
+        )
         print(
-            f"{name:10}  {len(good):4d}/{len(trials)}  {sum(one['found'] > WRONG for one in good):5d}  "
-            f"{np.median([one['found'] for one in good]):8.2f}  {np.median([one['naive'] for one in trials]):8.1f}  "
-            f"{np.median([one['sigma0'] for one in good]):6.2f}  "
+            f"{name:10} {len(good):4d}/{len(trials):<4d} {sum(one['wrong'] for one in good):5d}  "
+            f"{ortho:8.2f} ({naive_ortho:5.1f})"
+            f"  {apart:13.2f} ({naive_apart:5.1f})  {np.median([one['sigma0'] for one in good]):6.2f}"
+            f"  {np.sqrt(np.mean([one['shift'] ** 2 for one in good])):11.2f}  "
             + ", ".join(f"{value:.2f}" for value in spread.values()),
             flush=True,
         )

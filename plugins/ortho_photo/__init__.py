@@ -39,15 +39,20 @@ OPTIONS = {
     "pitch": "where the pitch of the camera is zero: horizon or nadir (default: as the maker's tags define it)",
     "sigmas": "standard deviations of position and angles: metres,degrees (default: as the tags state)",
     "heights": "lowest and highest ground, ellipsoidal metres: low,high",
-    "calibrate": "whether an adjustment estimates the focal length of each photo: yes (default) or no",
+    "calibrate": "whether an adjustment estimates the focal length of photos with exact heights: yes (default) or no",
 }
 UNKNOWN = "unknown"
+#: The error of a focal length is common to all photos of a flight. Each counts less by this: otherwise thirty of them
+#: would seem to know it better by the root of thirty.
+SHARED = 5.0
 #: The parameter of the interior orientation that an adjustment may change.
 FOCAL = "focal_length"
 #: Standard deviation (m) of heights of an unknown datum: geoid and ellipsoid are within twice of it nearly everywhere.
 DATUM_SIGMA = 50.0
 #: A camera that looks flatter than this (degrees from straight down) sees the horizon.
 FLATTEST_DEG = 85.0
+#: Height (m) above ground of a flight whose tags do not state it.
+_USUAL = 100.0
 #: Lowest and highest ground below a camera where nothing states its heights: m, and parts of the height above take-off.
 _BELOW, _OF_RELATIVE = (500.0, 20.0), (2.0, 0.2)
 
@@ -86,8 +91,8 @@ def open_scene(
     camera = camera_of(tags, *size, _width(sensor_width))
     stated = vertical or pose.datum or UNKNOWN
     model = _model(camera.interior, pose, stated, heights, tags)
-    if calibrate == "yes":
-        model = replace(model, free=(*model.free, FOCAL))
+    priors = _priors(model, pose, camera, stated, sigmas, _above_ground(tags) if calibrate == "yes" else 0.0)
+    model = replace(model, free=tuple(priors))
     if not (model.sees_ground and pose.tilt_deg < FLATTEST_DEG):
         other = HORIZON if pose.convention == NADIR else NADIR
         again = Setting("scene.sensor_options", other, key="pitch")
@@ -106,7 +111,7 @@ def open_scene(
         model_source="EXIF and XMP",
         facts=_facts(tags, pose, model, camera, stated),
         warnings=tuple(warnings),
-        priors=_priors(model, pose, camera, stated, sigmas),
+        priors=priors,
     )
 
 
@@ -135,7 +140,14 @@ def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> 
     return low, high
 
 
-def _priors(model: FrameCamera, pose: Pose, camera: Camera, stated: str, sigmas: str | None) -> dict[str, Prior]:
+def _priors(
+    model: FrameCamera, pose: Pose, camera: Camera, stated: str, sigmas: str | None, above_ground: float
+) -> dict[str, Prior]:
+    """Return what is known of the pose, and of the focal length where an adjustment can tell it from the height.
+
+    Over flat ground a wrong focal length looks like a wrong height. So it is a parameter only if the height is known
+    better than it (`above_ground`, m, times its sigma); else its error is a part of that of the height.
+    """
     (plan, height), angle = pose.sigmas, ANGLE
     if sigmas is not None:
         plan, angle = _pair(sigmas)
@@ -145,9 +157,17 @@ def _priors(model: FrameCamera, pose: Pose, camera: Camera, stated: str, sigmas:
                 f"{sigmas!r} are not two standard deviations", field="sigmas", remedy="give metres,degrees"
             )
     known = exterior_sigmas(plan, math.radians(angle))
-    known["Z_L"] = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
-    known[FOCAL] = camera.sigma * model.interior.focal_length
-    return priors_at(model, {name: sigma for name, sigma in known.items() if name in model.param_names})
+    height = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
+    if height < camera.sigma * above_ground:
+        focal = model.interior.focal_length
+        return {**priors_at(model, {**known, "Z_L": height}), FOCAL: Prior(focal, SHARED * camera.sigma * focal)}
+    known["Z_L"] = math.hypot(height, SHARED * camera.sigma * above_ground)
+    return priors_at(model, known)
+
+
+def _above_ground(tags: Tags) -> float:
+    """Return about how high (m) a photo was taken."""
+    return tags.positive("drone-dji:RelativeAltitude") or _USUAL
 
 
 def _unknown_datum(pose: Pose) -> Notice:

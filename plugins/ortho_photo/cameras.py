@@ -31,9 +31,8 @@ SENSOR_MM = {
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 #: Width (mm) of a frame of 35 mm film.
 _FILM_MM = 36.0
-#: Standard deviation of focal lengths, in parts: of a maker's calibration, and of a nominal length. All photos of a
-#: flight share the second, which is within 2 %; each counts less, because thirty of them together then have 2 %.
-CALIBRATED, NOMINAL = 0.005, 0.1
+#: Standard deviation of focal lengths, in parts: of a maker's calibration, and of a nominal length.
+CALIBRATED, NOMINAL = 0.005, 0.02
 _PIXEL = 1e-6
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
 

@@ -23,7 +23,8 @@ PLACE, ALTITUDE = (33.26, 39.5), 1000.5
 
 
 def opened(path: Path, **options: str) -> Any:
-    return open_scene(path, SceneOptions(sensor_options={"vertical": "ellipsoid", **options}))
+    given = {"vertical": "ellipsoid", "calibrate": "no", **options}
+    return open_scene(path, SceneOptions(sensor_options=given))
 
 
 def without(tags: dict[str, str], *names: str) -> dict[str, str]:
@@ -133,7 +134,8 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     path = photo(tmp_path / "a.tif")
     unknown = open_scene(path)
     assert [notice.code for notice in unknown.notices] == ["datum-unknown"]
-    assert unknown.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, DATUM_SIGMA))
+    # The unknown datum, the height by air pressure, and a focal length within 2 % of 100 m, for one of thirty photos.
+    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 10.0**2))
     assert unknown.model.perspective_centre[2] == pytest.approx(ALTITUDE)
     above_geoid = opened(path, vertical="egm96")
     undulation = float(Vertical.parse("egm96").undulation(np.array([33.26]), np.array([39.5]))[0])
@@ -148,7 +150,7 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     ("tags", "wanted"),
     [
         ({}, [3.0, 3.0, 10.0]),
-        ({"drone-dji:RtkStdLon": "0.05", "drone-dji:RtkStdLat": "0.04", "drone-dji:RtkStdHgt": ".1"}, [0.05, 0.05, 0.1]),
+        ({"drone-dji:RtkStdLon": ".05", "drone-dji:RtkStdLat": ".04", "drone-dji:RtkStdHgt": ".1"}, [0.05, 0.05, 0.1]),
         ({"drone-dji:RtkStdLon": "0.002", "drone-dji:RtkStdLat": "0.002", "drone-dji:RtkStdHgt": "0.003"}, [0.02] * 3),
         ({"drone-dji:RtkStdLon": "0", "drone-dji:RtkStdLat": "0", "drone-dji:RtkStdHgt": "0"}, [3.0, 3.0, 10.0]),
         ({"Camera:GPSXYAccuracy": "1.5", "Camera:GPSZAccuracy": "5/2"}, [1.5, 1.5, 2.5]),
@@ -161,6 +163,21 @@ def test_sigmas_are_those_of_the_tags(tmp_path, tags, wanted):
     given = opened(tmp_path / "a.tif", sigmas="0.5,1")
     assert sigmas(given) == pytest.approx([0.5] * 3)
     assert given.priors["kappa"].sigma == pytest.approx(math.radians(1.0))
+
+
+def test_the_focal_length_is_a_parameter_where_the_height_is_known_better(tmp_path):
+    rtk = {"drone-dji:RtkStdLon": "0.02", "drone-dji:RtkStdLat": "0.02", "drone-dji:RtkStdHgt": "0.03"}
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, **rtk}), calibrate="yes")
+    assert scene.model.param_names[-1] == "focal_length"
+    assert scene.priors["focal_length"].sigma == pytest.approx(0.1 * scene.model.interior.focal_length)
+    assert scene.priors["Z_L"].sigma == pytest.approx(0.03)
+    data = "2018-09-07;400,400,0,0,0,0,0,0,0"
+    calibrated = opened(photo(tmp_path / "b.tif", xmp={**DJI, **rtk, "drone-dji:DewarpData": data}), calibrate="yes")
+    assert calibrated.priors["focal_length"].sigma == pytest.approx(5 * 0.005 * 400e-6)
+    # A height within 10 m says less than a focal length within 2 % of 100 m; the height has both errors.
+    plain = opened(photo(tmp_path / "c.tif"), calibrate="yes")
+    assert plain.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
+    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 10.0))
 
 
 # -- cameras ---------------------------------------------------------------------------------------------------------
@@ -255,7 +272,9 @@ def test_damaged_or_missing_tags_are_one_error_each(tmp_path, exif, xmp, message
     assert error.value.remedy
 
 
-@pytest.mark.parametrize(("option", "value"), [("sensor_width", "x"), ("sigmas", "1"), ("heights", "9,1")])
+@pytest.mark.parametrize(
+    ("option", "value"), [("sensor_width", "x"), ("sigmas", "1"), ("heights", "9,1"), ("calibrate", "x")]
+)
 def test_wrong_options_are_errors(tmp_path, option, value):
     with pytest.raises(InputError) as error:
         opened(photo(tmp_path / "a.tif"), **{option: value})
