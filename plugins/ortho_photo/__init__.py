@@ -42,9 +42,6 @@ OPTIONS = {
     "calibrate": "whether an adjustment estimates the focal length of photos with exact heights: yes (default) or no",
 }
 UNKNOWN = "unknown"
-#: The error of a focal length is common to all photos of a flight. Each counts less by this: otherwise thirty of them
-#: would seem to know it better by the root of thirty.
-SHARED = 5.0
 #: The parameter of the interior orientation that an adjustment may change.
 FOCAL = "focal_length"
 #: Standard deviation (m) of heights of an unknown datum: geoid and ellipsoid are within twice of it nearly everywhere.
@@ -160,8 +157,8 @@ def _priors(
     height = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
     if height < camera.sigma * above_ground:
         focal = model.interior.focal_length
-        return {**priors_at(model, {**known, "Z_L": height}), FOCAL: Prior(focal, SHARED * camera.sigma * focal)}
-    known["Z_L"] = math.hypot(height, SHARED * camera.sigma * above_ground)
+        return {**priors_at(model, {**known, "Z_L": height}), FOCAL: Prior(focal, camera.sigma * focal)}
+    known["Z_L"] = math.hypot(height, camera.sigma * above_ground)
     return priors_at(model, known)
 
 

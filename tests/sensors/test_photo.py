@@ -134,8 +134,8 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     path = photo(tmp_path / "a.tif")
     unknown = open_scene(path)
     assert [notice.code for notice in unknown.notices] == ["datum-unknown"]
-    # The unknown datum, the height by air pressure, and a focal length within 2 % of 100 m, for one of thirty photos.
-    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 10.0**2))
+    # The unknown datum, the height by air pressure, and a focal length within 2 % of 100 m.
+    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 2.0**2))
     assert unknown.model.perspective_centre[2] == pytest.approx(ALTITUDE)
     above_geoid = opened(path, vertical="egm96")
     undulation = float(Vertical.parse("egm96").undulation(np.array([33.26]), np.array([39.5]))[0])
@@ -169,15 +169,15 @@ def test_the_focal_length_is_a_parameter_where_the_height_is_known_better(tmp_pa
     rtk = {"drone-dji:RtkStdLon": "0.02", "drone-dji:RtkStdLat": "0.02", "drone-dji:RtkStdHgt": "0.03"}
     scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, **rtk}), calibrate="yes")
     assert scene.model.param_names[-1] == "focal_length"
-    assert scene.priors["focal_length"].sigma == pytest.approx(0.1 * scene.model.interior.focal_length)
+    assert scene.priors["focal_length"].sigma == pytest.approx(0.02 * scene.model.interior.focal_length)
     assert scene.priors["Z_L"].sigma == pytest.approx(0.03)
     data = "2018-09-07;400,400,0,0,0,0,0,0,0"
     calibrated = opened(photo(tmp_path / "b.tif", xmp={**DJI, **rtk, "drone-dji:DewarpData": data}), calibrate="yes")
-    assert calibrated.priors["focal_length"].sigma == pytest.approx(5 * 0.005 * 400e-6)
+    assert calibrated.priors["focal_length"].sigma == pytest.approx(0.005 * 400e-6)
     # A height within 10 m says less than a focal length within 2 % of 100 m; the height has both errors.
     plain = opened(photo(tmp_path / "c.tif"), calibrate="yes")
     assert plain.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
-    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 10.0))
+    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 2.0))
 
 
 # -- cameras ---------------------------------------------------------------------------------------------------------
