@@ -42,6 +42,9 @@ OPTIONS = {
     "calibrate": "whether an adjustment estimates the focal length of photos with exact heights: yes (default) or no",
 }
 UNKNOWN = "unknown"
+#: The error of a focal length is common to all photos of a flight, but the height that it looks like is known of each. So
+#: each counts less by this: otherwise thirty would seem to know it better by the root of thirty.
+SHARED = 5.0
 #: The parameter of the interior orientation that an adjustment may change.
 FOCAL = "focal_length"
 #: Standard deviation (m) of heights of an unknown datum: geoid and ellipsoid are within twice of it nearly everywhere.
@@ -158,7 +161,7 @@ def _priors(
     if height < camera.sigma * above_ground:
         focal = model.interior.focal_length
         return {**priors_at(model, {**known, "Z_L": height}), FOCAL: Prior(focal, camera.sigma * focal)}
-    known["Z_L"] = math.hypot(height, camera.sigma * above_ground)
+    known["Z_L"] = math.hypot(height, SHARED * camera.sigma * above_ground)
     return priors_at(model, known)
 
 

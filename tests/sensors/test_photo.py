@@ -134,8 +134,8 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     path = photo(tmp_path / "a.tif")
     unknown = open_scene(path)
     assert [notice.code for notice in unknown.notices] == ["datum-unknown"]
-    # The unknown datum, the height by air pressure, and a focal length within 2 % of 100 m.
-    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 2.0**2))
+    # The unknown datum, the height by air pressure, and five times a focal length within 2 % of 100 m.
+    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 10.0**2))
     assert unknown.model.perspective_centre[2] == pytest.approx(ALTITUDE)
     above_geoid = opened(path, vertical="egm96")
     undulation = float(Vertical.parse("egm96").undulation(np.array([33.26]), np.array([39.5]))[0])
@@ -177,7 +177,7 @@ def test_the_focal_length_is_a_parameter_where_the_height_is_known_better(tmp_pa
     # A height within 10 m says less than a focal length within 2 % of 100 m; the height has both errors.
     plain = opened(photo(tmp_path / "c.tif"), calibrate="yes")
     assert plain.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
-    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 2.0))
+    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 10.0))
 
 
 # -- cameras ---------------------------------------------------------------------------------------------------------
