@@ -245,8 +245,8 @@ def off_by(flight: Flight, models: Any) -> Array:
 def figures(off: Array) -> tuple[float, float]:
     """Return the RMS (px per axis) of orthos, and of neighbours on the ground that both show."""
     pixel = ABOVE / FOCAL
-    mean = np.nanmean(off, axis=0)
     counts = np.isfinite(off[:, :, 0]).sum(axis=0)
+    mean = np.nansum(off, axis=0) / np.maximum(counts, 1)[:, None]
     apart = (off - mean)[:, counts > 1] * np.sqrt(counts / np.maximum(counts - 1, 1))[None, counts > 1, None]
     return float(np.sqrt(np.nanmean(off**2))) / pixel, float(np.sqrt(2 * np.nanmean(apart**2))) / pixel
 

@@ -42,8 +42,8 @@ OPTIONS = {
     "calibrate": "whether an adjustment estimates the focal length of photos with exact heights: yes (default) or no",
 }
 UNKNOWN = "unknown"
-#: The error of a focal length is common to all photos of a flight, but the height that it looks like is known of each. So
-#: each counts less by this: otherwise thirty would seem to know it better by the root of thirty.
+#: All photos of a flight share the error of a focal length, but the height that it looks like is known of each. So each
+#: counts less by this: otherwise thirty would seem to know it better by the root of thirty.
 SHARED = 5.0
 #: The parameter of the interior orientation that an adjustment may change.
 FOCAL = "focal_length"

@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from ortho_photo import DATUM_SIGMA
 from photos import DJI, EXIF, jpeg, photo
 
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.commands.survey.folder import images_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.options import SceneOptions
@@ -279,3 +282,27 @@ def test_wrong_options_are_errors(tmp_path, option, value):
     with pytest.raises(InputError) as error:
         opened(photo(tmp_path / "a.tif"), **{option: value})
     assert error.value.field == option
+
+
+def test_a_folder_stands_for_its_photos_and_says_what_they_lack(tmp_path):
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    one, _ = photo(folder / "a.tif"), photo(folder / "b.tif", xmp=without(DJI, "Gimbal"))
+    with pytest.raises(InputError, match=r"1 scene, .*b.tif: .*no camera angles") as error:
+        images_of([folder], SceneOptions())
+    assert "ortho info" in error.value.remedy
+    other = photo(folder / "c.tif")
+    assert images_of([folder], SceneOptions()) == [one, other]
+    assert images_of([one], SceneOptions()) == [one]
+    shown = CliRunner().invoke(cli, ["info", str(folder)]).output
+    assert f"ortho adjust '{folder}' --ties auto" in shown
+    assert "no camera angles" in shown
+
+
+def test_photos_that_do_not_overlap_are_an_error(tmp_path):
+    far = {**EXIF, "GPSLongitude": "(33) (45) (0)"}
+    files = [str(photo(tmp_path / "a.tif")), str(photo(tmp_path / "b.tif", far, without(DJI, "Gps")))]
+    words = ["--sensor-option", "vertical=ellipsoid", "--ties", "auto", "--height", "900", "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(cli, ["adjust", *files, *words])
+    assert done.exit_code == 2
+    assert "no two scenes overlap" in done.output

@@ -64,7 +64,7 @@ def test_photos_by_their_tags_alone_fit_and_are_where_opendronemap_has_them(real
         tmp_path / "tags",
         BlockOptions(ties="auto"),
         SceneOptions(sensor="photo", sensor_options={"vertical": "ellipsoid"}),
-        match=MatchOptions(search=10.0),
+        match=MatchOptions(search=10.0, points=150),
         surface=surface,
         orthos=output,
     )
