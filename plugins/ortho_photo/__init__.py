@@ -173,7 +173,7 @@ def _above_ground(tags: Tags) -> float:
 def _unknown_datum(pose: Pose) -> Notice:
     text = Text(
         "the tags do not state the height datum of the camera. Its altitude counts as ellipsoidal, within "
-        f"{DATUM_SIGMA:.0f} m. `ortho adjust` with a DEM or control points estimates it. If you know the datum, add ",
+        f"{DATUM_SIGMA:.0f} m. An adjustment with a DEM or control points estimates it. If you know the datum, add ",
         Setting("scene.sensor_options", "DATUM", key="vertical"),
     )
     return Notice("datum-unknown", text, altitude_m=pose.altitude, sigma_m=DATUM_SIGMA)
