@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
 
 from ortho_pipeline import commands, load_model
+from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
 
@@ -58,8 +59,8 @@ def test_photos_by_their_tags_alone_fit_and_are_where_opendronemap_has_them(real
     project = real / "orthority" / "odm"
     images = sorted((project / "images").glob("*.tif"))
     surface = SurfaceOptions(dem=project / "odm_dem" / "dsm.tif", vertical="ellipsoid", fill="mask")
-    output = OutputOptions(crs=MAP, resolution=(0.15, 0.15))
-    commands.adjust(
+    output = OutputOptions(crs=MAP, resolution=0.15)
+    adjust(
         images,
         tmp_path / "tags",
         BlockOptions(ties="auto"),
