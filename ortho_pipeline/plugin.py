@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.files.folders import listing as listing
     from ortho_pipeline.files.locations import place as place
     from ortho_pipeline.files.xml_fields import XmlFields as XmlFields
+    from ortho_pipeline.files.xml_fields import parse_xml as parse_xml
     from ortho_pipeline.geodesy.crs import Vertical as Vertical
     from ortho_pipeline.geodesy.crs import ground_transform as ground_transform
     from ortho_pipeline.geodesy.crs import parse_crs as parse_crs
@@ -194,7 +195,10 @@ _NAMES = {
         "listing",
     ),
     "files.locations": ("place",),
-    "files.xml_fields": ("XmlFields",),
+    "files.xml_fields": (
+        "XmlFields",
+        "parse_xml",
+    ),
     "geodesy.crs": (
         "Vertical",
         "ground_transform",

@@ -75,10 +75,10 @@ def adjust(
 ) -> None:
     """Adjust several IMAGEs together (bundle adjustment).
 
-    The images may be a stereo pair or a block. The command writes a model and an RPC of each image, the ground points
-    with their sigmas, and one report. Points with ground coordinates are control or check points; the others tie the
-    images together. --ties auto and --reference find points by matching; both need heights. --orthos also makes the
-    orthos of all images. --export writes what stereo programs need to compute a surface.
+    The images may be a stereo pair, a block, or one folder of photos. The command writes a model and an RPC of each
+    image, the ground points with their sigmas, and one report. Points with ground coordinates are control or check
+    points; the others tie the images together. --ties auto and --reference find points by matching; both need heights.
+    --orthos also makes the orthos of all images. --export writes what stereo programs need to compute a surface.
     """
     from ortho_pipeline.commands import block as blocks
     from ortho_pipeline.stores.delivery import address_of

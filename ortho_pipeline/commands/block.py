@@ -38,6 +38,7 @@ from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
+from ortho_pipeline.commands.survey.folder import images_of
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Text, counted
@@ -82,7 +83,7 @@ def adjust(
     Parameters
     ----------
     images : sequence of path
-        Of one or many scenes; each is opened with its own sensor.
+        Of one or many scenes, each opened with its own sensor; or one folder with several.
     folder : path
         Folder of all outputs. Files of images are named by the stems of the images, after folders if stems are equal.
     scene : SceneOptions or sequence of SceneOptions
@@ -110,7 +111,7 @@ def adjust(
     InputError
         If an input or an option is wrong.
     """
-    labels = labels_of(images)
+    labels = labels_of(images := images_of(images, scene))
     files = _files(labels, Path(folder))
     of_orthos = {} if orthos is None else ortho_files(Path(folder), labels, orthos)
     scenes = scenes_of(images, scene, models)
