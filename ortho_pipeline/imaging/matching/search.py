@@ -113,12 +113,16 @@ def place(
     middle = (region[0] + region[2]) / 2, (region[1] + region[3]) / 2
     start = ImageCorrection.identity(view.model, "affine", middle)
     factor, radius = _coarsest(region, reach, base)
-    side = _chip_side(region, factor, 3)
-    shifts = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
-    alone = [shifted(start, -shift * factor) for shift in shifts]
+    alone = _shifts_alone(view, targets, region, start, (factor, radius))
     try:
         return _refined(view, targets, reach, base, region, (factor, radius), alone)
     except InputError as error:
+        # Under clouds, or in another season, few coarse chips may decide nothing; fine ones are more.
+        finest = base, max(_NEXT, math.ceil(reach / base) + 2)
+        if factor > base and finest[1] <= _COMFORTABLE:
+            with contextlib.suppress(InputError):
+                fine = _shifts_alone(view, targets, region, start, finest)
+                return _refined(view, targets, reach, base, region, finest, fine)
         if rotation_deg:
             turned = _turned(view, targets, region, start, (factor, radius), rotation_deg)
             refined = (_settled(view, targets, region, correction, factor) for correction in turned)
@@ -128,6 +132,16 @@ def place(
             with contextlib.suppress(InputError):
                 return _refined(view, targets, reach, base, region, (factor, radius), corrections)
         raise error from None
+
+
+def _shifts_alone(
+    view: SceneView, targets: Sequence[Target], region: Region, start: ImageCorrection, level: tuple[int, int]
+) -> list[ImageCorrection]:
+    """Return the corrections of the highest peaks over shifts, the highest first."""
+    factor, radius = level
+    side = _chip_side(region, factor, 3)
+    shifts = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
+    return [shifted(start, -shift * factor) for shift in shifts]
 
 
 def _turned(
