@@ -56,6 +56,6 @@ def test_the_control_of_a_raw_scene_corrects_the_ortho(block):
 def test_their_orthos_are_one_mosaic(block, tmp_path):
     orthos = [block / f"{name}_ortho.tif" for name in ("scene", "displaced")]
     document = run("mosaic", *orthos, "--order", "first-on-top", "-o", tmp_path / "mosaic.tif")
-    (seam,) = document["seams"]
+    (seam,) = document["mosaic"]["seams"]
     assert seam["rmse_px"] < 0.5
     assert np.hypot(*seam["median_px"]) < 0.1
