@@ -233,7 +233,7 @@ def test_recognises_one_none_or_several(tmp_path):
     assert Host([make_plugin(alpha, nobody)]).open_scene(image).sensor == "alpha"
     with pytest.raises(InputError, match=r"alpha, beta(.|\n)*scene.sensor"):
         Host([make_plugin(alpha, beta)]).open_scene(image)
-    with pytest.raises(InputError, match=r"no sensor recognises this image \(installed: nobody\)(.|\n)*scene.sensor"):
+    with pytest.raises(InputError, match=r"no sensor recognises this image(.|\n)*scene.sensor"):
         Host([make_plugin(nobody)]).open_scene(image)
     assert Host([make_plugin(alpha, beta)]).open_scene(image, "beta").sensor == "beta"
     with pytest.raises(InputError, match=r"unknown sensor 'gamma' \(installed: alpha, beta\)"):

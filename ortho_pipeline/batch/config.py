@@ -186,6 +186,12 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     InputError
         For anything that is not as the schema has it: the message names line, field and remedy.
     """
+    if os.path.isdir(path):
+        raise InputError(
+            "this is a folder, not a pipeline file",
+            file=path,
+            remedy=f"give its pipeline file, or write one with `ortho init {typed(path)}`",
+        )
     content = read_bounded(path, _MAX_BYTES, remedy="check the path")
     if len(content) > _MAX_BYTES:
         raise InputError("the pipeline file is larger than 5 MB", file=path, remedy="name images by patterns")

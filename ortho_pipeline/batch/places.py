@@ -143,7 +143,7 @@ class PipelinePaths:
                 "patterns cannot search a web server",
                 file=self.file,
                 field=field,
-                remedy="name the images one by one, or use a pattern in object storage (s3, gs, az)",
+                remedy="name the images one by one, or use a pattern in an object store",
             )
         wanted = parts[len(fixed) :]
         folder = f"{scheme}://{'/'.join(fixed)}"

@@ -104,7 +104,7 @@ def adjust(
     >>> models = {name: op.open_scene(f"sample_data/cartosat/{name}").model for name in points.images}
     >>> shifts = {name: op.ImageCorrection.identity(model, "shift", (0, 0)) for name, model in models.items()}
     >>> op.adjust(shifts, points).gauge
-    'the datum is that of 9 control points'
+    'position and height come from 9 control points'
     """
     chosen = models_of(models, points)
     unknown = sorted(set(exclude) - set(points.ids))

@@ -70,7 +70,7 @@ def with_datum(
     # Fictitious constraints hold the shape of an orbit together, not where it is.
     known = bool(problem.pseudo) or any((~model.constraints().fictitious).any() for model in state.models)
     if hold is None and known and step_of(linear).condition <= CONDITION_LIMIT:
-        return problem, "no control points: the datum is that of the priors and constraints of the models"
+        return problem, "no control points: position and height come from the priors and constraints of the models"
     missed = 0.0 if control else _missed(linear)
     stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
     trusted = np.asarray(stated >= missed / _CONTRADICTED)
@@ -131,7 +131,7 @@ def _why(control: int, by_ties: bool, of: str) -> str:
 def by_control(problem: BlockProblem, selection: Selection) -> str:
     """Say that the control points of a selection define the datum."""
     number = int((problem.active(selection) & selection.ground).sum())
-    return f"the datum is that of {counted(number, 'control point')}"
+    return f"position and height come from {counted(number, 'control point')}"
 
 
 def with_start_errors(linear: Linear, covariance: Cofactors) -> Cofactors:

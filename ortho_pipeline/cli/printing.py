@@ -54,10 +54,12 @@ def print_warnings(warnings: Any) -> None:
 
 
 def print_notices(document: Mapping[str, Any]) -> None:
-    """Print the errors, warnings and notes of a document on stderr, each with its remedy."""
+    """Print the errors, warnings and notes of a document on stderr, each with its remedy; with ``-q`` no notes."""
     from ortho_pipeline.report.page.advice import signal_lines, signals
 
-    for line in signal_lines(signals(document.get("warnings", ()), document.get("notices", ()))):
+    found = signals(document.get("warnings", ()), document.get("notices", ()))
+    quiet = click.get_current_context().meta.get("quiet")
+    for line in signal_lines([one for one in found if one.level != "know" or not quiet]):
         say(as_typed(line), err=True)
 
 
@@ -69,6 +71,9 @@ def print_result(result: Result, as_json: bool) -> None:
     else:
         say(as_typed(result.summary))
         print_notices(result.document)
+        # The summary, which has the notices of a report, is not printed then.
+        if click.get_current_context().meta.get("quiet"):
+            print_notices(result.document.get("report") or {})
         print_files(result.files)
     if result.failure is not None:
         context = click.get_current_context()

@@ -46,8 +46,8 @@ def corner_ratio_of(solution: Solution, source: str, strength: float | None) -> 
         factor = math.inf
     if factor > EXTRAPOLATION_LIMIT and strength is None:
         raise DegeneratePoints(
-            "the control points do not determine the model over the whole scene: at a corner, its uncertainty is "
-            f"{factor:.0f} times that of a measured point",
+            "the control points do not determine the model over the whole scene: a corner is "
+            f"{factor:.0f} times as uncertain as a measured point",
             file=source,
             remedy="spread the points over the image (for 3D models also over height), or use a simpler model",
         )
@@ -58,7 +58,7 @@ def uncertain_edge(factor: float) -> list[Notice]:
     """Return a notice if a model is uncertain at a corner."""
     if factor <= EXTRAPOLATION_WARNING:
         return []
-    text = f"uncertain at the edge: at a corner, the model's uncertainty is {factor:.0f} times that of a measured point"
+    text = f"uncertain at the edge: a corner is {factor:.0f} times as uncertain as a measured point"
     return [Notice("uncertain-at-edge", text, factor=factor)]
 
 
@@ -70,8 +70,8 @@ def unstable(solution: Solution, strength: float | None) -> list[Notice]:
             return []
         text = (
             f"unstable: the points determine only {solution.effective:.1f} of {counted(len(names), 'parameter')} "
-            f"(condition number {solution.condition:.0e}). Regularisation ({strength:.1e}) sets the others. "
-            "Trust only check points"
+            f"(condition number {solution.condition:.0e}). Regularisation (strength {strength:.1g}) holds the others. "
+            "Only check points show the accuracy"
         )
         return [Notice("unstable", text, condition=solution.condition)]
     if solution.condition <= UNSTABLE or len(names) < 2:

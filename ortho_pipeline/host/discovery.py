@@ -289,19 +289,19 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
         return InputError(
             f"{beside.what}; no sensor opens it automatically", file=path, field="scene.sensor", remedy=beside.remedy
         )
-    names = ", ".join(item.name for item in sensors) or "none"
     general = ", ".join(item.name for item in sensors if item.fallback)
     hint = f" (general ones: {general})" if general else ""
     on_map = dataset.GetProjection() and dataset.GetGeoTransform(can_return_null=True) is not None
     finished = Text("; for a finished ortho add ", Setting("scene.ortho")) if on_map else Text("")
     return InputError(
-        f"no sensor recognises this image (installed: {names})",
+        "no sensor recognises this image: it has no RPC, and no metadata of a known product are next to it",
         file=path,
         remedy=Text(
-            "choose a sensor with ",
-            Setting("scene.sensor", "NAME"),
-            f"{hint}; its error message then says what is missing. Or give an RPC file with ",
+            "copy the other files of the delivery next to it, or give an RPC file with ",
             Setting("scene.rpc", "FILE"),
             finished,
+            ". With ",
+            Setting("scene.sensor", "NAME"),
+            f"{hint} the error message says what is missing",
         ),
     )

@@ -64,8 +64,8 @@ if TYPE_CHECKING:
 #: Rays that are drawn of each image, points that are listed on the page.
 _DRAWN_RAYS, _LISTED = 400, 400
 #: What makes points of known ground a test.
-KEPT_OUT = "whose ground coordinates took no part"
-TIED = "their image measurements tie the images"
+KEPT_OUT = "whose ground coordinates were not used"
+TIED = "their image measurements were used as tie points"
 #: What the headline says of a block that only ties hold together.
 _NO_CHECKS = "there are no check points"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.

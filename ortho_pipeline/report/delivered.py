@@ -55,7 +55,7 @@ def _of_block(scene: Scene, adjusted: Mapping[str, Any]) -> Headline:
     sigma0 = f", sigma0 {float(adjusted['sigma0']):.3g}" if adjusted["sigma0"] else ""
     notes = (f"The block: {adjusted['gauge']}{sigma0}.", _source(scene))
     if check := image.rms.back_projected.check:
-        points = f"{counted(check.n, 'measurement')} of check points, whose ground coordinates took no part,"
+        points = f"{counted(check.n, 'measurement')} of check points, whose ground coordinates were not used,"
         what = f"RMSE of {points} in this image, when it was adjusted in a block"
         return Headline(figure=px(check.total), metres=None, what=what, notes=notes)
     what = "the model was adjusted in a block without check points in this image"

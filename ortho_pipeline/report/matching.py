@@ -48,7 +48,7 @@ class MatchComponents(Record):
         """Say what there is of each part."""
         said = []
         if self.matching > 0:
-            said.append(f"{self.matching:.3g} times the variance from least-squares matching")
+            said.append(f"{self.matching:.3g} times the variance that least-squares matching states")
         if self.height_m > 0:
             said.append(f"height errors of {metres(self.height_m)}")
         said.append(f"other errors of {px(self.other_px)} per axis")

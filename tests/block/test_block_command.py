@@ -254,7 +254,7 @@ def test_the_report_is_one_page_in_both_lights(stereo: Stereo, tmp_path: Path) -
     assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
     assert "https://" not in page
     # Notices say what to do, and one script, named by its digest, sorts the tables.
-    assert "Reserve more check points" in page
+    assert "Use at least 30 check points" in page
     assert page.count("<script") == page.count("script-src &#39;sha256-") == 1
     report = json.loads((out / "block_report.json").read_text())
     assert report["document"] == "ortho-pipeline block report"

@@ -16,6 +16,8 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.options import SurfaceOptions
 
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
+
 #: Not on whole multiples of the resolution, and larger than the scene.
 EXTENT = (402003.0, 6679002.0, 404011.0, 6681004.0)
 EDGE = 2
@@ -353,9 +355,14 @@ def test_a_dry_run_says_what_would_be_made(tiny, tmp_path):
     assert f"{made['size'][0]} x {made['size'][1]} px of 10 in {made['crs']}" in done.stdout
 
 
-def test_quiet_prints_nothing(tiny, tmp_path):
+def test_quiet_prints_only_warnings(tiny, tmp_path):
     done = run("rectify", tiny.image, "--height", 500, "-q", "-o", tmp_path / "out")
     assert (done.stdout, done.stderr, done.exit_code) == ("", "", 0)
+    words = ("rectify", SAMPLE / "scene.tif", "--gcps", SAMPLE / "gcps.geojson", "--dem", SAMPLE / "dem.tif")
+    done = run(*words, "-tr", 30, 30, "-q", "-o", tmp_path / "out")
+    assert (done.stdout, done.exit_code) == ("", 0)
+    assert done.stderr.startswith("Warning: 6 check points: fewer than the 30")
+    assert "Note" not in done.stderr
     shown = run("rectify", tiny.image, "--height", 500, "-q", "--json", "-o", tmp_path / "out")
     assert json.loads(shown.stdout)["files"]
 

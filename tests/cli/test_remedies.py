@@ -24,6 +24,7 @@ from click.testing import CliRunner
 from osgeo import gdal
 
 from ortho_pipeline import commands, open_dem, open_scene
+from ortho_pipeline.batch.config import read_config
 from ortho_pipeline.batch.plan import plan
 from ortho_pipeline.batch.runner import run as run_pipeline
 from ortho_pipeline.cli.program import cli
@@ -496,6 +497,14 @@ def _pipeline(folder: Path, mosaic: bool) -> Path:
 def _names(printed: Printed, folder: Path) -> None:
     path = _pipeline(folder, mosaic=False)
     assert "west" in printed.paste(refused(plan(path).chosen, ["no-such"]))
+
+
+@case("batch", "ortho init")
+def a_folder_is_no_pipeline_file(printed: Printed, folder: Path) -> None:
+    scenes = folder / "scenes"
+    shutil.copytree(SAMPLE / "orbview3", scenes)
+    printed.paste(refused(read_config, scenes))
+    assert (scenes / "pipeline.yaml").exists()
 
 
 @case("batch", "ortho mosaic")

@@ -271,7 +271,7 @@ def test_an_adjustment_finds_ties_and_control_by_itself(tmp_path):
     }
     assert "takes-no-part" not in {one["code"] for one in report["notices"]}
     assert (
-        "in the images, relative to the reference, whose ground coordinates took no part" in report["headline"]["what"]
+        "in the images, relative to the reference, whose ground coordinates were not used" in report["headline"]["what"]
     )
     read = {(one["role"], Path(one["path"]).name) for one in report["provenance"]["inputs"]}
     assert {("DEM", dem.name), ("DEM", "dem.json"), ("reference", scenes[0].reference_file.name)} <= read

@@ -207,7 +207,7 @@ def test_the_ortho_of_an_image_has_the_model_of_the_block(
         told = ask("made")
     assert told["state"] == "done", told
     assert told["number"] == 1
-    assert "whose ground coordinates took no part, in this image, when it was adjusted in a block" in told["what"]
+    assert "whose ground coordinates were not used, in this image, when it was adjusted in a block" in told["what"]
     ortho = next(Path(path) for path in told["files"] if path.endswith("second_ortho.tif"))
     assert ortho.parent.name == "second"
     said = json.loads((ortho.parents[1] / "block/block_report.json").read_text())["adjustment"]["images"]["second"]

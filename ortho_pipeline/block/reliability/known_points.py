@@ -38,9 +38,9 @@ class ContradictedPoint(Record):
 
     def notice(self) -> Notice:
         """Say it to people."""
-        taken = "it counts in the accuracy all the same" if self.role == "check" else "it was used all the same"
+        kept = "the accuracy still counts it" if self.role == "check" else "the adjustment still uses it"
         text = (
-            f"{self.role} point {self.point}: {self.place} from where the block puts it; {taken}: check its "
+            f"{self.role} point {self.point}: {self.place} from where the block puts it; {kept}: check its "
             "coordinates and measurements"
         )
         return Notice("contradicting-point", text, point=self.point, role=self.role)

@@ -459,7 +459,7 @@ def _sentences(analysis: Covariance) -> list[str]:
             f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
-    chance = f"chance alone exceeds {analysis.critical:+.2f} in 1 of {round(1 / SIGNIFICANCE)} cases"
+    chance = f"by chance alone it would exceed {analysis.critical:+.2f} only once in {round(1 / SIGNIFICANCE)} scenes"
     result = "Systematic errors remain" if analysis.verdict == "systematic" else "No systematic error was found"
     sentences = [
         f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) are correlated by {alike}; {chance}."
@@ -469,9 +469,8 @@ def _sentences(analysis: Covariance) -> list[str]:
     if analysis.relative is not None:
         numbers = "{:.2f} and {:.2f}".format(*analysis.relative), "{:.2f} and {:.2f}".format(*analysis.absolute)
         sentences.append(
-            f"Relative to each other, points closer than {analysis.near_m:g} m are accurate to {numbers[0]} "
-            f"{analysis.unit} "
-            f"({counted(analysis.pairs_near, 'pair')}). All points are accurate to {numbers[1]} {analysis.unit}."
+            f"Between points closer than {analysis.near_m:g} m ({counted(analysis.pairs_near, 'pair')}) the relative "
+            f"error is {numbers[0]} {analysis.unit}. The error of a single point is {numbers[1]} {analysis.unit}."
         )
     if analysis.mean_p and min(analysis.mean_p) < SIGNIFICANCE / 2:
         off = "{:+.2f} and {:+.2f}".format(*analysis.mean)

@@ -64,7 +64,7 @@ _SAMPLES_SHOWN = 4
 #: Why a match was rejected, in words.
 REASONS = {
     "hidden": "the target shows too little of the chip",
-    "weak": "the chips are too different",
+    "weak": "the best position is too weakly correlated",
     "ambiguous": "a second place fits nearly as well",
     "backward": "matching back gives another place",
     "not measured": "least-squares matching is uncertain by more than half a pixel",

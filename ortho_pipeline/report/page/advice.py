@@ -48,14 +48,14 @@ _LOOK: dict[str, str] = {
     "ortho-tested-in-part": "Add references that show the rest, or do not use the ortho there.",
     "left-out": "Check the point in the image and at its source. Measure it again or delete it.",
     "more-left-out": "Check points and model: they do not belong together.",
-    "contradicting-point": "Measure the point again. Delete it only if its source is wrong.",
+    "contradicting-point": "Measure the point again. Delete it only if it is proven wrong.",
     "no-projection": "Add the heights of the points, and check their CRS.",
     "takes-no-part": "Measure these points in one more image.",
     "outside-of-image": "Check whether the points belong to another image or to a crop of this one.",
     "one-mark-twice": "Keep one of each pair.",
     "images-not-given": "Add these images, or remove their points.",
     "no-intersection": "Measure these points again.",
-    "few-check-points": "Reserve more check points before you claim accuracy.",
+    "few-check-points": "Use at least 30 check points before you claim an accuracy class.",
     "no-redundancy": "Add points. Until then the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
     "dem-shifted": Text("If the images are right, add ", Setting("points.dem_shift", "estimate"), "."),
@@ -175,7 +175,7 @@ def signal_lines(found: Sequence[Signal]) -> list[Text]:
 def _signal(notice: Mapping[str, Any]) -> tuple[Level, str, str]:
     level, to_do = advised(notice["code"])
     if notice["code"] == "few-check-points" and not notice.get("count", 1):
-        to_do = to_do.replace("Reserve more check points", "Reserve some check points")
+        to_do = "Reserve some check points: with 30 you can claim an accuracy class."
     if notice["code"] == "checks-apart":
         to_do = _about_checks(notice, to_do)
     return level, _sentence(notice["text"]), to_do
