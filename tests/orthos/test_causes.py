@@ -89,10 +89,7 @@ def written(heights: Array, gsd: float, path: Path) -> Path:
 
 @pytest.mark.parametrize(
     "number",
-    [
-        pytest.param(k, marks=() if k == 12 else pytest.mark.slow, id=f"{kind}-{k % 4}")
-        for k, kind in enumerate(KINDS)
-    ],
+    [pytest.param(k, marks=() if k == 12 else pytest.mark.slow, id=f"{kind}-{k % 4}") for k, kind in enumerate(KINDS)],
 )
 def test_a_deliberate_error_is_named(tmp_path, number):
     kind = KINDS[number]
