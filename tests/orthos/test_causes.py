@@ -16,7 +16,7 @@ from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
 
 gdal.UseExceptions()
-SIDE, POST = 320, 2
+SIDE, POST = 480, 2
 #: PROJ's differences at the place of the pairs: metres to the east and north.
 DATUMS = {"Cape": (34.0, 62.1), "Arc 1950": (30.5, 59.6), "WGS 72BE": (-22.6, -1.5), "WGS 72": (-15.4, -3.9)}
 
