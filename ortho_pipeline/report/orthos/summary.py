@@ -97,7 +97,7 @@ def _accuracy_rows(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     part = best_part(document)
     if part is None:
         return [("accuracy", "unknown")]
-    rows = []
+    rows: list[tuple[str, str]] = []
     for name in [name for name in PARTS if document[name] is not None]:
         for key, called in (("ce90", "CE90"), ("rmse", "RMSE"), ("bias", "bias")):
             text = interval_text(document[name][f"{key}_m"])
