@@ -4,11 +4,13 @@
 #   make test     set up, run the tests (under ten minutes on two cores)
 #   make test-all the same with those marked slow
 #   make faults   commands limited, killed, cut off: no broken or mixed outputs (N=400 write limits, 3/4 as many kills)
-#   make check    formatting, lint, types, tests
+#   make check    formatting, lint, types (make lint), tests
+#   make test-with  the tests with the oldest packages that pyproject.toml allows, or RESOLUTION=highest: the newest
 #   make page-types  the types of the scripts of `ortho measure`, by TypeScript (npx fetches it)
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
 #   make bench    speed and memory against gdalwarp, of adjustments, of many scenes: docs/performance.json (an hour)
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
+#   make dist     build sdist and wheel in out/dist
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
 #                 and manual pages in out/man
 #   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, tutorials, notebooks (Chromium)
@@ -28,6 +30,7 @@ PYTHON ?= python3
 GDAL ?= auto
 APT ?= auto
 VENV := .venv
+CONSTRAINTS := tools/constraints.txt
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
 WORKERS ?= 2
@@ -39,15 +42,15 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all faults check page-types fuzz bench packages docs images constraints pin-image clean
+.PHONY: help setup demo test test-all test-with faults lint check dist page-types fuzz bench packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml Makefile tools/setup.sh tools/constraints.txt
-	@PYTHON="$(PYTHON)" GDAL="$(GDAL)" APT="$(APT)" VENV="$(VENV)" bash tools/setup.sh
+$(STAMP): pyproject.toml Makefile tools/setup.sh $(CONSTRAINTS)
+	@PYTHON="$(PYTHON)" GDAL="$(GDAL)" APT="$(APT)" VENV="$(VENV)" CONSTRAINTS="$(CONSTRAINTS)" bash tools/setup.sh
 	touch $@
 
 demo: setup
@@ -71,11 +74,27 @@ faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup
 	@$(BIN)/python tests/attack/faults.py --limits $(N) --kills $$(( $(N) * 3 / 4 ))
 
-check: setup
+# The packages of a resolution of uv, in an environment of their own.
+RESOLUTION ?= lowest-direct
+test-with: setup
+	@$(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt uv
+	mkdir -p out
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --resolution $(RESOLUTION) --extra dev \
+	    --python-version "$$($(BIN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')" \
+	    -o out/$(RESOLUTION).txt pyproject.toml tools/constraints.in
+	$(MAKE) test VENV=out/venv-$(RESOLUTION) CONSTRAINTS=out/$(RESOLUTION).txt
+
+lint: setup
 	@$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(PYTEST) -m "not slow"
+
+check: lint
+	@$(PYTEST) -m "not slow"
+
+dist: setup
+	@rm -rf out/dist
+	$(BIN)/python -m hatchling build --directory out/dist
 
 page-types:
 	@npx --yes -p typescript@5.9 tsc -p tests/measure/types

@@ -88,7 +88,7 @@ GDAL_MODULES = {
     "raster.caching.block_cache",
     "raster.source",
     "raster.intensity",
-    "raster.output",
+    "raster.verified_writing",
     "raster.pixel_types",
     "raster.ortho",
     "raster.regridded",

@@ -11,8 +11,8 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
-from ortho_pipeline.raster.output import checked_options
 from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.raster.verified_writing import checked_options
 
 
 @pytest.mark.parametrize("size", [(4_000_001, 1), (1, 4_000_001)])

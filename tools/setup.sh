@@ -11,7 +11,7 @@ PYTHON="${PYTHON:-python3}"
 GDAL="${GDAL:-auto}"
 APT="${APT:-auto}"
 VENV="${VENV:-.venv}"
-CONSTRAINTS=tools/constraints.txt
+CONSTRAINTS="${CONSTRAINTS:-tools/constraints.txt}"
 
 say() { printf '[setup] %s\n' "$*"; }
 fail() {

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files import read_bounded
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.options import (
     MatchOptions,
     MosaicOptions,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
-from ortho_pipeline.batch.places import PipelinePaths, Place
+from ortho_pipeline.batch.paths import PipelinePaths, Place
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request

@@ -52,7 +52,12 @@ class _Shard(click.ParamType):
 @click.option(
     "--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: all processors]"
 )
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="Threads per scene.  [default: the cores divided by the jobs]")
+@click.option(
+    "--threads",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Threads per scene.  [default: cores per job]",
+)
 @click.option(
     "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Memory per scene."
 )

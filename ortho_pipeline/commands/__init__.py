@@ -11,26 +11,26 @@ from typing import TYPE_CHECKING
 from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
+    from ortho_pipeline.commands.facts import dem_check as dem_check
+    from ortho_pipeline.commands.facts import doctor as doctor
+    from ortho_pipeline.commands.facts import edge as edge
+    from ortho_pipeline.commands.facts import forget_kept_files as forget_kept_files
+    from ortho_pipeline.commands.facts import formats as formats
+    from ortho_pipeline.commands.facts import info as info
+    from ortho_pipeline.commands.facts import kept_files as kept_files
+    from ortho_pipeline.commands.facts import models as models
+    from ortho_pipeline.commands.facts import sensors as sensors
+    from ortho_pipeline.commands.facts import write_plots as write_plots
     from ortho_pipeline.commands.fitting import compare as compare
     from ortho_pipeline.commands.fitting import fit as fit
     from ortho_pipeline.commands.rectification import check as check
     from ortho_pipeline.commands.rectification import export as export
     from ortho_pipeline.commands.rectification import rectify as rectify
-    from ortho_pipeline.commands.scene import dem_check as dem_check
-    from ortho_pipeline.commands.scene import doctor as doctor
-    from ortho_pipeline.commands.scene import edge as edge
-    from ortho_pipeline.commands.scene import forget_kept_files as forget_kept_files
-    from ortho_pipeline.commands.scene import formats as formats
-    from ortho_pipeline.commands.scene import info as info
-    from ortho_pipeline.commands.scene import kept_files as kept_files
-    from ortho_pipeline.commands.scene import models as models
-    from ortho_pipeline.commands.scene import sensors as sensors
-    from ortho_pipeline.commands.scene import write_plots as write_plots
 
 _NAMES = {
     "fitting": ("compare", "fit"),
     "rectification": ("check", "export", "rectify"),
-    "scene": (
+    "facts": (
         "dem_check",
         "doctor",
         "edge",

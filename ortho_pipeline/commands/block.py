@@ -32,7 +32,7 @@ from ortho_pipeline.commands.control.block_points import (
     relative_to_reference,
     settled_scenes,
 )
-from ortho_pipeline.commands.heights.surfaces import open_surface
+from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store

@@ -11,9 +11,9 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.points import control_of, refuse_contradictions
 from ortho_pipeline.commands.placement import open_rasters
 from ortho_pipeline.commands.resolved.ledger import provenance
+from ortho_pipeline.commands.resolved.opening import resolve
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
-from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.commands.results import ENDINGS, CompareResult, FitResult, outputs_together, write_report
 from ortho_pipeline.commands.scene_fit import (
     Adjusted,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ortho_pipeline.commands import inputs
-from ortho_pipeline.commands.heights.surfaces import require_heights
+from ortho_pipeline.commands.heights.opening import require_heights
 from ortho_pipeline.commands.layers import budget as layers
 from ortho_pipeline.commands.layers.angles import sun_of, write_angles
 from ortho_pipeline.commands.layers.filling import other_of
@@ -45,7 +45,7 @@ from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.output import checked_options, require_whole
+from ortho_pipeline.raster.verified_writing import checked_options, require_whole
 from ortho_pipeline.report import document as report
 from ortho_pipeline.report.records import SceneReport
 from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread

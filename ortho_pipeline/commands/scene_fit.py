@@ -11,9 +11,9 @@ import numpy as np
 
 from ortho_pipeline.commands.control.matching import Matched
 from ortho_pipeline.commands.control.points import control_of, refuse_contradictions, with_heights
+from ortho_pipeline.commands.resolved.opening import resolve
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
-from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import CoverageError, InputError

@@ -16,7 +16,7 @@ from ortho_pipeline.exchange.rpc import name_sources_relatively
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
-from ortho_pipeline.raster.output import close, raster_output, written
+from ortho_pipeline.raster.verified_writing import close, raster_output, written
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.footprint import image_grid
 from ortho_pipeline.surface.rays import meet_surface

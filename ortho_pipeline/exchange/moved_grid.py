@@ -12,7 +12,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import name_sources_relatively
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.verified_writing import raster_output, written
 
 
 def moved_geotransform(geotransform: tuple[float, ...], displaced: Array) -> tuple[float, ...]:

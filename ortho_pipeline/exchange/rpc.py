@@ -32,8 +32,8 @@ from ortho_pipeline.files.locations import VsiPath, place
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC
-from ortho_pipeline.raster.output import close, raster_output, written
 from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.raster.verified_writing import close, raster_output, written
 
 __all__ = [
     "RpcExport",

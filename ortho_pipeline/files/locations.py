@@ -448,7 +448,7 @@ def require_network(address: str, allowed: bool, *, paged: bool = False) -> None
         raise InputError(
             "an address must not contain credentials (a password, a signature), because outputs name all their inputs",
             file=re.split("[?#;&]", _NAMED.sub("", plain))[0],
-            remedy="use s3://, gs:// or az://, with the credentials in the environment",
+            remedy=f"use {', '.join(f'{one}://' for one in STORES)} with the credentials in the environment",
         )
     if not allowed:
         raise InputError(

@@ -12,8 +12,8 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.imaging.registration import Registration, register
-from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.raster.source import open_pixels
+from ortho_pipeline.raster.verified_writing import raster_output, written
 
 
 def stack_bands(

@@ -135,7 +135,7 @@ class PointOptions:
         str | None,
         Option(
             "--select",
-            "Points to use as control: N well spread, N of one region, by id, or N at random. All others become check points.",
+            "Points to use as control: N well spread, N of one region, by id, or N at random. The others check.",
             "even:N|cluster:N|ids:A,B|random:N:SEED",
         ),
     ] = None

@@ -18,9 +18,9 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import whole_or_nothing
-from ortho_pipeline.raster.output import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.raster.pixel_types import holds, pixel_type
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.raster.verified_writing import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
 
 #: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.

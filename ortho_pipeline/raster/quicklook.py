@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.raster.output import png_bytes
 from ortho_pipeline.raster.source import Grid, open_pixels
+from ortho_pipeline.raster.verified_writing import png_bytes
 
 #: GDAL's number for averaging in a raster read.
 _AVERAGE = 5

@@ -238,7 +238,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
         (
             "RMSE in plan",
             "at most 0.25 mm at map scale",
-            f"{found.rmse:.4g} m",
+            metres(found.rmse),
             scale_text(usual_scale(found.rmse / POSITION)),
         )
     ]
@@ -251,13 +251,13 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
                 scale_text(usual_scale(found.pixel / PIXEL)),
             )
         )
-    survey = f", check points themselves {found.survey:.4g} m" if found.survey else ""
+    survey = f", check points themselves {metres(found.survey)}" if found.survey else ""
     needs = "" if found.claim else f" (a claim needs {ENOUGH_CHECK_POINTS} check points)"
     rows.append(
         (
             "ASPRS 2023, horizontal class",
             "RMSE including the error of the check points, rounded up to 1 cm",
-            f"{found.rmse:.4g} m{survey}",
+            f"{found.rmse:.2f} m{survey}",
             f"{class_size(found.class_cm)}{needs}",
         )
     )
@@ -265,7 +265,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
         (
             "NMAS 1947",
             "90 % of the points within 1/30 inch at map scale (1/50 inch from 1:20,000)",
-            f"{found.ce90:.4g} m",
+            metres(found.ce90),
             scale_text(found.nmas_scale),
         )
     )

@@ -16,6 +16,8 @@ from typing import Any
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.runtime.compilation.marked import Marked
 
+#: The package that compiles kernels.
+COMPILER = "numba"
 #: numba takes settings from a file of this name in the working folder, which may be somebody else's delivery.
 _SETTINGS = ".numba_config.yaml"
 _lock = threading.Lock()
@@ -37,7 +39,7 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 def is_loaded() -> bool:
     """Tell whether this process has loaded numba, which takes a second."""
-    return "numba" in sys.modules
+    return COMPILER in sys.modules
 
 
 class Kernel(Marked):

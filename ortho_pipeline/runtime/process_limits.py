@@ -243,7 +243,7 @@ def is_told_already(lost: Any) -> bool:
     """Tell whether what a destructor cannot raise is of a dataset that GDAL's binding dropped because a copy failed.
 
     The binding raises what stops a copy and drops what there is of it, whose destructor complains once more. All other
-    datasets that are written are closed by `raster.output`, which raises.
+    datasets that are written are closed by `raster.verified_writing`, which raises.
     """
     return getattr(lost.object, "__name__", "") == "delete_Dataset"
 

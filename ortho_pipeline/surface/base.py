@@ -38,6 +38,7 @@ class Surface(abc.ABC):
     do not contain heights that were read.
 
     For a warp every surface is a raster of samples that is read by windows. The samples of flat ground are equal.
+    There is no third kind: another source of heights is a `Samples`, of which `dem_of` makes a DEM.
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from osgeo import gdal, osr
 
 from ortho_pipeline.geodesy.crs import Vertical
-from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.surface.base import Array
 
 

@@ -38,8 +38,8 @@ from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
-from ortho_pipeline.raster.output import gdal_errors, written
 from ortho_pipeline.raster.source import Grid, first_line
+from ortho_pipeline.raster.verified_writing import gdal_errors, written
 from ortho_pipeline.surface.base import Excerpt, Surface
 from ortho_pipeline.warp.job import WARPING, WarpJob, WarpRecord
 from ortho_pipeline.warp.quality.hiding import Hiding

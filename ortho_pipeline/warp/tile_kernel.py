@@ -1,7 +1,7 @@
 """The compiled loop of the warp over one block of output pixels, in a single pass.
 
 `warp_block` takes image coordinates out of the block's lattice, terrain heights out of the DEM, and pixel values out of
-the source by one of `kernels`. Nothing is stored per pixel but the values.
+the source by one of `resampling_kernel`. Nothing is stored per pixel but the values.
 
 The lattice gives, at nodes every `spacing` output pixels, DEM coordinates (u, v) and image coordinates as a polynomial
 in the normalised height t = (h - middle) / half. Between nodes everything is bilinear.

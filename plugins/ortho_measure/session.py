@@ -22,9 +22,9 @@ from ortho_pipeline.commands.control.matching import open_reference_views
 from ortho_pipeline.commands.control.points import read_control, with_heights
 from ortho_pipeline.commands.control.search import search_of
 from ortho_pipeline.commands.fitting import compare
-from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.heights.opening import open_surface, require_heights
+from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
-from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256

@@ -29,7 +29,7 @@ from ortho_pipeline.batch.shared.leases import Lease, Leases, lease_document
 from ortho_pipeline.files import together
 from ortho_pipeline.files.whole import Outputs
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
-from ortho_pipeline.stores import kept, objects
+from ortho_pipeline.stores import local_cache, objects
 
 _COUNT = itertools.count()
 
@@ -76,7 +76,7 @@ _ADDRESS = "https://example.org/cells/N37E033.tif"
 
 @contextlib.contextmanager
 def _cache(folder: Path) -> Iterator[Path]:
-    with mock.patch.dict(os.environ, {kept.FOLDER: str(folder)}):
+    with mock.patch.dict(os.environ, {local_cache.FOLDER: str(folder)}):
         yield folder
 
 
@@ -88,18 +88,18 @@ def _fetched(path: Path) -> objects.Content:
 def kept_record(folder: Path) -> bytes:
     """Return the record of a file that is kept."""
     with _cache(folder / "cache"):
-        found = kept.kept("dem", _ADDRESS, _fetched)
+        found = local_cache.kept("dem", _ADDRESS, _fetched)
     return found.with_name(f"{found.name}.json").read_bytes()
 
 
 def read_kept_record(path: Path) -> list[Any]:
     """Look at what is kept, and use it: a record that cannot be understood means that the file is fetched again."""
     with _cache(path.parent / f"cache{next(_COUNT)}") as folder:
-        file = kept.kept("dem", _ADDRESS, _fetched)
+        file = local_cache.kept("dem", _ADDRESS, _fetched)
         shutil.copyfile(path, file.with_name(f"{file.name}.json"))
-        kept._agreed.clear()  # as in another process
+        local_cache._agreed.clear()  # as in another process
         listed = commands.kept_files(verify=True)
-        assert kept.kept("dem", _ADDRESS, _fetched).read_bytes() == b"heights"
+        assert local_cache.kept("dem", _ADDRESS, _fetched).read_bytes() == b"heights"
         json.dumps(listed, ensure_ascii=False).encode()
         commands.forget_kept_files()
         shutil.rmtree(folder)

@@ -30,8 +30,8 @@ from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
 from ortho_pipeline.geodesy.crs_gate import refuse_files
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import read_points
-from ortho_pipeline.raster.output import checked_options
 from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.raster.verified_writing import checked_options
 from ortho_pipeline.stores.stac.item import read_item
 from ortho_pipeline.surface.dem import open_dem
 

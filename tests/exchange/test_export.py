@@ -14,7 +14,7 @@ from osgeo import gdal
 
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.heights.surfaces import open_surface
+from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.export import FORMATS
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc

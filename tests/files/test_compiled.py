@@ -12,8 +12,8 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.folders import cache_folder
-from ortho_pipeline.runtime.compilation import places
-from ortho_pipeline.stores import kept
+from ortho_pipeline.runtime.compilation import cache_folders
+from ortho_pipeline.stores import local_cache
 
 KERNELS = [
     path
@@ -221,14 +221,14 @@ def test_no_folder_of_caches_is_in_the_working_folder(
     for name, value in surroundings.items():
         monkeypatch.setenv(name, value)
     monkeypatch.chdir(tmp_path)
-    places.own.cache_clear()
+    cache_folders.own.cache_clear()
     assert cache_folder() is None
-    assert places.own()[0] is None
-    assert "NUMBA_CACHE_DIR" in places.own()[1]
+    assert cache_folders.own()[0] is None
+    assert "NUMBA_CACHE_DIR" in cache_folders.own()[1]
     with pytest.raises(InputError, match="ORTHO_CACHE"):
-        kept.folder()
+        local_cache.folder()
     assert list(tmp_path.iterdir()) == []
-    places.own.cache_clear()
+    cache_folders.own.cache_clear()
 
 
 def others(how: str, folder: Path) -> None:
@@ -267,9 +267,9 @@ def test_folders_to_which_others_can_write_are_known(tmp_path: Path, how: str) -
     folder = tmp_path / "cache" / "kernels"
     folder.mkdir(parents=True, mode=0o700)
     (folder / "one.nbi").write_bytes(b"")
-    assert places.fault_of(folder, os.geteuid()) == ""
+    assert cache_folders.fault_of(folder, os.geteuid()) == ""
     others(how, folder)
-    assert "others can write to" in places.fault_of(folder, os.geteuid())
+    assert "others can write to" in cache_folders.fault_of(folder, os.geteuid())
 
 
 def test_kernels_to_which_others_can_write_are_not_loaded(tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ def test_a_folder_for_all_has_one_folder_for_each_user(tmp_path: Path) -> None:
     assert cached(tmp_path) == "42 0\n"
     (folder,) = (tmp_path / "cache").iterdir()
     assert folder.stat().st_mode & 0o777 == 0o700
-    assert places.fault_of(folder, os.geteuid()) == ""
+    assert cache_folders.fault_of(folder, os.geteuid()) == ""
 
 
 @pytest.mark.slow

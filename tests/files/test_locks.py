@@ -14,7 +14,7 @@ from ortho_measure.journal import Journal
 from ortho_pipeline.batch.records import locked
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import Lock, Outputs, append_line, together, write_text
-from ortho_pipeline.stores import kept
+from ortho_pipeline.stores import local_cache
 from ortho_pipeline.stores.objects import Content
 
 #: What a process asks that wants a file for itself.
@@ -95,8 +95,8 @@ def _run(folder: Path) -> None:
 
 
 def _kept(folder: Path) -> None:
-    os.environ[kept.FOLDER] = str(folder)
-    kept.kept("dem", "https://example.org/cell.tif", fetched)
+    os.environ[local_cache.FOLDER] = str(folder)
+    local_cache.kept("dem", "https://example.org/cell.tif", fetched)
 
 
 #: Everything that takes a lock in a folder.
@@ -111,7 +111,7 @@ TAKERS = {
 
 @pytest.mark.parametrize("taker", TAKERS)
 def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path, monkeypatch, taker):
-    monkeypatch.setenv(kept.FOLDER, "")
+    monkeypatch.setenv(local_cache.FOLDER, "")
     # Which files it locks, as the system is asked.
     names, ask = [], fcntl.flock
     monkeypatch.setattr(
@@ -133,7 +133,7 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch, taker):
     def refuse(file: int, how: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setenv(kept.FOLDER, "")
+    monkeypatch.setenv(local_cache.FOLDER, "")
     monkeypatch.setattr(fcntl, "flock", refuse)
     before = len(os.listdir("/proc/self/fd"))
     if taker in ("outputs", "cache"):

@@ -12,8 +12,8 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
-from ortho_pipeline.raster.output import check_written, close, raster_output
 from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.raster.verified_writing import check_written, close, raster_output
 
 GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 1.0, 1.0, 700, 600)
 NOISE = np.random.default_rng(1).integers(0, 60_000, (1, 600, 700)).astype(np.uint16)
@@ -107,7 +107,7 @@ def test_what_gdal_says_when_it_closes_a_file_is_not_lost(tmp_path):
 import resource, signal, sys
 import numpy as np
 from osgeo import gdal
-from ortho_pipeline.raster.output import close, raster_output
+from ortho_pipeline.raster.verified_writing import close, raster_output
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 with raster_output(sys.argv[1]) as temporary:

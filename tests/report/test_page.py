@@ -262,7 +262,7 @@ def test_a_scale_says_what_sets_its_limit():
     coarse = MapScaleRecord(**judge(np.full((30, 2), 1e5), "check", None).to_json())
     assert fitness(coarse) == "Not good enough for a usual map scale: the error (140000 m) is too large."
     rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
-    assert rows["RMSE in plan"] == ("14.14 m", "1:100,000")
+    assert rows["RMSE in plan"] == ("14.1 m", "1:100,000")
     # 14.142 m is 1415 cm: what is rounded is no better than it was.
     assert rows["ASPRS 2023, horizontal class"] == ("14.14 m", "14.2 m")
     assert "pixels" not in " ".join(rows).lower()
@@ -277,10 +277,10 @@ def test_a_scale_that_pixels_limit_names_the_pixel_and_what_the_error_would_allo
     )
     assert found.statement.startswith("1:25,000 (limited by the pixel size). Indicative: 6 check points;")
     rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
-    assert rows["RMSE in plan"] == ("0.4794 m", "1:2,000")
+    assert rows["RMSE in plan"] == ("0.48 m", "1:2,000")
     assert rows["Pixel size"] == ("2.5 m", "1:25,000")
     assert rows["ASPRS 2023, horizontal class"] == (
-        "0.4794 m, check points themselves 0.14 m", "50 cm (a claim needs 30 check points)",
+        "0.48 m, check points themselves 0.14 m", "50 cm (a claim needs 30 check points)",
     )  # fmt: skip
 
 

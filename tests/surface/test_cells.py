@@ -26,7 +26,7 @@ from ortho_pipeline.commands.heights.automatic import extent_under
 from ortho_pipeline.errors import CoverageError, DatumError, InputError, StorageError
 from ortho_pipeline.host import open_scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
-from ortho_pipeline.stores import kept, objects
+from ortho_pipeline.stores import local_cache, objects
 from ortho_pipeline.surface.cells import sources
 from ortho_pipeline.surface.cells.assembled import open_cells
 from ortho_pipeline.surface.cells.copernicus import Cell, Extent, cells_of_list, columns_at, extent_of
@@ -127,7 +127,7 @@ def test_sea_is_at_height_0_above_the_geoid_and_lost_land_is_refused(bucket: Pub
         found(bucket.address, extent, geoid)
     assert "surface.fill=mask" in caught.value.remedy
     assert np.isnan(found(bucket.address, extent, geoid, fill="mask").heights([[19.5, -30.5]])[0])
-    kept.clear()
+    local_cache.clear()
     write_list(bucket.folder, HERE[1:])
     dem = found(bucket.address, extent, geoid)
     # The geoid of the test: 20 m and a metre for each 10 degrees.
@@ -326,11 +326,11 @@ def test_what_is_kept_is_checked_and_heals(bucket: PublicFolder, geoid: str) -> 
     first = dict(bucket.asked)
     found(bucket.address, extent, geoid)
     assert dict(bucket.asked) == first, "kept: nothing is asked for again"
-    path = next(record.path for record in kept.records() if HERE[0].name in record.path.name)
+    path = next(record.path for record in local_cache.records() if HERE[0].name in record.path.name)
     sound = path.read_bytes()
     for damaged in (flipped(sound, 0), sound[:-50], b""):
         path.write_bytes(damaged)
-        assert {record.state() for record in kept.records()} >= {
+        assert {record.state() for record in local_cache.records()} >= {
             "damaged" if len(damaged) == len(sound) else "of another size"
         }
         np.testing.assert_array_equal(found(bucket.address, extent, geoid).heights([[19.55, -30.45]]), wanted)
@@ -339,15 +339,15 @@ def test_what_is_kept_is_checked_and_heals(bucket: PublicFolder, geoid: str) -> 
     np.testing.assert_array_equal(found(bucket.address, extent, geoid).heights([[19.55, -30.45]]), wanted)
     path.with_name(path.name + ".json").write_text("{")
     np.testing.assert_array_equal(found(bucket.address, extent, geoid).heights([[19.55, -30.45]]), wanted)
-    assert kept.clear()[0] == len(first)
-    assert not list(kept.records())
+    assert local_cache.clear()[0] == len(first)
+    assert not list(local_cache.records())
 
 
 _FETCHING = """
 import sys
-from ortho_pipeline.stores import kept, objects
+from ortho_pipeline.stores import local_cache, objects
 store = objects.Objects(sys.argv[1], allow_network=True)
-print(kept.kept("dem", store.of(sys.argv[2]), lambda path: store.fetch(sys.argv[2], path, 10**9)))
+print(local_cache.kept("dem", store.of(sys.argv[2]), lambda path: store.fetch(sys.argv[2], path, 10**9)))
 """
 
 
@@ -549,7 +549,7 @@ def test_the_cache_is_listed_verified_and_cleared(bucket: PublicFolder, geoid: s
     found(bucket.address, Extent(19.5, -30.5, 19.6, -30.4), geoid)
     runner = CliRunner()
     listed = json.loads(runner.invoke(cli, ["cache", "list", "--json"]).stdout)
-    assert len(listed["files"]) == len(list(kept.records())) > 0
+    assert len(listed["files"]) == len(list(local_cache.records())) > 0
     assert runner.invoke(cli, ["cache", "verify"]).exit_code == 0
     Path(listed["files"][0]["path"]).write_bytes(b"damaged")
     verified = runner.invoke(cli, ["cache", "verify", "--json"])

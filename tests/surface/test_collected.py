@@ -25,9 +25,9 @@ from ortho_pipeline.errors import CoverageError, DatumError, InputError
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.stores.stac import collection as collections
 from ortho_pipeline.stores.stac import item as stac_item
+from ortho_pipeline.stores.stac.boxes import boxes_of, meet, questions
 from ortho_pipeline.stores.stac.collection import Collection
 from ortho_pipeline.stores.stac.item import item_of
-from ortho_pipeline.stores.stac.places import boxes_of, meet, questions
 from ortho_pipeline.surface.cells.collected import open_collected
 from ortho_pipeline.surface.cells.copernicus import Extent
 

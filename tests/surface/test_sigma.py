@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.heights.opening import has_surface, open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError

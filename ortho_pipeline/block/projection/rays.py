@@ -9,7 +9,7 @@ import numpy as np
 
 from ortho_pipeline.block.local_frame import GEODETIC, Places
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.block.projection import ray_kernel
+from ortho_pipeline.block.projection import projection_kernel
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.correction import COEFFICIENTS
@@ -64,7 +64,7 @@ def linearised(
         rays, images = np.concatenate(parts), _tables([models[n] for n in rational], widest)
         at, made = (point, places.in_crs(GEODETIC), places.partials(GEODETIC)), (found.image, found.by_point)
         side_by_side(
-            lambda _, begin, end: ray_kernel.linearise(
+            lambda _, begin, end: projection_kernel.linearise(
                 images, begin, end, starts, rays, at, scale, *made, found.by_params
             ),
             parts_of(len(rational), max(_SHARE * len(rational) // max(len(rays), 1), 1)),
@@ -87,7 +87,7 @@ def _rpc_of(model: SensorModel) -> RPC | None:
     return inner if type(inner) is RPC else None
 
 
-def _tables(models: Sequence[SensorModel], widest: int) -> ray_kernel.Images:
+def _tables(models: Sequence[SensorModel], widest: int) -> projection_kernel.Images:
     tables = [rpc.tables for model in models if (rpc := _rpc_of(model)) is not None]
     offsets, scales, polynomials, limits = (np.stack(part) for part in zip(*tables, strict=True))
     origins, coefficients = np.zeros((len(models), 2)), np.zeros((len(models), 6))
@@ -97,4 +97,4 @@ def _tables(models: Sequence[SensorModel], widest: int) -> ray_kernel.Images:
             origins[n], coefficients[n] = model.origin, model.coefficients
             if widest:
                 columns[n, [COEFFICIENTS.index(name) for name in model.param_names]] = range(len(model.param_names))
-    return ray_kernel.Images(offsets, scales, polynomials, limits, origins, coefficients, columns)
+    return projection_kernel.Images(offsets, scales, polynomials, limits, origins, coefficients, columns)

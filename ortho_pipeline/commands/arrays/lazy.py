@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.commands.heights.surfaces import require_heights
+from ortho_pipeline.commands.heights.opening import require_heights
 from ortho_pipeline.commands.placement import Placement, open_rasters, place_scene
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.scene_fit import adjustable

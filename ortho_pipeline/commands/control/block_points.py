@@ -18,8 +18,8 @@ from ortho_pipeline.commands.block_images import points_of_images
 from ortho_pipeline.commands.control.crops import settled_options
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.ties import tie_scenes
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface, require_heights
-from ortho_pipeline.commands.resolved.resolving import on_surface
+from ortho_pipeline.commands.heights.opening import has_surface, open_surface, require_heights
+from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors import InputError

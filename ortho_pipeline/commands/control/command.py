@@ -10,10 +10,10 @@ from typing import Any
 
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
-from ortho_pipeline.commands.heights.surfaces import require_heights
+from ortho_pipeline.commands.heights.opening import require_heights
 from ortho_pipeline.commands.resolved.ledger import provenance
+from ortho_pipeline.commands.resolved.opening import resolve
 from ortho_pipeline.commands.resolved.request import Request
-from ortho_pipeline.commands.resolved.resolving import resolve
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.scene_fit import Adjusted, adjust
 from ortho_pipeline.commands.stac.given import with_items

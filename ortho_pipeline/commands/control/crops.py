@@ -15,7 +15,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.control.points import read_control
 from ortho_pipeline.commands.heights.automatic import AUTO
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.heights.opening import has_surface, open_surface
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError

@@ -18,9 +18,9 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of
 from ortho_pipeline.commands.control.crops import settled_options
 from ortho_pipeline.commands.control.search import search_of
-from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.heights.opening import open_surface, require_heights
+from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import Request
-from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document

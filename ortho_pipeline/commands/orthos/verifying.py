@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ortho_pipeline.commands.control.points import read_control
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.heights.opening import has_surface, open_surface
 from ortho_pipeline.commands.orthos.dependence import (
     FieldStep,
     HeightDependence,

@@ -28,6 +28,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster import source as raster
+from ortho_pipeline.runtime.compiled import COMPILER
 from ortho_pipeline.runtime.process_limits import thread_pool
 from ortho_pipeline.surface.base import Surface
 
@@ -165,7 +166,7 @@ def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:
 @functools.cache
 def versions() -> dict[str, Any]:
     """Return the software that results depend on."""
-    packages = ("ortho-pipeline", "numpy", "scipy", "numba")
+    packages = ("ortho-pipeline", "numpy", "scipy", COMPILER)
     return {
         **{name: metadata.version(name) for name in packages},
         "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-from ortho_pipeline.commands.heights.surfaces import dem_files, sigma_file
+from ortho_pipeline.commands.heights.opening import dem_files, sigma_file
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 #: In place of a file of points: the ground control points that the image itself holds.

@@ -14,7 +14,7 @@ from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
-from ortho_pipeline.stores.beside import ask_beside
+from ortho_pipeline.stores.sidecars import ask_beside
 from ortho_pipeline.stores.stac.item import Asset, Item, item_at, read_item
 
 _P = ParamSpec("_P")

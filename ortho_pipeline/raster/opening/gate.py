@@ -37,7 +37,7 @@ from ortho_pipeline.raster.opening.drivers import (
     require_driver,
 )
 from ortho_pipeline.raster.opening.references import NAMES_OF, Named, crs_texts, products_of_volume, to_one_file
-from ortho_pipeline.stores.beside import ask_beside
+from ortho_pipeline.stores.sidecars import ask_beside
 
 gdal.UseExceptions()
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.display.numbers import px
 from ortho_pipeline.estimation.records import Pair
-from ortho_pipeline.raster.output import png_bytes
+from ortho_pipeline.raster.verified_writing import png_bytes
 from ortho_pipeline.report.gallery.matches import MatchPoint, in_words, shown
 from ortho_pipeline.report.records import SceneReport
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.estimation.records import Pair, Point, is_known
-from ortho_pipeline.raster.output import png_bytes
+from ortho_pipeline.raster.verified_writing import png_bytes
 from ortho_pipeline.report.gallery.chips import stretched
 from ortho_pipeline.report.records import SceneReport
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numba
 from numba.core.caching import FunctionCache, NullCache
 
-from ortho_pipeline.runtime.compilation import places
+from ortho_pipeline.runtime.compilation import cache_folders
 from ortho_pipeline.runtime.compilation.marked import Marked
 
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ def dispatcher(kernel: Marked) -> Any:
         return _njit(forceinline=True)(function)
     made: Any = _njit()(function)
     # As enable_caching() does with numba's own.
-    made._cache = _Kept(_cache_in(places.own()[0], function), _cache_in(places.of_root(), function))
+    made._cache = _Kept(_cache_in(cache_folders.own()[0], function), _cache_in(cache_folders.of_root(), function))
     return made
 
 
@@ -121,6 +121,6 @@ def _say_once() -> None:
     log.warning(
         "Compiled kernels are not cached, because %s. Every run compiles them again, for some seconds. "
         "Remedy: set %s to a folder of your own to which nobody else can write",
-        places.own()[1],
-        places.FOLDER,
+        cache_folders.own()[1],
+        cache_folders.FOLDER,
     )

@@ -10,9 +10,9 @@ from urllib.parse import urlencode
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.files.locations import AnyPath, Location
 from ortho_pipeline.runtime.process_limits import thread_pool
+from ortho_pipeline.stores.stac.boxes import Box, any_meet, extent_boxes, questions
 from ortho_pipeline.stores.stac.documents import COLLECTIONS, read_document, target
 from ortho_pipeline.stores.stac.item import Item, item_of, read_item
-from ortho_pipeline.stores.stac.places import Box, any_meet, extent_boxes, questions
 
 _REMEDY = "give a STAC collection: its JSON file, or its address in an API (…/collections/NAME)"
 #: Items of a page, and largest number of pages.

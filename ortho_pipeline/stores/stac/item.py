@@ -14,8 +14,8 @@ from typing import Any
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import AnyPath, Location
+from ortho_pipeline.stores.stac.boxes import Box, boxes_of
 from ortho_pipeline.stores.stac.documents import COLLECTIONS, REMEDY, read_document, target
-from ortho_pipeline.stores.stac.places import Box, boxes_of
 
 #: Roles of what an image or a DEM is read from, the first first.
 _ROLES = ("data", "visual")

@@ -15,7 +15,7 @@ from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical, horizontal, parse_crs
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
-from ortho_pipeline.stores.beside import ask_beside
+from ortho_pipeline.stores.sidecars import ask_beside
 from ortho_pipeline.stores.stac.collection import Collection
 from ortho_pipeline.stores.stac.item import Asset
 from ortho_pipeline.surface.base import parse_fill

@@ -14,7 +14,7 @@ from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.raster.source import open_pixels
 from ortho_pipeline.runtime.process_limits import thread_pool
-from ortho_pipeline.stores.kept import kept
+from ortho_pipeline.stores.local_cache import kept
 from ortho_pipeline.stores.objects import Objects
 from ortho_pipeline.stores.stac.collection import Collection
 from ortho_pipeline.surface.cells.copernicus import LARGEST, LIST, PUBLIC, PUBLIC_LAND, Cell, cells_of_list

@@ -12,8 +12,8 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, keep_off_nodata, value_range
-from ortho_pipeline.raster.output import raster_output, written
 from ortho_pipeline.raster.source import MEMORY
+from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.warp.mosaic.balance import Balance
 from ortho_pipeline.warp.mosaic.layout import Mosaic, box_of, circular_errors, intersection, windows
 from ortho_pipeline.warp.mosaic.reading import Opened, open_layers

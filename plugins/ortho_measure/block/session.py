@@ -26,9 +26,9 @@ from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
 from ortho_pipeline.commands.control.block_points import observed, read_points, settled_scenes
 from ortho_pipeline.commands.control.search import search_of
 from ortho_pipeline.commands.control.ties import DEM_SIGMA, FLAT_SIGMA, names_of
-from ortho_pipeline.commands.heights.surfaces import open_surface, require_heights
+from ortho_pipeline.commands.heights.opening import open_surface, require_heights
+from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import Request
-from ortho_pipeline.commands.resolved.resolving import on_surface
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, sha256

@@ -15,9 +15,9 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.imaging.matching.chips import Renderer
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
-from ortho_pipeline.raster.output import png_bytes
 from ortho_pipeline.raster.pyramid import Pyramid, stretch
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.verified_writing import png_bytes
 
 #: Side of a tile (px).
 SIDE = 256

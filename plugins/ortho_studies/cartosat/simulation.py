@@ -19,7 +19,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
-from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.surface.writing import write_terrain
 from ortho_studies.cartosat import rendering
 from ortho_studies.cartosat import truth as simulated

@@ -19,7 +19,7 @@ from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.files import write_text
 from ortho_pipeline.points import Points, write_points
-from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.surface.writing import write_terrain
 from ortho_studies.ikonos import rendering
 from ortho_studies.ikonos import truth as simulated

@@ -19,7 +19,7 @@ from ortho_pipeline.files import write_text
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.models.rational import RPC
 from ortho_pipeline.points import write_points
-from ortho_pipeline.raster.output import raster_output, written
+from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.surface.writing import write_terrain
 from ortho_studies.orbview3 import rendering
 from ortho_studies.orbview3 import truth as simulated

@@ -8,7 +8,7 @@ import os
 
 from ortho_pipeline.commands.control.crops import open_by_evidence
 from ortho_pipeline.commands.control.points import read_control
-from ortho_pipeline.commands.heights.surfaces import has_surface, open_surface
+from ortho_pipeline.commands.heights.opening import has_surface, open_surface
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline import host
-from ortho_pipeline.commands.heights.surfaces import dem_as_stated
+from ortho_pipeline.commands.heights.opening import dem_as_stated
 from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.commands.stac.given import heights_given, with_items
@@ -33,7 +33,8 @@ from ortho_pipeline.models import families
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.report import document as report
-from ortho_pipeline.stores import kept
+from ortho_pipeline.runtime.compiled import COMPILER
+from ortho_pipeline.stores import local_cache
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.cells.copernicus import extent_of
@@ -238,7 +239,7 @@ def doctor(*, fetch_grids: bool = False) -> dict[str, Any]:
     """
     fetched = fetch_missing() if fetch_grids else []
     plugins = host.Host(installed=True, lenient=True)
-    packages = ("ortho-pipeline", "numpy", "scipy", "numba", "pyproj", "click", "pluggy")
+    packages = ("ortho-pipeline", "numpy", "scipy", COMPILER, "pyproj", "click", "pluggy")
     allowed = [name for name in raster.DRIVERS if raster.gdal.GetDriverByName(name) is not None]
     return {
         "schema_version": SCHEMA_VERSION,
@@ -268,12 +269,12 @@ def kept_files(*, verify: bool = False) -> dict[str, Any]:
     files = [
         {"address": record.address, "path": str(record.path), "bytes": record.bytes, "sha256": record.sha256}
         | ({"state": record.state()} if verify else {})
-        for record in kept.records()
+        for record in local_cache.records()
     ]
-    return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": files}
+    return {"schema_version": SCHEMA_VERSION, "folder": str(local_cache.folder()), "files": files}
 
 
 def forget_kept_files() -> dict[str, Any]:
     """Delete the cached downloads; return their number and bytes."""
-    count, size = kept.clear()
-    return {"schema_version": SCHEMA_VERSION, "folder": str(kept.folder()), "files": count, "bytes": size}
+    count, size = local_cache.clear()
+    return {"schema_version": SCHEMA_VERSION, "folder": str(local_cache.folder()), "files": count, "bytes": size}

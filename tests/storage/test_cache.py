@@ -14,7 +14,7 @@ from dying import SOURCE
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import confined, together, write_text
-from ortho_pipeline.stores import kept
+from ortho_pipeline.stores import local_cache
 from ortho_pipeline.stores.objects import Content
 
 ADDRESS = "https://example.org/cells/N37E033.tif"
@@ -23,7 +23,7 @@ DATA = b"heights"
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(kept.FOLDER, str(tmp_path / "cache"))
+    monkeypatch.setenv(local_cache.FOLDER, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
@@ -43,13 +43,13 @@ def names(folder: Path) -> list[str]:
 #: Fetches a file and dies at the k-th call of the system that changes the folder.
 DYING = f"""{SOURCE}
 import hashlib, sys
-from ortho_pipeline.stores import kept
+from ortho_pipeline.stores import local_cache
 from ortho_pipeline.stores.objects import Content
 def fetched(path):
     path.write_bytes(b"heights")
     return Content(7, hashlib.sha256(b"heights").hexdigest(), (), None)
 die_at(int(sys.argv[1]))
-kept.kept("dem", sys.argv[2], fetched)
+local_cache.kept("dem", sys.argv[2], fetched)
 """
 
 
@@ -58,14 +58,14 @@ def test_killed_at_any_moment_the_next_command_finds_or_fetches_it(cache: Path) 
     for deadline in range(1, 60):
         address = f"{ADDRESS}{deadline}"
         ended.append(subprocess.run([sys.executable, "-c", DYING, str(deadline), address], check=False).returncode)
-        assert {one.state() for one in kept.records()} <= {"sound"}
-        file = kept.kept("dem", address, fetched)
+        assert {one.state() for one in local_cache.records()} <= {"sound"}
+        file = local_cache.kept("dem", address, fetched)
         assert file.read_bytes() == DATA
         # A list of renames that are all done may be left, until the next one who writes or removes the file.
         left = set(names(cache)) - {file.name, f"{file.name}.json"}
         assert all(name.endswith((".journal.part", ".lock.part")) for name in left)
-        assert kept.kept("dem", address, not_fetched) == file
-        assert kept.clear() == (1, len(DATA))
+        assert local_cache.kept("dem", address, not_fetched) == file
+        assert local_cache.clear() == (1, len(DATA))
         assert names(cache) == []
         if ended[-1] == 0:
             break
@@ -79,14 +79,14 @@ def test_it_is_no_part_of_the_outputs_that_are_under_way(cache: Path, tmp_path: 
     def fail() -> None:
         with confined(tmp_path / "out"), together(tmp_path / "out", "scene"):
             write_text(tmp_path / "out" / "scene.txt", "new")
-            assert kept.kept("dem", ADDRESS, fetched).read_bytes() == DATA
+            assert local_cache.kept("dem", ADDRESS, fetched).read_bytes() == DATA
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         fail()
     assert len(names(cache)) == 2
     assert not (tmp_path / "out").exists()
-    kept.kept("dem", ADDRESS, not_fetched)
+    local_cache.kept("dem", ADDRESS, not_fetched)
 
 
 def test_who_needs_what_another_one_fetches_waits_for_it(cache: Path) -> None:
@@ -97,10 +97,12 @@ def test_who_needs_what_another_one_fetches_waits_for_it(cache: Path) -> None:
         assert proceed.wait(20)
         return fetched(path)
 
-    threads = [threading.Thread(target=lambda: found.append(kept.kept("dem", ADDRESS, slowly)))]
+    threads = [threading.Thread(target=lambda: found.append(local_cache.kept("dem", ADDRESS, slowly)))]
     threads[0].start()
     assert begun.wait(20)
-    threads += [threading.Thread(target=lambda: found.append(kept.kept("dem", ADDRESS, not_fetched))) for _ in range(3)]
+    threads += [
+        threading.Thread(target=lambda: found.append(local_cache.kept("dem", ADDRESS, not_fetched))) for _ in range(3)
+    ]
     for thread in threads[1:]:
         thread.start()
     proceed.set()
@@ -116,26 +118,26 @@ def test_what_is_not_there_or_not_sound_is_not_kept(cache: Path) -> None:
         raise FileNotFoundError(2, "there is no such object", ADDRESS)
 
     with pytest.raises(FileNotFoundError):
-        kept.kept("dem", ADDRESS, missing)
+        local_cache.kept("dem", ADDRESS, missing)
     with pytest.raises(InputError, match="not valid: no heights"):
-        kept.kept("dem", ADDRESS, fetched, fault=lambda path: "no heights")
+        local_cache.kept("dem", ADDRESS, fetched, fault=lambda path: "no heights")
     assert names(cache) == []
-    assert kept.kept("dem", ADDRESS, fetched).read_bytes() == DATA
+    assert local_cache.kept("dem", ADDRESS, fetched).read_bytes() == DATA
 
 
 def test_where_nothing_can_be_kept_the_remedy_names_the_variable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv(kept.FOLDER, str(tmp_path / "file" / "cache"))
+    monkeypatch.setenv(local_cache.FOLDER, str(tmp_path / "file" / "cache"))
     with pytest.raises(InputError, match="cannot write here") as refused:
-        kept.kept("dem", ADDRESS, fetched)
-    assert kept.FOLDER in str(refused.value.remedy)
+        local_cache.kept("dem", ADDRESS, fetched)
+    assert local_cache.FOLDER in str(refused.value.remedy)
 
     def full(path: Path) -> Content:
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setenv(kept.FOLDER, str(tmp_path / "cache"))
+    monkeypatch.setenv(local_cache.FOLDER, str(tmp_path / "cache"))
     with pytest.raises(InputError, match="No space left") as refused:
-        kept.kept("dem", ADDRESS, full)
-    assert kept.FOLDER in str(refused.value.remedy)
+        local_cache.kept("dem", ADDRESS, full)
+    assert local_cache.FOLDER in str(refused.value.remedy)
