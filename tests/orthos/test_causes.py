@@ -1,4 +1,4 @@
-"""`ortho verify` names deliberate errors: four each of wrong datum, wrong heights, shift, rotation and old model."""
+"""`ortho verify` names deliberate errors, four each of datum, heights, shift, rotation and old model; it refuses one."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from pairs import CORNER, Array, Look, Pair
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ortho_pipeline.commands.orthos.verifying import verify
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
 
 gdal.UseExceptions()
-SIDE, POST = 480, 2
+SIDE, POST = 320, 2
 #: PROJ's differences at the place of the pairs: metres to the east and north.
 DATUMS = {"Cape": (34.0, 62.1), "Arc 1950": (30.5, 59.6), "WGS 72BE": (-22.6, -1.5), "WGS 72": (-15.4, -3.9)}
 
@@ -35,7 +36,7 @@ def terrain(seed: int) -> Array:
 def leaning(seed: int, wrong: Array | float) -> Array:
     """Return metres to the east and north by which wrong heights displace posts, from a view off vertical."""
     random = np.random.default_rng([seed, 10])
-    azimuth, tangent = random.uniform(0, 2 * np.pi), random.uniform(0.1, 0.2)
+    azimuth, tangent = random.uniform(0, 2 * np.pi), random.uniform(0.1, 0.3)
     rate = tangent * np.array([np.sin(azimuth), np.cos(azimuth)])
     return rate * (terrain(seed) - wrong)[..., None]
 
@@ -76,6 +77,8 @@ CASES = {
     ],
 }
 WRONG = dict(enumerate(one for kind in CASES.values() for one in kind))
+#: Another season, and relief that displaces by 10 px within 100 px: the limit of so small an ortho.
+REFUSED = 5
 KINDS = [kind for kind, cases in CASES.items() for _ in cases]
 
 
@@ -102,7 +105,12 @@ def test_a_deliberate_error_is_named(tmp_path, number):
     ortho, reference = pair.write(tmp_path / "pair")
     dem = written(terrain(number), gsd, tmp_path / "dem.tif")
     surface = SurfaceOptions(dem=str(dem), vertical="ellipsoid")
-    result = verify(ortho, match=MatchOptions(reference=[str(reference)], search=120.0), surface=surface)
+    match = MatchOptions(reference=[str(reference)], search=120.0)
+    if number == REFUSED:
+        with pytest.raises(InputError, match="cannot match"):
+            verify(ortho, match=match, surface=surface)
+        return
+    result = verify(ortho, match=match, surface=surface)
     causes = result.document["causes"]
     assert causes, "no cause"
     assert causes[0]["code"] == kind, causes
