@@ -1,4 +1,4 @@
-"""`ortho verify` names deliberate errors: four each of datum, heights, shift, rotation and old model; one is refused."""
+"""`ortho verify` names deliberate errors: datum, heights, shift, rotation and old model, four each; one is refused."""
 
 from __future__ import annotations
 

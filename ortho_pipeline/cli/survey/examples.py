@@ -105,6 +105,12 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
             "ortho align out/scene_ortho.tif --reference reference.tif -o aligned",
         ),
     ),
+    "sharpen": (
+        (
+            "Pan-sharpen two finished orthos:",
+            "ortho sharpen pan/scene_ortho.tif ms/scene_ortho.tif -o sharpened",
+        ),
+    ),
     "dem-check": (("Compare a DEM with surveyed heights:", "ortho dem-check dem.tif --points gcps.csv"),),
     "sensors": (("List the supported products:", "ortho sensors"),),
     "models": (("List the models, with the number of points that each needs:", "ortho models"),),

@@ -87,6 +87,10 @@ _LOOK: dict[str, str] = {
     "maybe-cut-off": "Copy the file again.",
     "processing-level": "Check that the product was not resampled to a map.",
     "from-sensor": "Read this before you use the ortho.",
+    "sharpen-displaced": "Align the multispectral ortho, then sharpen it again.",
+    "sharpen-not-matched": "Compare both orthos on screen.",
+    "sharpen-unlike": "Check that both orthos are of one acquisition.",
+    "sharpen-no-gain": "Check the registration of the bands, and use the multispectral ortho.",
 }
 _KNOW: dict[str, str] = {
     "control-without-height": "Add heights if you have them.",
