@@ -143,7 +143,7 @@ def _usual(paths: list[Path], folder: Path, output: OutputOptions) -> np.ndarray
             continue
         match = MatchOptions(reference=(str(paths[master]),), search=60.0)
         try:
-            done = align(path, folder / "usual", match=match, output=output, correction="shift", resample=False)
+            done = align(path, folder / "usual", match=match, output=output, resample=False)
         except OrthoError:
             continue
         found[number] = done.document["correction"]["shift_px"]

@@ -89,6 +89,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
     "Which model": {
         "sensor": "No sensor recognises the image, or two do.",
         "sensor-option": "A sensor needs a value that the files do not state.",
+        "test": "You write a plugin, or you suspect one.",
         "rpc": "Tag and side-car differ, or the RPC is elsewhere.",
         "model": "An earlier run saved the model as `_model.json`.",
         "ortho": "The image is a finished ortho, such as Sentinel-2 or a national mosaic, and you treat it as a scene.",
@@ -114,6 +115,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
     },
     "More outputs": {
         "orthos": "You want the orthos of a block on one grid, ready for `mosaic`.",
+        "export": "CARS, Ames Stereo Pipeline or s2p computes a surface from the block.",
         "accuracy-raster": "The accuracy differs over the scene: steep ground, or control in one part only.",
         "visibility": "The view is oblique. With a surface model, `nodata` makes a true ortho.",
         "fill-from": "Another ortho shows what is hidden here.",
@@ -126,6 +128,9 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "acquired": "The metadata do not state the acquisition time.",
         "plots": "You need the plots of a report as pictures.",
         "kind": "You need PNG instead of SVG.",
+        "sharpen": "You have a panchromatic and a multispectral image of one acquisition.",
+        "weights": "You know how much each band contributes to the panchromatic one.",
+        "ratio": "The multispectral ortho has the pixel size of the panchromatic one already.",
         "force": "An RPC that is more than 0.1 px off is good enough for you.",
         "edge": "`edge` does not find a good edge by itself.",
         "transform": "Bands differ by something other than a projective transformation.",

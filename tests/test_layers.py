@@ -92,6 +92,7 @@ GDAL_MODULES = {
     "raster.pixel_types",
     "raster.ortho",
     "raster.regridded",
+    "raster.pansharpened",
     "surface.dem_file",
     "testing",
 }
@@ -334,7 +335,10 @@ def test_the_map_of_the_house_is_true() -> None:
 
 
 #: Whole command lines, of this program and of others, which are typed as they are.
-COMMAND_LINE = re.compile(r"\b(ortho (adjust|doctor|fit|measure|rectify|run)|pyproj sync|projsync|gdal_calc\.py) ")
+COMMAND_LINE = re.compile(
+    r"\b(ortho (adjust|align|doctor|fit|measure|rectify|run)|pyproj sync|projsync|gdal_calc\.py|"
+    r"mapproject|parallel_stereo|point2dem|dem_mosaic) "
+)
 
 
 def texts(path: Path) -> Iterator[str]:

@@ -291,6 +291,7 @@ reference_options = _grouped("match", MatchOptions, "reference", "reference_band
 tie_options = _grouped("match", MatchOptions, "search", "points")
 dem_datum_options = _grouped("surface", SurfaceOptions, "vertical", "override_vertical")
 network_option = _grouped("scene", SceneOptions, "allow_network")
+tested_options = _grouped("scene", SceneOptions, "sensor_options")
 #: All options of the ortho, as `OutputOptions`.
 output_options = _grouped("output", OutputOptions)
 #: The options of the orthos of a block.

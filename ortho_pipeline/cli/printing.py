@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
@@ -237,6 +238,22 @@ def print_models(models: list[dict[str, Any]]) -> None:
     for model in models:
         numbers = f"{model['parameters']:>10} {model['minimum_points']:>7} {str(model['dimensions']) + 'D':>7}"
         say(f"{model['name']:<13} {numbers}  {model['suits']}")
+
+
+def print_sensor_test(tested: Mapping[str, Any]) -> None:
+    """Print that a sensor passes the contract, what was tested, and what no program can test."""
+    origin = f"{tested['distribution']} {tested['version']}".strip()
+    columns, rows = tested["size"]
+    image = "this image" if tested["recognised"] else "not this image"
+    say(f"The sensor {tested['sensor']} passes the contract with {tested['image']}.")
+    say(f"  plugin      {tested['plugin']} of {origin}: names, options and arguments")
+    say(f"  recognises  {image}; no raster in memory, no TIFF without other files")
+    say(f"  scene       {columns} x {rows} pixels, model from {tested['model_source']}; facts, priors and domain")
+    for name, kind in tested["models"].items():
+        label = name if name == kind else f"{name} ({kind})"
+        say(f"  model {label}: shapes, NaN, distant points, ground to image and back, derivatives, parameters, copies")
+    image = shlex.join(["ortho", "info", str(tested["image"])])
+    say(f"Not tested: where the camera looks. Compare the corners with the vendor's: {image}")
 
 
 def print_comparison(result: CompareResult, units: str) -> None:

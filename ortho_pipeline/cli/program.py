@@ -28,6 +28,7 @@ GROUPS = {
     "Make orthos": {
         "rectify": ("scene.rectifying", "Make the ortho of IMAGE, with its accuracy report."),
         "align": ("orthos", "Align a finished ORTHO with an orthoimage."),
+        "sharpen": ("sharpening", "Pan-sharpen MS_ORTHO with PAN_ORTHO."),
         "mosaic": ("batch", "Combine ORTHOs on one grid into one raster."),
         "export": ("scene.rectifying", "Write the model of IMAGE for other programs."),
         "register": ("scene.bands", "Align the bands of separate cameras in one image."),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
+    from ortho_pipeline.commands.facts import block_formats as block_formats
     from ortho_pipeline.commands.facts import dem_check as dem_check
     from ortho_pipeline.commands.facts import doctor as doctor
     from ortho_pipeline.commands.facts import edge as edge
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands.facts import info as info
     from ortho_pipeline.commands.facts import kept_files as kept_files
     from ortho_pipeline.commands.facts import models as models
+    from ortho_pipeline.commands.facts import sensor_test as sensor_test
     from ortho_pipeline.commands.facts import sensors as sensors
     from ortho_pipeline.commands.facts import write_plots as write_plots
     from ortho_pipeline.commands.fitting import compare as compare
@@ -31,6 +33,7 @@ _NAMES = {
     "fitting": ("compare", "fit"),
     "rectification": ("check", "export", "rectify"),
     "facts": (
+        "block_formats",
         "dem_check",
         "doctor",
         "edge",
@@ -39,6 +42,7 @@ _NAMES = {
         "info",
         "kept_files",
         "models",
+        "sensor_test",
         "sensors",
         "write_plots",
     ),

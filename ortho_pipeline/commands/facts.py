@@ -1,23 +1,28 @@
-"""Facts about a scene, an image, a DEM and this machine: `ortho info`, `edge`, `dem-check`, `doctor`, `cache`."""
+"""Facts about a scene, an image, a DEM, a sensor and this machine: `ortho info`, `edge`, `sensors`, `doctor`, ..."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import shlex
+import sys
+import traceback
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline import host
+from ortho_pipeline import errors, host
 from ortho_pipeline.commands.heights.opening import dem_as_stated
 from ortho_pipeline.commands.inputs import open_image, open_scene
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION, Result, outputs_together
 from ortho_pipeline.commands.stac.given import heights_given, with_items
 from ortho_pipeline.commands.survey.map_raster import described, is_upright, kind_of
 from ortho_pipeline.display.notices import to_document
-from ortho_pipeline.errors import InputError, completed
+from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
@@ -26,7 +31,8 @@ from ortho_pipeline.files.locations import located
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
-from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.hookspecs import Scene, Sensor
+from ortho_pipeline.host.discovery import require_declared
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.imaging import resolution
 from ortho_pipeline.models import families
@@ -38,6 +44,7 @@ from ortho_pipeline.stores import local_cache
 from ortho_pipeline.surface import accuracy as dem_accuracy
 from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.cells.copernicus import extent_of
+from ortho_pipeline.testing import check_sensor
 
 
 def sensors() -> dict[str, Any]:
@@ -60,9 +67,122 @@ def sensors() -> dict[str, Any]:
     }
 
 
+def sensor_test(
+    name: str, image: str | os.PathLike[str] | None, options: SceneOptions = SceneOptions()
+) -> dict[str, Any]:
+    """Check the contract of plugins (`testing.check_sensor`) for an installed sensor and an image of it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor, or of its plugin, module or distribution if that has one sensor.
+    image : path or None
+        None is an error with the command to type, after the name was checked.
+    options : SceneOptions
+        Only `sensor_options` are used.
+
+    Raises
+    ------
+    InputError
+        If no or several sensors have this name, the image cannot be opened, or the sensor says that it is damaged.
+    PluginError
+        With the requirement of the contract that fails, or with the exception of the plugin and its line.
+    """
+    plugins = host.Host.discover()
+    sensor = _sensor_named(name, plugins)
+    if image is None:
+        raise InputError(
+            f"an image of the sensor {sensor.name!r} is missing",
+            field="test",
+            remedy=f"name it: `ortho sensors --test {sensor.name} IMAGE`",
+        )
+    origin = plugins.provenance(sensor.name)
+    require_declared(sensor, options.sensor_options, image)
+    again = shlex.join(["ortho", "sensors", "--test", sensor.name, str(image)])
+    remedy = f"correct the plugin, or give an image of its sensor; then test again: `{again}`"
+    with _contract_of(sensor, remedy):
+        scene = check_sensor(sensor, image, **options.sensor_options)
+        recognised = sensor.recognises(raster.open_dataset(image))
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "sensor": sensor.name,
+        "plugin": origin.plugin,
+        "distribution": origin.distribution,
+        "version": origin.version,
+        "image": str(image),
+        "sensor_options": dict(options.sensor_options),
+        "recognised": recognised,
+        "size": [scene.width, scene.height],
+        "models": {key: model.kind for key, model in scene.models.items()},
+        "model_source": str(scene.model_source),
+        "facts": json_value(scene.facts),
+    }
+
+
+def _sensor_named(name: str, plugins: host.Host) -> Sensor:
+    """Return the sensor of this name, or the only one of the plugin, module or distribution of this name."""
+    if name in plugins.sensors:
+        return plugins.sensors[name]
+    wanted = _comparable(name)
+    for broken in plugins.broken:
+        if wanted in {_comparable(broken.plugin), _comparable(broken.distribution)}:
+            raise PluginError(
+                f"the plugin cannot be imported ({broken.error})",
+                field=broken.plugin,
+                remedy="correct its module, then test it again",
+            )
+    named = []
+    for sensor in plugins.sensors.values():
+        origin = plugins.provenance(sensor.name)
+        if wanted in {_comparable(text) for text in (origin.plugin, origin.module, origin.distribution)}:
+            named.append(sensor)
+    if len(named) == 1:
+        return named[0]
+    if named:
+        names = ", ".join(sensor.name for sensor in named)
+        raise InputError(
+            f"{name!r} has several sensors: {names}",
+            field="test",
+            remedy=f"name one of them: `ortho sensors --test {named[0].name} IMAGE`",
+        )
+    raise InputError(
+        f"no installed sensor or plugin has the name {name!r}",
+        field="test",
+        remedy="list the names with `ortho sensors`; a plugin is listed when its package is installed",
+    )
+
+
+def _comparable(name: str) -> str:
+    """Return the name of a distribution as indexes compare it."""
+    return name.lower().replace("_", "-").replace(".", "-")
+
+
+@contextlib.contextmanager
+def _contract_of(sensor: Sensor, remedy: str) -> Iterator[None]:
+    """Turn a failed requirement, and any exception of the plugin, into a `PluginError` of the plugin's file."""
+    if not __debug__:
+        raise InputError("Python ignores assertions, so it cannot check the contract", remedy="unset PYTHONOPTIMIZE")
+    try:
+        yield
+    except OrthoError:
+        raise
+    except (Exception, SystemExit) as error:
+        *_, (frame, _line) = traceback.walk_tb(error.__traceback__)
+        of_contract = isinstance(error, AssertionError) and frame.f_globals["__name__"] == check_sensor.__module__
+        text = str(error) if of_contract else f"the plugin failed ({errors.described(error, sensor.open_scene)})"
+        file = getattr(sys.modules.get(getattr(sensor.open_scene, "__module__", "")), "__file__", None)
+        raise PluginError(text, file=file, field=sensor.name, remedy=remedy) from error
+
+
 def formats() -> dict[str, str]:
     """Return the formats that models are written in, by name, each with its title; broken plugins are left out."""
     return {name: file_format.title for name, file_format in host.Host(installed=True, lenient=True).formats.items()}
+
+
+def block_formats() -> dict[str, str]:
+    """Return the programs that take all images of a block, by name, each with its title; as `formats`."""
+    offers = host.Host(installed=True, lenient=True).block_formats
+    return {name: offer.title for name, offer in offers.items()}
 
 
 @with_items

@@ -15,7 +15,7 @@ from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
-from ortho_pipeline.hookspecs import Format, Scene, Sensor
+from ortho_pipeline.hookspecs import BlockFormat, Format, Scene, Sensor
 from ortho_pipeline.host.contract import scene_faults
 from ortho_pipeline.host.registry import Broken, Origin, Registry
 from ortho_pipeline.host.unread import unread
@@ -98,9 +98,19 @@ class Host:
         return self._registry.broken
 
     @functools.cached_property
+    def _added_formats(self) -> Mapping[str, Format | BlockFormat]:
+        return self._registry.formats()
+
+    @functools.cached_property
     def formats(self) -> Mapping[str, Format]:
         """File formats for models by name: those of the host, then those of plugins."""
-        return {**FORMATS, **self._registry.formats()}
+        added = {name: offer for name, offer in self._added_formats.items() if isinstance(offer, Format)}
+        return {**FORMATS, **added}
+
+    @functools.cached_property
+    def block_formats(self) -> Mapping[str, BlockFormat]:
+        """Formats for all images of a block, by name."""
+        return {name: offer for name, offer in self._added_formats.items() if isinstance(offer, BlockFormat)}
 
     def open_image(
         self,
@@ -174,15 +184,7 @@ class Host:
         options = dict(options or {})
         dataset = self.open_image(path, sensor, allow_network=allow_network, roots=roots)
         chosen = self.recognise(dataset, sensor, options)
-        for name in options:
-            if name not in chosen.options:
-                declared = ", ".join(chosen.options) or "none"
-                raise InputError(
-                    f"the sensor {chosen.name!r} has no option {name!r}; its options: {declared}",
-                    file=path,
-                    field=name,
-                    remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
-                )
+        require_declared(chosen, options, path)
         try:
             with completed(path, remedy=_COPY_IT):
                 scene = chosen.open_scene(dataset, **options)
@@ -257,6 +259,19 @@ def open_scene(
     return Host.discover().open_scene(
         path, sensor, options, allow_network=allow_network, roots=roots, crop_offset=crop_offset
     )
+
+
+def require_declared(sensor: Sensor, options: Iterable[str], path: str | PathLike[str]) -> None:
+    """Refuse options of a user that a sensor does not declare."""
+    for name in options:
+        if name not in sensor.options:
+            declared = ", ".join(sensor.options) or "none"
+            raise InputError(
+                f"the sensor {sensor.name!r} has no option {name!r}; its options: {declared}",
+                file=path,
+                field=name,
+                remedy=Text("see `ortho sensors`, or choose another sensor with ", Setting("scene.sensor", "NAME")),
+            )
 
 
 @functools.cache

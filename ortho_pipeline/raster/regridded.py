@@ -169,11 +169,7 @@ class Regridded:
 
     def _check_overlap(self) -> None:
         own, grid = self._own, self._grid
-        try:
-            to_own = pyproj.Transformer.from_crs(grid.crs, own.crs, always_xy=True)
-            box = to_own.transform_bounds(*grid.extent, densify_pts=21)
-        except pyproj.exceptions.ProjError:
-            box = (math.inf,) * 4
+        box = warped_bounds(grid, own.crs)
         xmin, ymin, xmax, ymax = own.extent
         if not (box[0] < xmax and box[2] > xmin and box[1] < ymax and box[3] > ymin):
             raise InputError(
@@ -181,6 +177,18 @@ class Regridded:
                 file=self.path,
                 remedy="give an ortho of this place, or leave it out",
             )
+
+
+def warped_bounds(grid: Grid, crs: pyproj.CRS) -> tuple[float, float, float, float]:
+    """Return xmin, ymin, xmax and ymax of a grid in another CRS; infinite if it is nowhere there."""
+    if grid.crs == crs:
+        return grid.extent
+    try:
+        to_crs = pyproj.Transformer.from_crs(grid.crs, crs, always_xy=True)
+        xmin, ymin, xmax, ymax = to_crs.transform_bounds(*grid.extent, densify_pts=21)
+    except pyproj.exceptions.ProjError:
+        return (math.inf,) * 4
+    return xmin, ymin, xmax, ymax
 
 
 def _offset(grid: Grid, own: Grid) -> tuple[int, int] | None:

@@ -274,6 +274,7 @@ COMMANDS = [
     "measure a.tif --reference b.tif --height 5 -o c.geojson", "mosaic a.tif b.tif -o c.tif",
     "cache list", "stack a.tif b.tif -o out",
     "verify a.tif --reference b.tif", "align a.tif --reference b.tif -o out",
+    "sharpen a.tif b.tif -o out",
 ]  # fmt: skip
 
 

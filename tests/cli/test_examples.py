@@ -18,7 +18,7 @@ from ortho_pipeline.cli.survey.examples import EXAMPLES
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 #: What takes seconds.
-SLOW = ("match", "stack", "ties", "--reference", "edge", "register")
+SLOW = ("match", "stack", "ties", "--reference", "edge", "register", "sharpen")
 #: What has to be there before.
 BEFORE = {
     "stack": [
@@ -30,6 +30,10 @@ BEFORE = {
     "mosaic": [
         f"ortho rectify scene.tif --height 800 -t_srs EPSG:32636 -tr 10 10 -te {box} -o {name}"
         for name, box in (("west", "530000 4121500 532000 4123500"), ("east", "531000 4121500 533000 4123500"))
+    ],
+    "sharpen": [
+        f"ortho rectify scene.tif --height 800 -t_srs EPSG:32636 {options} -te 530000 4121500 533000 4124500 -o {name}"
+        for name, options in (("pan", "-tr 10 10"), ("ms", "-tr 40 40 -r average -b 1,1"))
     ],
 }
 LINES = [(words, line) for words, examples in EXAMPLES.items() for _, line in examples]

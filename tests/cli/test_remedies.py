@@ -30,6 +30,8 @@ from ortho_pipeline.batch.runner import run as run_pipeline
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.orthos.verifying import verify
+from ortho_pipeline.commands.sharpening.registration import Agreement, displaced
+from ortho_pipeline.commands.sharpening.sharpen import sharpen
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.opening import gate
@@ -372,6 +374,27 @@ def _sensors(printed: Printed, folder: Path) -> None:
     assert "ikonos" in printed.paste(refused(open_scene, SAMPLE / "scene.tif", options={"no-such": "1"}))
 
 
+@case("commands", "ortho sensors")
+def _installed(printed: Printed, folder: Path) -> None:
+    assert "ikonos" in printed.paste(refused(commands.sensor_test, "no-such", None))
+
+
+@case("commands", "ortho sensors --test")
+def _tested(printed: Printed, folder: Path) -> None:
+    assert "passes" in printed.paste(refused(commands.sensor_test, "rpc", None), IMAGE=str(SAMPLE / "scene.tif"))
+    several = refused(commands.sensor_test, "ortho-pipeline", None).replace("asp", "rpc")
+    assert "passes" in printed.paste(several, IMAGE=str(SAMPLE / "scene.tif"))
+
+
+@case("commands", "ortho info")
+def _one_scene_in_a_folder(printed: Printed, folder: Path) -> None:
+    (folder / "my photos").mkdir()
+    for name in ("scene.tif", "scene_RPC.TXT"):
+        (folder / "my photos" / name).symlink_to(SAMPLE / name)
+    told = ortho("adjust", "my photos", "--ties", "auto", "--height", "900", "-o", "out")
+    assert "1000 x 1000, rpc" in printed.paste(told)
+
+
 @case("imaging", "ortho info")
 def _elsewhere(printed: Printed, folder: Path) -> None:
     far = tiff(folder / "far.tif", GREY, dem=True)
@@ -417,6 +440,27 @@ def _raw(printed: Printed, folder: Path) -> None:
     reference = MatchOptions(reference=[SAMPLE / "reference.tif"])
     printed.paste(refused(verify, SAMPLE / "scene.tif", match=reference), DEM=str(SAMPLE / "dem.tif"))
     assert (folder / "out" / "scene_ortho.tif").exists()
+
+
+@case("commands", "gdalbuildvrt -separate")
+def _bands(printed: Printed, folder: Path) -> None:
+    pan, coarse = folder / "pan.tif", folder / "blue.tif"
+    gdal.Translate(str(coarse), str(SAMPLE / "reference.tif"), widthPct=25, heightPct=25)
+    shutil.copy(SAMPLE / "reference.tif", pan)
+    printed.paste(
+        refused(sharpen, pan, coarse, folder / "out"), BLUE="blue.tif", GREEN="blue.tif", RED="blue.tif", NIR="blue.tif"
+    )
+    assert gdal.Open(str(folder / "ms.vrt")).RasterCount == 4
+
+
+@case("commands", "ortho align")
+def _displaced(printed: Printed, folder: Path) -> None:
+    pan, coarse = folder / "pan.tif", folder / "ms.tif"
+    gdal.Translate(str(pan), str(SAMPLE / "reference.tif"), srcWin=[100, 100, 400, 400])
+    gdal.Translate(str(coarse), str(pan), widthPct=50, heightPct=50, resampleAlg="average")
+    notice = displaced(Agreement((0.7, 0.0), (0.02, 0.02), 0.7, 90, 100), "pan.tif", "ms.tif")
+    printed.paste(notice)
+    assert (folder / "aligned" / "ms_aligned.tif").is_file()
 
 
 @case("commands", "gdal_edit.py -a_srs")

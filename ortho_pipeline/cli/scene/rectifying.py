@@ -23,6 +23,7 @@ from ortho_pipeline.cli.options import (
 )
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import checked_text, print_json, print_result, progress
+from ortho_pipeline.cli.sharpening import weights_option
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 
 
@@ -39,6 +40,13 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
     help="Also delete leftovers of earlier runs and sidecar files that GIS software would pick up. (Existing outputs "
     "are always replaced.)",
 )
+@click.option(
+    "--sharpen",
+    metavar="MS",
+    type=click.Path(),
+    help="Multispectral image of the same acquisition: also make its ortho on the same grid, and pan-sharpen it.",
+)
+@weights_option
 @dry_run_option
 @point_options
 @match_options
@@ -51,6 +59,8 @@ def rectify(
     image: str,
     folder: str,
     overwrite: bool,
+    sharpen: str | None,
+    weights: tuple[float, ...] | None,
     dry_run: bool,
     points: PointOptions,
     match: MatchOptions,
@@ -65,22 +75,29 @@ def rectify(
     """
     from ortho_pipeline import commands
 
+    if weights is not None and sharpen is None:
+        raise click.UsageError("--weights are for pan-sharpening: also give --sharpen.")
+    if dry_run and sharpen is not None:
+        raise click.UsageError("--dry-run checks one image: leave out --sharpen.")
     if dry_run:
         checked = commands.check(image, scene=scene, points=points, surface=surface, match=match, output=output)
         return print_json(checked) if as_json else say(checked_text(Path(image).name, checked))
+    options: dict[str, Any] = {
+        "scene": scene,
+        "points": points,
+        "surface": surface,
+        "match": match,
+        "output": output,
+        "overwrite": overwrite,
+        "command": click.get_current_context().meta["command"],
+    }
     with progress() as advance:
-        result = commands.rectify(
-            image,
-            folder,
-            scene=scene,
-            points=points,
-            surface=surface,
-            match=match,
-            output=output,
-            progress=advance,
-            overwrite=overwrite,
-            command=click.get_current_context().meta["command"],
-        )
+        if sharpen is None:
+            result = commands.rectify(image, folder, progress=advance, **options)
+        else:
+            from ortho_pipeline.commands.sharpening.bundle import rectify_bundle
+
+            result = rectify_bundle(image, sharpen, folder, weights=weights, progress=advance, **options)
     return print_result(result, as_json)
 
 

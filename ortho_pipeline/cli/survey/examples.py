@@ -111,8 +111,17 @@ EXAMPLES: Mapping[str, Sequence[tuple[str, str]]] = {
             "ortho stack series --date-pattern %Y%m%d -o stacked",
         ),
     ),
+    "sharpen": (
+        (
+            "Pan-sharpen two finished orthos:",
+            "ortho sharpen pan/scene_ortho.tif ms/scene_ortho.tif -o sharpened",
+        ),
+    ),
     "dem-check": (("Compare a DEM with surveyed heights:", "ortho dem-check dem.tif --points gcps.csv"),),
-    "sensors": (("List the supported products:", "ortho sensors"),),
+    "sensors": (
+        ("List the supported products:", "ortho sensors"),
+        ("Test the plugin of a sensor with one of its images:", "ortho sensors --test rpc scene.tif"),
+    ),
     "models": (("List the models, with the number of points that each needs:", "ortho models"),),
     "doctor": (("Check the installation:", "ortho doctor"),),
     "cache list": (("List the cached files:", "ortho cache list"),),

@@ -38,6 +38,9 @@ _STOP: dict[str, str] = {
     "metadata-contradict": "Find out which one is right before you use the ortho. Ask the supplier of the scene.",
 }
 _LOOK: dict[str, str] = {
+    "datum-unknown": Text(
+        "State the height datum with ", Setting("scene.sensor_options", "DATUM", key="vertical"), "."
+    ),
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "
     "there.",
     "bands-disagree": Text(
@@ -91,6 +94,10 @@ _LOOK: dict[str, str] = {
     "maybe-cut-off": "Copy the file again.",
     "processing-level": "Check that the product was not resampled to a map.",
     "from-sensor": "Read this before you use the ortho.",
+    "sharpen-displaced": "Align the multispectral ortho, then sharpen it again.",
+    "sharpen-not-matched": "Compare both orthos on screen.",
+    "sharpen-unlike": "Check that both orthos are of one acquisition.",
+    "sharpen-no-gain": "Check the registration of the bands, and use the multispectral ortho.",
 }
 _KNOW: dict[str, str] = {
     "control-without-height": "Add heights if you have them.",

@@ -1,0 +1,1 @@
+"""Pan-sharpening: weights, registration and quality of a panchromatic and a multispectral image, and their ortho."""

@@ -1,0 +1,169 @@
+"""`ortho rectify --sharpen`: both images of a bundle in; their orthos on one grid and the pan-sharpened ortho out.
+
+The panchromatic image is adjusted to the points. Errors of orbit and attitude are common to both images, so its
+correction also corrects the model of the multispectral image, in pixels of that image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.commands import inputs
+from ortho_pipeline.commands.rectification import rectify
+from ortho_pipeline.commands.results import Result, to_store
+from ortho_pipeline.commands.sharpening.sharpen import require_one, require_several, sharpen
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.estimation.ground_residuals import metre_partials
+from ortho_pipeline.exchange.model_file import read_model_file
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import ImageCorrection, SensorModel
+from ortho_pipeline.models.correction import COEFFICIENTS
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.raster.pansharpened import colour_bands
+from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.runtime.process_limits import Progress
+
+#: Options that open one image and cannot open both.
+_OF_ONE = ("rpc", "model", "crop_offset")
+
+
+@to_store(folder="sharpened")
+def rectify_bundle(
+    pan: str | os.PathLike[str],
+    colours: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    weights: Sequence[float] | None = None,
+    scene: SceneOptions = SceneOptions(),
+    points: PointOptions = PointOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    match: MatchOptions = MatchOptions(),
+    output: OutputOptions = OutputOptions(),
+    progress: Progress | None = None,
+    command: str | None = None,
+    overwrite: bool = False,
+) -> Result:
+    """Make the orthos of a panchromatic and a multispectral image with one adjustment, and sharpen the latter.
+
+    Both orthos have one grid, so each image is resampled once.
+
+    Returns
+    -------
+    Result
+        The files of `rectify` for the panchromatic image, the ortho `multispectral`, and those of `sharpen`.
+
+    Raises
+    ------
+    InputError
+        As `rectify` and `sharpen`, and for an adjustment that the multispectral image cannot take over.
+    """
+    _refuse_options(pan, colours, scene, points)
+    require_one(colour_bands(RasterSource(pan, **scene.access)), pan)
+    require_several(colour_bands(RasterSource(colours, **scene.access)), colours)
+    opened = inputs.open_scene(colours, scene)
+    common: dict[str, Any] = {"surface": surface, "progress": progress, "command": command, "overwrite": overwrite}
+    sharp = rectify(pan, folder, scene=scene, points=points, match=match, output=output, **common)
+    adjusted = read_model_file(sharp.files["model"]).model
+    model, ratio = taken_over(adjusted, opened)
+    corrected = dataclasses.replace(opened, models={model.kind: model}, adjusted={"from": Path(pan).name})
+    access = SceneOptions(allow_network=scene.allow_network, roots=scene.roots)
+    own = OutputOptions(
+        like=sharp.files["ortho"], resampling="cubic", nodata=output.nodata, memory=output.memory,
+        threads=output.threads, tolerance=output.tolerance, dem_interpolation=output.dem_interpolation,
+    )  # fmt: skip
+    wide = rectify(corrected, folder, scene=access, output=own, **common)
+    done = sharpen(
+        sharp.files["ortho"], wide.files["ortho"], folder, weights=weights, ratio=ratio, scene=access, output=output,
+        progress=progress,
+    )  # fmt: skip
+    files = {
+        **sharp.files,
+        "multispectral": wide.files["ortho"],
+        "sharpened": done.files["ortho"],
+        "quality": done.files["json"],
+    }
+    document = {**sharp.document, "sharpening": done.document}
+    document |= {name: done.document[name] for name in ("warnings", "notices")}
+    return Result(files, document, f"{sharp.summary}\n\nPan-sharpened:\n{done.summary}", sharp.failure)
+
+
+def _refuse_options(
+    pan: str | os.PathLike[str], colours: str | os.PathLike[str], scene: SceneOptions, points: PointOptions
+) -> None:
+    if Path(pan).stem == Path(colours).stem:
+        raise InputError(
+            "both images have the same name, so their orthos would have, too",
+            file=colours,
+            field="sharpen",
+            remedy="make each ortho in its own folder, and sharpen the orthos",
+        )
+    for name in _OF_ONE:
+        if getattr(scene, name) is not None:
+            raise InputError(
+                Text(Setting(f"scene.{name}"), " opens one image, and these are two"),
+                field=f"scene.{name}",
+                remedy="leave it out; or make each ortho by itself, and sharpen the orthos",
+            )
+    if points.correction == "model" or points.fit_model is not None:
+        field = "points.fit_model" if points.fit_model is not None else "points.correction"
+        raise InputError(
+            "the multispectral image can take over a correction in the image only",
+            field=field,
+            remedy=Text(
+                "use ", Setting("points.correction", "affine"), "; or make each ortho by itself, and sharpen the orthos"
+            ),
+        )
+
+
+def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
+    """Return the model of a scene with the correction of the panchromatic model, and the ratio of their pixel sizes.
+
+    Raises
+    ------
+    InputError
+        If the scene does not show the place of the panchromatic image, or is not coarser.
+    """
+    delivered = adjusted.model if isinstance(adjusted, ImageCorrection) else adjusted
+    middle = scene.model.image_to_ground(np.array([[scene.width / 2, scene.height / 2]]), scene.model.reference_height)
+    there = ground_transform(scene.model.crs, delivered.crs)(middle)
+    # Pixels in a square metre of the ground; NaN where a model does not reach.
+    with np.errstate(invalid="ignore"):
+        fine, coarse = (
+            float(abs(np.linalg.det(metre_partials(model, ground)[0][0])))
+            for model, ground in ((delivered, there), (scene.model, middle))
+        )
+    ratio = np.sqrt(fine / coarse)
+    if not np.isfinite(ratio):
+        raise InputError(
+            "this image does not show the place of the panchromatic image",
+            file=scene.path,
+            field="sharpen",
+            remedy="give the multispectral image of the same acquisition",
+        )
+    if ratio < 1.5:
+        raise InputError(
+            f"the pixels of this image are {ratio:.2g} times as wide as the panchromatic ones, so it is not coarser",
+            file=scene.path,
+            field="sharpen",
+            remedy=Text(
+                "give the multispectral image with ", Setting("sharpen"), ", and the panchromatic one as IMAGE"
+            ),
+        )
+    if not isinstance(adjusted, ImageCorrection):
+        return scene.model, round(ratio)
+    image = np.array([adjusted.origin])
+    ground = ground_transform(delivered.crs, scene.model.crs)(
+        delivered.image_to_ground(image, delivered.reference_height)
+    )
+    ((column, row),) = scene.model.ground_to_image(ground).tolist()
+    shifts = np.array([name.endswith("_shift") for name in COEFFICIENTS])
+    coefficients = np.where(shifts, adjusted.coefficients / ratio, adjusted.coefficients)
+    return ImageCorrection(scene.model, adjusted.correction, (column, row), coefficients), round(ratio)

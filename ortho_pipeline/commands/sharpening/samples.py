@@ -1,0 +1,132 @@
+"""Samples of two orthos on one coarse grid, and the weights of the multispectral bands in the panchromatic one.
+
+The panchromatic pixels are averaged to the multispectral pixel size. GDAL divides by the weighted sum of the bands, so
+the regression has no constant; a constant would change the brightness. Weights are not negative, as sensitivities are.
+
+Source: Lawson and Hanson 1974 (non-negative least squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.regridded import Regridded
+from ortho_pipeline.raster.source import Grid
+
+#: Side (coarse px) of a window, and the most values of all windows together (float32: 48 MB).
+_SIDE, _VALUES = 256, 12_000_000
+#: Fewest pixels with a value in both orthos, for each weight.
+_FEWEST = 10
+
+
+class Sample(NamedTuple):
+    """A window of both orthos: panchromatic ``(h, w)`` and multispectral ``(bands, h, w)``, NaN without a value."""
+
+    pan: NDArray[np.float32]
+    colours: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The weights of the bands.
+
+    Parameters
+    ----------
+    values : tuple of float
+    explained : float
+        Share of the variance of the panchromatic pixels that the weighted sum explains; below 0 it explains nothing.
+    residual : float
+        RMS of the residuals, in panchromatic values.
+    pixels : int
+        Number of pixels of the regression.
+    """
+
+    values: tuple[float, ...]
+    explained: float
+    residual: float
+    pixels: int
+
+
+def read_samples(pan: Regridded, colours: Regridded, bands: Sequence[int], grid: Grid, multiple: int) -> list[Sample]:
+    """Read windows that are spread evenly over a grid; their sides are multiples of a number if possible.
+
+    Parameters
+    ----------
+    pan, colours : Regridded
+        On this grid.
+    bands : sequence of int
+        Numbers of the multispectral bands.
+    """
+    starts, sides = [], []
+    for length in (grid.width, grid.height):
+        side = min(_SIDE, length)
+        side = max(side // multiple * multiple, min(multiple, length))
+        starts.append(np.linspace(0, length - side, max(1, length // side)).astype(int))
+        sides.append(side)
+    places = [(int(left), int(top)) for top in starts[1] for left in starts[0]]
+    most = max(1, _VALUES // (sides[0] * sides[1] * (len(bands) + 1)))
+    chosen = np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))
+    index, samples = np.array(bands) - 1, []
+    for left, top in (places[number] for number in chosen.tolist()):
+        (sharp, there), (pixels, valid) = (image.read(left, top, *sides) for image in (pan, colours))
+        values = np.where(valid[index], pixels[index].astype(np.float32), np.float32(np.nan))
+        samples.append(Sample(np.where(there[0], sharp[0].astype(np.float32), np.float32(np.nan)), values))
+    return samples
+
+
+def regress(samples: Iterable[Sample], count: int) -> Weights:
+    """Return the non-negative weights of so many bands that explain the panchromatic pixels best.
+
+    Raises
+    ------
+    InputError
+        If too few pixels have a value in both orthos, or no band is positively related to the panchromatic one.
+    """
+    normal, right = np.zeros((count, count)), np.zeros(count)
+    pixels, total, squares = 0, 0.0, 0.0
+    for sample in samples:
+        good = np.isfinite(sample.pan) & np.isfinite(sample.colours).all(axis=0)
+        design, observed = sample.colours[:, good].T.astype(np.float64), sample.pan[good].astype(np.float64)
+        normal += design.T @ design
+        right += design.T @ observed
+        pixels += len(observed)
+        total += float(observed.sum())
+        squares += float((observed**2).sum())
+    if pixels < _FEWEST * count:
+        raise InputError(
+            "the panchromatic and the multispectral ortho have no valid pixels in common",
+            field="nodata",
+            remedy="check the nodata values and masks of both",
+        )
+    values = _non_negative(normal, right)
+    if not values.any():
+        raise InputError(
+            "no multispectral band is related to the panchromatic ortho",
+            field="weights",
+            remedy="give both orthos of one acquisition",
+        )
+    left = max(squares - 2 * float(values @ right) + float(values @ normal @ values), 0.0)
+    variance = squares - total**2 / pixels
+    explained = 1.0 - left / variance if variance > 0 else 0.0
+    return Weights(tuple(values.tolist()), explained, float(np.sqrt(left / pixels)), pixels)
+
+
+def _non_negative(normal: Array, right: Array) -> Array:
+    """Return the non-negative solution of normal equations."""
+    scale = np.sqrt(np.diag(normal))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    # A dependent band has no eigenvalue of its own; it may have any weight, so it gets the smallest.
+    root = np.sqrt(np.maximum(values, 0.0))
+    kept = root > 1e-7 * root.max()
+    design = (vectors * root).T[kept]
+    observed = (vectors.T @ (right / scale))[kept] / root[kept]
+    return np.asarray(optimize.nnls(design, observed)[0] / scale)

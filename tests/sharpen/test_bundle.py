@@ -1,0 +1,119 @@
+"""`ortho rectify --sharpen`: one adjustment for both images of a bundle, and both orthos on one grid."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bundles import Bundle, write
+from click.testing import CliRunner
+from osgeo import gdal
+from seeds import SIZE, rpc
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.sharpening.bundle import taken_over
+from ortho_pipeline.commands.sharpening.registration import Agreement
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import ImageCorrection
+
+
+def coarse_scene() -> Scene:
+    """Return a scene four times as coarse as `rpc()`."""
+    return Scene("rpc", "ms.tif", SIZE[0] // 4, SIZE[1] // 4, {"rpc": rpc().scaled(4.0)}, "made")
+
+
+@pytest.mark.parametrize("kind", ["none", "shift", "affine"])
+def test_a_correction_is_taken_over_in_pixels_of_the_other_image(kind: str) -> None:
+    coefficients = {"none": np.zeros(6), "shift": np.array([3.0, 0, 0, -2.0, 0, 0])}
+    affine = np.array([3.0, 1e-3, -2e-3, -2.0, 5e-4, 1.5e-3])
+    adjusted = ImageCorrection(rpc(), kind, (40.0, 10.0), coefficients.get(kind, affine))
+    model, ratio = taken_over(adjusted, coarse_scene())
+    image = np.random.default_rng(0).uniform(0, SIZE, (50, 2))
+    ground = rpc().image_to_ground(image, rpc().h_off)
+    # Outer corners agree, so a place in one image is a quarter of that in the other.
+    np.testing.assert_allclose(4 * model.ground_to_image(ground), adjusted.ground_to_image(ground), atol=1e-3)
+    assert ratio == 4
+
+
+def test_images_that_are_no_bundle_are_refused() -> None:
+    scene = coarse_scene()
+    with pytest.raises(InputError, match="not coarser"):
+        taken_over(rpc(), replace(scene, models={"rpc": rpc()}))
+    far = replace(scene.model, lon_off=scene.model.lon_off + 90.0)
+    with pytest.raises(InputError, match="does not show the place"):
+        taken_over(rpc(), replace(scene, models={"rpc": far}))
+
+
+def bundle_of(folder: Path) -> tuple[Path, Path]:
+    """Write both images of a bundle with RPCs: places of both are those of one RPC."""
+    pixels = Bundle(side=256).pixels()
+    paths = []
+    for name, raster, scale in (("pan", pixels[0][None], 1.0), ("ms", pixels[1], 4.0)):
+        path = write(folder / f"{name}.tif", raster, 1.0)
+        model = rpc() if scale == 1.0 else rpc().scaled(scale)
+        dataset = gdal.Open(str(path), gdal.GA_Update)
+        dataset.SetGeoTransform((0, 1, 0, 0, 0, 1))
+        dataset.SetProjection("")
+        dataset.SetMetadata(rpc_metadata(model), "RPC")
+        dataset = None
+        paths.append(path)
+    return paths[0], paths[1]
+
+
+def run(*words: Any) -> Any:
+    return CliRunner().invoke(cli, list(map(str, words)))
+
+
+def test_both_orthos_and_the_sharpened_one_share_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pan, colours = bundle_of(tmp_path)
+    height = rpc().h_off
+    places = np.array([[20.0, 30.0], [200.0, 40.0], [60.0, 210.0], [190.0, 180.0]])
+    ground = rpc().image_to_ground(places, height)
+    rows = ["id,col,row,x,y,h"]
+    rows += [
+        f"{k},{c + 2},{r - 1},{x},{y},{h}" for k, ((c, r), (x, y, h)) in enumerate(zip(places, ground, strict=True))
+    ]
+    (tmp_path / "gcps.csv").write_text("\n".join(rows))
+    agreement = Agreement((0.0, 0.0), (0.02, 0.02), 0.05, 100, 120)
+    monkeypatch.setattr("ortho_pipeline.commands.sharpening.sharpen.measure_agreement", lambda *_: agreement)
+    result = run(
+        "rectify", pan, "--sharpen", colours, "--height", height, "--gcps", tmp_path / "gcps.csv", "--points-crs",
+        "EPSG:4326", "--points-vertical", "ellipsoid", "-o", tmp_path / "out", "--json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    orthos = [gdal.Open(document["files"][name]) for name in ("ortho", "multispectral", "sharpened")]
+    assert len({ortho.GetGeoTransform() for ortho in orthos}) == 1
+    assert [ortho.RasterCount for ortho in orthos] == [1, 4, 4]
+    saved = json.loads((tmp_path / "out" / "ms_model.json").read_text())
+    coefficients = saved.get("model", saved)["coefficients"]
+    np.testing.assert_allclose([coefficients[0], coefficients[3]], [0.5, -0.25], atol=1e-3)
+    # The colours are where the detail is: the sharpened ortho averages to the multispectral one.
+    valid = orthos[2].GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+    assert document["sharpening"]["ratio"] == 4
+    sharp, wide = (ortho.ReadAsArray().astype(float)[:, valid] for ortho in (orthos[2], orthos[1]))
+    np.testing.assert_allclose(sharp.mean(axis=1), wide.mean(axis=1), rtol=0.02)
+
+
+def test_wrong_options_are_refused_before_any_work(tmp_path: Path) -> None:
+    pan, colours = bundle_of(tmp_path)
+    out = "--height", 800, "-o", tmp_path / "out"
+    for words, message in (
+        (("--sharpen", pan), "the same name"),
+        (("--sharpen", colours, "--rpc", "tag"), "opens one image"),
+        (("--sharpen", colours, "--fit-model", "affine3d", "--gcps", tmp_path / "p.csv"), "in the image only"),
+        (("--weights", "1,2"), "also give --sharpen"),
+        (("--sharpen", colours, "--weights", "a,b"), "not a list of numbers"),
+    ):
+        result = run("rectify", pan, *words, *out)
+        assert result.exit_code == 2, result.output
+        assert message in result.output
+    result = run("rectify", colours, "--sharpen", pan, *out)
+    assert "panchromatic image has one" in result.output
+    assert not (tmp_path / "out").exists()
