@@ -8,6 +8,8 @@
 #   make test-with  the tests with the oldest packages that pyproject.toml allows, or RESOLUTION=highest: the newest
 #   make page-types  the types of the scripts of `ortho measure`, by TypeScript (npx fetches it)
 #   make fuzz     read damaged files with every reader (N=100000 of each, READER=name for one, KEEP=folder for results)
+#   make mutants  small deliberate errors, and which of them no test catches (COUNT=300 of them, drawn by SEED=1); a run
+#                 that was stopped goes on where it was
 #   make bench    speed and memory against gdalwarp, of adjustments, of many scenes: docs/performance.json (an hour)
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make dist     build sdist and wheel in out/dist
@@ -42,7 +44,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-with faults lint check dist page-types fuzz bench packages docs images constraints pin-image clean
+.PHONY: help setup demo test test-all test-with faults mutants lint check dist page-types fuzz bench packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -73,6 +75,12 @@ test-all: setup
 faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup
 	@$(BIN)/python tests/attack/faults.py --limits $(N) --kills $$(( $(N) * 3 / 4 ))
+
+SEED ?= 1
+COUNT ?= 300
+mutants: setup
+	@$(BIN)/python tools/mutants.py --record
+	$(BIN)/python tools/mutants.py --seed $(SEED) --count $(COUNT)
 
 # The packages of a resolution of uv, in an environment of their own.
 RESOLUTION ?= lowest-direct

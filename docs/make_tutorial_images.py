@@ -329,6 +329,7 @@ FIGURES: dict[str, dict[str, Callable[[Path], None]]] = {
     "is-my-ortho-right.md": {},
     "which-model.md": {"compared.png": compared},
     "stereo-and-blocks.md": {"block.png": network, "heights.png": heights},
+    "drone-photos.md": {},
     "sensor-of-your-own.md": {"panoramic.png": panoramic},
     "many-scenes.md": {"run.jpg": run_page, "mosaic.jpg": mosaic},
 }

@@ -325,6 +325,42 @@ class Format:
 
 
 @dataclass(frozen=True)
+class BlockFormat:
+    """How another program takes all images of a block, for ``ortho adjust --export NAME``.
+
+    The host writes the models and the images without a georeference; the format adds a text that names them.
+
+    Parameters
+    ----------
+    name : str
+        Lower case, digits and dashes; unique among all formats.
+    title : str
+        One line for ``ortho adjust --help``.
+    file : str
+        Name of the text file, such as ``cars.json``; unique among all formats.
+    models : tuple of str
+        Names of the formats of the models, best first. The first one that represents all models is written.
+    text : callable(export) -> str
+        The content of the file, for a `ortho_pipeline.plugin.BlockExport`. Raises `InputError` if the program
+        cannot take the block.
+    command : str
+        The program to which people give the file, such as ``cars``.
+
+    Examples
+    --------
+    >>> BlockFormat("cars", "CARS 1", "cars.json", ("geom",), lambda export: "{}", "cars").file
+    'cars.json'
+    """
+
+    name: str
+    title: str
+    file: str
+    models: tuple[str, ...]
+    text: Callable[[Any], str]
+    command: str
+
+
+@dataclass(frozen=True)
 class Subcommand:
     """A command that a package adds to ``ortho``; its code is imported when it is called.
 
@@ -376,8 +412,8 @@ def ortho_models() -> Mapping[str, type[SensorModel]]:
 
 
 @hookspec
-def ortho_formats() -> Iterable[Format]:
-    """Return the file formats for sensor models that this plugin offers."""
+def ortho_formats() -> Iterable[Format | BlockFormat]:
+    """Return the file formats for sensor models that this plugin offers: of one image, or of all images of a block."""
     raise NotImplementedError
 
 

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.observations.prior import Prior as Prior
     from ortho_pipeline.estimation.observations.prior import priors_at as priors_at
     from ortho_pipeline.estimation.spatial.correlation import analyse_fit as analyse_fit
+    from ortho_pipeline.exchange.block_export import BlockExport as BlockExport
     from ortho_pipeline.exchange.export import Export as Export
     from ortho_pipeline.exchange.rpc import export_rpc as export_rpc
     from ortho_pipeline.exchange.rpc import has_rpc as has_rpc
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.files.folders import listing as listing
     from ortho_pipeline.files.locations import place as place
     from ortho_pipeline.files.xml_fields import XmlFields as XmlFields
+    from ortho_pipeline.files.xml_fields import parse_xml as parse_xml
     from ortho_pipeline.geodesy.crs import Vertical as Vertical
     from ortho_pipeline.geodesy.crs import ground_transform as ground_transform
     from ortho_pipeline.geodesy.crs import parse_crs as parse_crs
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.geodesy.ellipsoid import geocentric as geocentric
     from ortho_pipeline.geodesy.ellipsoid import geodetic as geodetic
     from ortho_pipeline.geodesy.ellipsoid import orbital_from_ecef as orbital_from_ecef
+    from ortho_pipeline.hookspecs import BlockFormat as BlockFormat
     from ortho_pipeline.hookspecs import Format as Format
     from ortho_pipeline.hookspecs import Piece as Piece
     from ortho_pipeline.hookspecs import Scene as Scene
@@ -167,6 +170,7 @@ _NAMES = {
         "priors_at",
     ),
     "estimation.spatial.correlation": ("analyse_fit",),
+    "exchange.block_export": ("BlockExport",),
     "exchange.export": ("Export",),
     "exchange.rpc": (
         "export_rpc",
@@ -191,7 +195,10 @@ _NAMES = {
         "listing",
     ),
     "files.locations": ("place",),
-    "files.xml_fields": ("XmlFields",),
+    "files.xml_fields": (
+        "XmlFields",
+        "parse_xml",
+    ),
     "geodesy.crs": (
         "Vertical",
         "ground_transform",
@@ -208,6 +215,7 @@ _NAMES = {
         "orbital_from_ecef",
     ),
     "hookspecs": (
+        "BlockFormat",
         "Format",
         "Piece",
         "Scene",

@@ -32,7 +32,7 @@ from ortho_pipeline.models.base import as_ground
 #: Image to ground and back must close within this (pixels).
 CLOSURE = 1e-5
 #: Partial derivatives must agree with finite differences, relative to the largest one.
-PARTIALS = 1e-4
+PARTIALS = 2e-5
 #: Largest distance of a domain from its image, in image sizes: a crop may have the domain of the whole scene.
 WIDEST = 20.0
 #: Images smaller than this (pixels) are tests, with larger domains.

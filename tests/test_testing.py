@@ -77,6 +77,12 @@ def test_good_models_pass():
     check_sensor_model(corrected, ground)
 
 
+@pytest.mark.parametrize(("names", "points"), [(0, 0), (1, 1), (2, 1), (3, 2), (9, 5)])
+def test_a_point_gives_two_equations(monkeypatch, names, points):
+    monkeypatch.setattr(Plane, "param_names", tuple("abcdefghi"[:names]))
+    assert Plane().minimum_points == points
+
+
 def wrong_shape(model, ground):
     return Plane.ground_to_image(model, ground)[:, 0]
 
@@ -175,6 +181,21 @@ def image(tmp_path):
     dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 2000, 1600)
     dataset.SetMetadata(rpc_metadata(make_rpc()), "RPC")
     return tmp_path / "a.tif"
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_rpc_whose_slope_is_wrong_by_a_ten_thousandth_is_found(monkeypatch, axis):
+    def projected(model, ground):
+        image, partials = RPC.projected(model, ground)
+        return image, partials * (1 + 1e-4 * np.eye(3)[axis])
+
+    wrong = {"projected": projected, "ground_partials": lambda model, ground: projected(model, ground)[1]}
+    broken = type("Broken", (RPC,), {**wrong, "kind": "test-broken"})
+    monkeypatch.setitem(KINDS, "test-broken", broken)
+    rpc = make_rpc()
+    centre, half = rpc.domain
+    with pytest.raises(AssertionError, match=f"along axis {axis} differs from finite differences"):
+        check_sensor_model(broken.from_dict(rpc.to_dict()), centre + GROUND * half)
 
 
 def test_model_that_cannot_be_pickled_is_found(monkeypatch):

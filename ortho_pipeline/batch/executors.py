@@ -365,7 +365,7 @@ def crew_of(
     elif executor == "sequential":
         yield Sequential(), threads
     elif executor in ("processes", None):
-        processors = len(os.sched_getaffinity(0))
+        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         count = max(1, min(workers or processors, jobs))
         budget = threads or max(1, processors // count)
         yield Processes(count, budget), budget

@@ -280,5 +280,6 @@ def locked(path: Path, *, shared: bool = False, wait: bool = False, owner: str =
         if not wait:
             owner = f"{owner} (process {os.getpid()} on {socket.gethostname()})".strip()
             os.ftruncate(lock.descriptor, 0)
-            os.pwrite(lock.descriptor, owner.encode(), 0)
+            os.lseek(lock.descriptor, 0, os.SEEK_SET)
+            os.write(lock.descriptor, owner.encode())
         yield

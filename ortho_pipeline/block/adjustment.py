@@ -25,7 +25,7 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.record import record_of
 from ortho_pipeline.block.heights.settling import Heights
-from ortho_pipeline.block.heights.source import DemHeights, started
+from ortho_pipeline.block.heights.source import DemHeights, starts
 from ortho_pipeline.block.intersection import frame_of, meet, models_of, predict
 from ortho_pipeline.block.local_frame import GEODETIC, GroundFrame
 from ortho_pipeline.block.points import BlockPoints, Index
@@ -238,11 +238,11 @@ def _prepared(
     known[flat, 2] = np.nan
     takes_part = ~_among(points, set(exclude))
     rays = takes_part[points.point]
-    local = meet(frame, models, points, rays)
     problem = BlockProblem(points, models, frame, known, pseudo_of(models, points, priors))
+    on_dem = np.full((len(points), 3), np.nan) if dem is None else starts(dem, problem, rays)
+    elsewhere = np.isnan(on_dem)
+    local = np.where(elsewhere, meet(frame, models, points, rays & elsewhere[points.point, 0]), on_dem)
     local = _at_known(problem, local, rays)
-    if dem is not None:
-        local = started(dem, problem, State(models, local), rays)
     seen = rays & np.isfinite(predict(frame, models, points, local)).all(axis=1)
     ground = points.control & takes_part
     nowhere = ~problem.active(Selection.of(seen, ground))

@@ -31,6 +31,21 @@ _models = click.option(
 )
 
 
+_PROGRAMS = "Also write models and a configuration for these stereo programs: {}. May be repeated."
+
+
+class _Programs(click.Option):
+    """The option ``--export``: its help names the programs of installed plugins."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the option and its help, for which the plugins are loaded."""
+        from ortho_pipeline import commands
+
+        listed = ", ".join(f"{name} ({title})" for name, title in commands.block_formats().items())
+        self.help = _PROGRAMS.format(listed)
+        return super().get_help_record(ctx)
+
+
 @click.command(cls=Command)
 @images_argument
 @folder_option
@@ -40,6 +55,7 @@ _models = click.option(
 @matching_options
 @surface_options
 @click.option("--orthos", is_flag=True, help="Also make the orthos of all images on one grid, for 'ortho mosaic'.")
+@click.option("--export", cls=_Programs, multiple=True, metavar="PROGRAM[,PROGRAM...]", help=_PROGRAMS)
 @block_output_options
 @sensor_options
 @open_option
@@ -52,24 +68,33 @@ def adjust(
     match: MatchOptions,
     surface: SurfaceOptions,
     orthos: bool,
+    export: tuple[str, ...],
     output: OutputOptions,
     scene: SceneOptions | list[SceneOptions],
     as_json: bool,
 ) -> None:
     """Adjust several IMAGEs together (bundle adjustment).
 
-    The images may be a stereo pair or a block. The command writes a model and an RPC of each image, the ground points
-    with their sigmas, and one report. Points with ground coordinates are control or check points; the others tie the
-    images together. --ties auto and --reference find points by matching; both need heights. --orthos also makes the
-    orthos of all images.
+    The images may be a stereo pair, a block, or one folder of photos. The command writes a model and an RPC of each
+    image, the ground points with their sigmas, and one report. Points with ground coordinates are control or check
+    points; the others tie the images together. --ties auto and --reference find points by matching; both need heights.
+    --orthos also makes the orthos of all images. --export writes what stereo programs need to compute a surface.
     """
     from ortho_pipeline.commands import block as blocks
+    from ortho_pipeline.stores.delivery import address_of
 
     if not orthos and output != OutputOptions():
         raise InputError(
             "this option is for orthos, and none are made",
             field="orthos",
             remedy=Text("leave it out, or add ", Setting("orthos")),
+        )
+    programs = [name.strip() for text in export for name in text.split(",")]
+    if programs and address_of(folder) is not None:
+        raise InputError(
+            "stereo programs read images and models from disk",
+            field="export",
+            remedy=Text("give a folder on disk, or leave out ", Setting("export")),
         )
     command = click.get_current_context().meta["command"]
     asked = output if orthos else None
@@ -83,6 +108,7 @@ def adjust(
             match=match,
             surface=surface,
             orthos=asked,
+            export=programs,
             command=command,
             progress=shown,
         )

@@ -95,15 +95,12 @@ def verify(
 @_mask_option
 @_band_option
 @click.option(
-    "--correction",
-    type=click.Choice(["shift", "affine", "field"]),
-    help="Kind of correction.  [default: what the matches justify]",
+    "--shift-only", is_flag=True, help="Correct a shift only.  [default: the correction that the matches justify]"
 )
-@click.option("--shift-only", is_flag=True, help="Correct a shift only.")
 @click.option(
     "--no-resample",
     is_flag=True,
-    help="Move the map grid and keep the pixels: write a VRT, or a copy with --format GTiff.",
+    help="Correct a shift only, by moving the map grid. Write a VRT, or a copy with --format GTiff.",
 )
 @click.option(
     "--max-bending",
@@ -125,7 +122,6 @@ def align(
     match: MatchOptions,
     masks: tuple[str, ...],
     band: int | None,
-    correction: str | None,
     shift_only: bool,
     no_resample: bool,
     bending: float,
@@ -141,8 +137,6 @@ def align(
     """
     from ortho_pipeline.commands.orthos import aligning
 
-    if shift_only and correction not in (None, "shift"):
-        raise click.UsageError("--shift-only and --correction contradict each other: leave out one.")
     groups = _grouped(grouped, "scene", "output")
     groups["output"] = replace(groups["output"], resampling=resampling)
     result = aligning.align(
@@ -151,7 +145,7 @@ def align(
         match=match,
         masks=masks,
         band=band,
-        correction="shift" if shift_only else correction,
+        shift_only=shift_only,
         bending=bending,
         resample=not no_resample,
         **groups,

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+#: Signals that end a command; Windows has one of them.
+_ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 #: Seconds until a lost signal is raised again.
 _AGAIN = 0.01
 
@@ -28,7 +30,7 @@ def ended_by_signals() -> Iterator[None]:
     After the block a signal ends the process at once, without a traceback of the interpreter that shuts down: the
     outputs have their names.
     """
-    for ending in (signal.SIGTERM, signal.SIGHUP):
+    for ending in _ENDING:
         # Under nohup a command is to survive the end of its terminal.
         if signal.getsignal(ending) == signal.SIG_DFL:
             signal.signal(ending, _end)
@@ -36,10 +38,11 @@ def ended_by_signals() -> Iterator[None]:
     try:
         yield
     finally:
-        for ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for ending in (signal.SIGINT, *_ENDING):
             if signal.getsignal(ending) in (signal.default_int_handler, _end):
                 signal.signal(ending, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         sys.unraisablehook = before
 
 
@@ -61,5 +64,7 @@ def _ask_again(lost: Any) -> None:
     def end(*_: Any) -> None:
         raise error.with_traceback(None)
 
+    if not hasattr(signal, "setitimer"):  # Windows: a person presses Ctrl-C once more
+        return
     signal.signal(signal.SIGALRM, end)
     signal.setitimer(signal.ITIMER_REAL, _AGAIN)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
+    from ortho_pipeline.commands.facts import block_formats as block_formats
     from ortho_pipeline.commands.facts import dem_check as dem_check
     from ortho_pipeline.commands.facts import doctor as doctor
     from ortho_pipeline.commands.facts import edge as edge
@@ -32,6 +33,7 @@ _NAMES = {
     "fitting": ("compare", "fit"),
     "rectification": ("check", "export", "rectify"),
     "facts": (
+        "block_formats",
         "dem_check",
         "doctor",
         "edge",

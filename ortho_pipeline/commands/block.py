@@ -24,6 +24,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
 from ortho_pipeline.commands.block_results.orthos import adjusted_scenes, corrected, make_orthos, ortho_files
+from ortho_pipeline.commands.block_results.other_programs import AdjustedBlock, block_formats, files_for
 from ortho_pipeline.commands.control.block_points import (
     gather,
     observed,
@@ -37,6 +38,7 @@ from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
 from ortho_pipeline.commands.stac.given import with_items
+from ortho_pipeline.commands.survey.folder import images_of
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Text, counted
@@ -72,6 +74,7 @@ def adjust(
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
     orthos: OutputOptions | None = None,
+    export: Sequence[str] = (),
     command: str | None = None,
     progress: Progress | None = None,
 ) -> Result:
@@ -80,7 +83,7 @@ def adjust(
     Parameters
     ----------
     images : sequence of path
-        Of one or many scenes; each is opened with its own sensor.
+        Of one or many scenes, each opened with its own sensor; or one folder with several.
     folder : path
         Folder of all outputs. Files of images are named by the stems of the images, after folders if stems are equal.
     scene : SceneOptions or sequence of SceneOptions
@@ -93,32 +96,33 @@ def adjust(
         Heights, for matching, as observations of the ties, and for orthos.
     orthos : OutputOptions, optional
         Make the orthos of all images, on one grid.
+    export : sequence of str
+        Names of programs that compute heights from the block: cars, asp, s2p, and formats of plugins.
 
     Returns
     -------
     Result
         `files` has report, html, points, points-csv, and ``<image> model`` and ``<image> rpc`` (where an RPC stands for
-        the model) of each image; with orthos also ``<image> ortho`` and so on, as those of `rectify`.
+        the model) of each image; with orthos also ``<image> ortho`` and so on, as those of `rectify`; with exports the
+        configuration of each program by its name, and ``<image> geom`` and so on.
 
     Raises
     ------
     InputError
         If an input or an option is wrong.
     """
-    labels = labels_of(images)
+    labels = labels_of(images := images_of(images, scene))
     files = _files(labels, Path(folder))
     of_orthos = {} if orthos is None else ortho_files(Path(folder), labels, orthos)
     scenes = scenes_of(images, scene, models)
     refuse_contradictions(points, match, surface, orthos=orthos is not None)
-    _check_paths(files, images, points, scenes, *models, match=match, surface=surface, orthos=of_orthos)
+    programs = block_formats(export)
+    written = of_orthos | {"export": files_for(programs, Path(folder), labels)}
+    _check_paths(files, images, points, scenes, *models, match=match, surface=surface, further=written)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
     table, notes = gathered.table, [*placed, *gathered.notices]
-    heights = _heights(table)
-    starts = {
-        label: start_of(image, points, own, table.in_image(label), heights)
-        for label, image, own in zip(labels, images, scenes, strict=True)
-    }
+    starts = _starts(images, labels, scenes, points, table)
     fit = adjust_block(
         {label: start.model for label, start in starts.items()},
         table,
@@ -145,6 +149,8 @@ def adjust(
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
         _write(files, report, fit, starts, exported, record)
+        block = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0])
+        told = block.export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
         if orthos is not None:
             under = [start.scene for start in starts.values()]
@@ -153,7 +159,7 @@ def adjust(
             failed = make_orthos(adjusted, of_orthos, ground, options, command, progress)
             failure = failure or next(iter(failed.values()), None)
             files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
-    text = Text.joined("\n", [block_report.summary_text(report), *gathered.text])
+    text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])
     return Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
 
 
@@ -226,6 +232,20 @@ def _heights(table: BlockPoints) -> tuple[float, float] | None:
     return (float(known.min()), float(known.max())) if len(known) else None
 
 
+def _starts(
+    images: Sequence[str | os.PathLike[str]],
+    labels: Sequence[str],
+    scenes: Sequence[SceneOptions],
+    points: BlockOptions,
+    table: BlockPoints,
+) -> dict[str, Start]:
+    heights = _heights(table)
+    return {
+        label: start_of(image, points, own, table.in_image(label), heights)
+        for label, image, own in zip(labels, images, scenes, strict=True)
+    }
+
+
 def _own(scene: Any, name: str | None) -> SensorModel:
     if name is not None and name not in scene.models:
         raise InputError(
@@ -262,14 +282,14 @@ def _check_paths(
     *more: str | os.PathLike[str],
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
-    orthos: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
+    further: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
 ) -> None:
     if not files:
         return
     for image, scene in zip(images, scenes, strict=True):
         for read in (options.points, options.gcps, options.spot_heights, *more):
             request = Request(image, scene, PointOptions(gcps=read), surface, match)
-            for written in (files, *orthos.values()):
+            for written in (files, *further.values()):
                 inputs.check_paths(written, request)
 
 

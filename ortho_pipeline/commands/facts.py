@@ -179,6 +179,12 @@ def formats() -> dict[str, str]:
     return {name: file_format.title for name, file_format in host.Host(installed=True, lenient=True).formats.items()}
 
 
+def block_formats() -> dict[str, str]:
+    """Return the programs that take all images of a block, by name, each with its title; as `formats`."""
+    offers = host.Host(installed=True, lenient=True).block_formats
+    return {name: offer.title for name, offer in offers.items()}
+
+
 @with_items
 def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> dict[str, Any]:
     """Describe a scene: sensor, size, models and their source, facts, position and ground sample distance.

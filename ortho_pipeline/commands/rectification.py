@@ -177,7 +177,7 @@ def export(
     Parameters
     ----------
     formats : sequence of str
-        Names of formats: rpc-txt, rpb, vrt, tag, gcp, gcp-tag, geolocation, and formats of plugins, such as csm.
+        Names of formats: those of `exchange.export.FORMATS`, and formats of plugins, such as csm.
     force : bool
         Write a file even if it differs from the model by more than 0.1 px.
 

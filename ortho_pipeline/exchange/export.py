@@ -21,6 +21,7 @@ from ortho_pipeline.exchange.rpc import (
     write_tagged_copy,
     write_vrt,
 )
+from ortho_pipeline.exchange.rpc_files import write_geom, write_rpc_xml
 from ortho_pipeline.hookspecs import Format
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.points import Points
@@ -156,6 +157,18 @@ FORMATS: Mapping[str, Format] = {
             "RPC in the TIFF tag of a copy",
             "_rpc.tif",
             lambda export, path: write_tagged_copy(export.dataset, export.rpc.rpc, path),
+        ),
+        (
+            "geom",
+            "RPC as keyword list of OTB, shareloc and CARS",
+            ".geom",
+            lambda export, path: write_geom(export.rpc.rpc, export.size, path),
+        ),
+        (
+            "rpc-xml",
+            "RPC as XML of DigitalGlobe and Ames Stereo Pipeline",
+            "_rpc.xml",
+            lambda export, path: write_rpc_xml(export.rpc.rpc, path),
         ),
         ("gcp", "ground control points", "_gcp.vrt", _write_gcps),
         ("gcp-tag", "ground control points in a copy", "_gcp.tif", _write_gcps),

@@ -44,6 +44,7 @@ __all__ = [
     "read_rpc",
     "rpc_metadata",
     "rpc_of_dataset",
+    "write_bare_vrt",
     "write_rpb",
     "write_rpc_txt",
     "write_tagged_copy",
@@ -269,6 +270,29 @@ def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> Non
             copy.SetMetadata(rpc_metadata(rpc), "RPC")
         name_sources_relatively(temporary, Path(path))
         _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
+
+
+def write_bare_vrt(dataset: gdal.Dataset, path: str | PathLike[str]) -> None:
+    """Write a VRT of an image without geotransform, CRS, GCPs and RPC, for programs that take these for a map.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    from defusedxml import ElementTree
+
+    with raster_output(path) as temporary:
+        with written(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)):
+            pass
+        name_sources_relatively(temporary, Path(path))
+        root = ElementTree.fromstring(temporary.read_bytes())
+        located = [root.find("SRS"), root.find("GeoTransform"), root.find("GCPList")]
+        located += [part for part in root.findall("Metadata") if part.get("domain") in ("RPC", "GEOLOCATION")]
+        for part in located:
+            if part is not None:
+                root.remove(part)
+        temporary.write_bytes(ElementTree.tostring(root))
 
 
 def name_sources_relatively(vrt: Path, final: Path) -> None:

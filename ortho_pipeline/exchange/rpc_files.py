@@ -1,4 +1,4 @@
-"""RPC text formats of vendors, read and written without GDAL.
+"""RPC text formats of vendors and other programs, read and written without GDAL.
 
 =====================  ============================================  =======================================
 format                 pixel origin in the file                      written by
@@ -365,3 +365,48 @@ def write_rpb(rpc: RPC, path: str | PathLike[str]) -> None:
             lines.append(f"\t{name} = {fields[key]};")
     lines += ["END_GROUP = IMAGE", "END;"]
     files.write_text(path, "\n".join(lines) + "\n")
+
+
+def write_geom(rpc: RPC, size: tuple[int, int], path: str | PathLike[str]) -> None:
+    """Write a keyword list (``.geom``) of Orfeo Toolbox, which shareloc and CARS read, too.
+
+    Parameters
+    ----------
+    size : (int, int)
+        Columns and rows of the image.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    fields = rpc_metadata(rpc)
+    lines = [f"{key.lower()}:  {fields[key]}" for key in SCALARS]
+    for key in COEFFICIENTS:
+        lines += [f"{key.lower()}_{n:02d}:  {value}" for n, value in enumerate(fields[key].split())]
+    # The toolbox writes 0 for an unknown accuracy.
+    lines += [
+        f"{name}:  {fields.get(key, 0)}" for name, key in (("bias_error", "ERR_BIAS"), ("rand_error", "ERR_RAND"))
+    ]
+    lines += ["polynomial_format:  B", "type:  ossimRpcModel"]
+    lines += [f"number_lines:  {size[1]}", f"number_samples:  {size[0]}"]
+    files.write_text(path, "\n".join(lines) + "\n")
+
+
+def write_rpc_xml(rpc: RPC, path: str | PathLike[str]) -> None:
+    """Write the RPC part of DigitalGlobe's XML, the form in which Ames Stereo Pipeline reads and writes an RPC.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    fields = rpc_metadata(rpc)
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<isd>", "<RPB>", "<SPECID>RPC00B</SPECID>", "<IMAGE>"]
+    for key, name in _RPB_NAMES.items():
+        tag = name.upper()
+        if key in COEFFICIENTS:
+            lines.append(f"<{tag}List><{tag}>{fields[key]}</{tag}></{tag}List>")
+        elif key in fields:
+            lines.append(f"<{tag}>{fields[key]}</{tag}>")
+    files.write_text(path, "\n".join([*lines, "</IMAGE>", "</RPB>", "</isd>"]) + "\n")

@@ -5,7 +5,7 @@ Imports nothing above `errors`.
 
 from __future__ import annotations
 
-from ortho_pipeline.files.locks import Lock
+from ortho_pipeline.files.locks import Lock, open_itself
 from ortho_pipeline.files.reading import decoded, parse_json, read_bounded, read_json, sha256, states
 from ortho_pipeline.files.whole import (
     Outputs,
@@ -33,6 +33,7 @@ __all__ = [
     "confined",
     "decoded",
     "json_text",
+    "open_itself",
     "parse_json",
     "part_of_outputs",
     "read_bounded",

@@ -6,8 +6,20 @@ who holds it. Readers cannot share its locks of files. Until 3.20.1 it followed 
 
 from __future__ import annotations
 
-import fcntl
+import errno
+import importlib
 import os
+import random
+import time
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+#: Where there is no `fcntl`: bytes of a lock, far beyond the end of any file, and seconds between two attempts.
+_FIRST, _BYTES, _PAUSE = 1 << 40, 64, 0.02
 
 
 class Lock:
@@ -42,10 +54,10 @@ class Lock:
     def __init__(
         self, path: str | os.PathLike[str], *, shared: bool = False, wait: bool = True, needed: bool = True
     ) -> None:
-        self.descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        self.descriptor = open_itself(path, os.O_RDWR | os.O_CREAT)
         self.held = True
         try:
-            fcntl.flock(self.descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+            _lock(self.descriptor, shared, wait)
         except OSError as error:
             self.held = False
             if needed or isinstance(error, BlockingIOError):
@@ -66,3 +78,39 @@ class Lock:
     def close(self) -> None:
         """Release the lock."""
         os.close(self.descriptor)
+
+
+def open_itself(path: str | os.PathLike[str], flags: int) -> int:
+    """Open a file, but not by a symbolic link in its place."""
+    if not hasattr(os, "O_NOFOLLOW") and os.path.islink(path):
+        raise OSError(errno.ELOOP, "a symbolic link is not followed", os.fspath(path))
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0), 0o666)
+
+
+def _lock(descriptor: int, shared: bool, wait: bool) -> None:
+    """Lock a file; where there is no `fcntl`, one of some bytes to share it, and all of them to have it alone."""
+    if fcntl is not None:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+        return
+    try:
+        windows: Any = importlib.import_module("msvcrt")
+    except ImportError:
+        raise OSError(errno.ENOLCK, "No locks available") from None
+    places = random.sample(range(_BYTES), _BYTES) if shared else [0]
+    while not any(_taken(windows, descriptor, place, 1 if shared else _BYTES) for place in places):
+        if not wait:
+            raise BlockingIOError(errno.EAGAIN, "another process holds this lock")
+        time.sleep(_PAUSE)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+
+
+def _taken(windows: Any, descriptor: int, place: int, count: int) -> bool:
+    """Lock some bytes, and tell whether that was possible."""
+    os.lseek(descriptor, _FIRST + place, os.SEEK_SET)
+    try:
+        windows.locking(descriptor, windows.LK_NBLCK, count)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EAGAIN, errno.EDEADLK):
+            raise
+        return False
+    return True

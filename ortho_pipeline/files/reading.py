@@ -41,8 +41,8 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
     try:
         if isinstance(path, VsiPath):
             return path.read(limit + 1)
-        # Without O_NONBLOCK, opening a pipe waits for somebody who writes to it.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        # Without O_NONBLOCK, opening a pipe waits for somebody who writes to it; Windows has no pipes among files.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 told.setdefault("remedy", "give a plain file")

@@ -483,6 +483,8 @@ def _sync(path: Path) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Bring the names in a folder to disk: a power cut after a file was made or renamed could lose its name."""
+    if os.name == "nt":  # a folder cannot be opened there
+        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

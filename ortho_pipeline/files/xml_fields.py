@@ -21,6 +21,34 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?", re.ASCII)
 _TIME = re.compile(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(\.\d{1,12})?Z?", re.ASCII)
 
 
+def parse_xml(data: bytes | str, path: os.PathLike[str] | str, remedy: str) -> Element:
+    """Return the root of XML that a stranger wrote; its names keep their namespaces.
+
+    Parameters
+    ----------
+    path : path
+        The file that has it, for messages.
+
+    Raises
+    ------
+    InputError
+        If it is no well-formed XML, or has entities or a DTD.
+
+    Examples
+    --------
+    >>> parse_xml("<scene gain='0.5'/>", "scene.xml", "copy it again").attrib
+    {'gain': '0.5'}
+    """
+    from defusedxml import ElementTree
+    from defusedxml.common import DefusedXmlException
+
+    try:
+        root: Element = ElementTree.fromstring(data, forbid_dtd=True)
+    except (ElementTree.ParseError, DefusedXmlException, ValueError, LookupError) as error:
+        raise InputError(f"this is not well-formed XML ({error})", file=path, remedy=remedy) from error
+    return root
+
+
 class XmlFields:
     """The fields of an XML file; names are without their namespaces.
 
@@ -48,9 +76,6 @@ class XmlFields:
     def __init__(
         self, path: os.PathLike[str], *, remedy: str = "copy the file again from the delivery", limit: int = MAX_SIZE
     ) -> None:
-        from defusedxml import ElementTree
-        from defusedxml.common import DefusedXmlException
-
         self.path, self.remedy = path, remedy
         self._midnight: datetime | None = None
         data = read_bounded(path, limit, remedy=remedy)
@@ -59,10 +84,7 @@ class XmlFields:
             raise InputError(
                 f"this file has more than {size}, too much for the metadata of a scene", file=path, remedy=remedy
             )
-        try:
-            self.root: Element = ElementTree.fromstring(data, forbid_dtd=True)
-        except (ElementTree.ParseError, DefusedXmlException, ValueError, LookupError) as error:
-            raise InputError(f"this is not well-formed XML ({error})", file=path, remedy=remedy) from error
+        self.root: Element = parse_xml(data, path, remedy)
         for element in self.root.iter():
             if isinstance(element.tag, str) and element.tag.startswith("{"):
                 element.tag = element.tag.rpartition("}")[2]

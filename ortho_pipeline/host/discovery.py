@@ -15,7 +15,7 @@ from ortho_pipeline.errors import InputError, OrthoError, PluginError, completed
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.crop import placed
 from ortho_pipeline.exchange.export import FORMATS
-from ortho_pipeline.hookspecs import Format, Scene, Sensor
+from ortho_pipeline.hookspecs import BlockFormat, Format, Scene, Sensor
 from ortho_pipeline.host.contract import scene_faults
 from ortho_pipeline.host.registry import Broken, Origin, Registry
 from ortho_pipeline.host.unread import unread
@@ -98,9 +98,19 @@ class Host:
         return self._registry.broken
 
     @functools.cached_property
+    def _added_formats(self) -> Mapping[str, Format | BlockFormat]:
+        return self._registry.formats()
+
+    @functools.cached_property
     def formats(self) -> Mapping[str, Format]:
         """File formats for models by name: those of the host, then those of plugins."""
-        return {**FORMATS, **self._registry.formats()}
+        added = {name: offer for name, offer in self._added_formats.items() if isinstance(offer, Format)}
+        return {**FORMATS, **added}
+
+    @functools.cached_property
+    def block_formats(self) -> Mapping[str, BlockFormat]:
+        """Formats for all images of a block, by name."""
+        return {name: offer for name, offer in self._added_formats.items() if isinstance(offer, BlockFormat)}
 
     def open_image(
         self,

@@ -21,14 +21,14 @@ import pluggy
 
 from ortho_pipeline import hookspecs
 from ortho_pipeline.errors import OrthoError, PluginError, described
-from ortho_pipeline.hookspecs import Format, Sensor, Subcommand
+from ortho_pipeline.hookspecs import BlockFormat, Format, Sensor, Subcommand
 
 if TYPE_CHECKING:
     from ortho_pipeline.models import SensorModel
 
 BUNDLED = "ortho-pipeline"
 _TYPED, _TARGET = re.compile(r"[a-z][a-z0-9-]*"), re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-_ENDING = re.compile(r"[._-][A-Za-z0-9._-]*\.?[A-Za-z0-9]+")
+_ENDING, _FILE = re.compile(r"[._-][A-Za-z0-9._-]*\.?[A-Za-z0-9]+"), re.compile(r"[a-z0-9-]+\.[a-z0-9]+")
 log = logging.getLogger(__name__)
 
 
@@ -159,40 +159,46 @@ class Registry:
                     families[name] = family
         return MappingProxyType(families)
 
-    def formats(self) -> Mapping[str, Format]:
+    def formats(self) -> Mapping[str, Format | BlockFormat]:
         """Collect the formats of all plugins, by name; their output is checked."""
         from ortho_pipeline.exchange.export import FORMATS, RESERVED
 
         self._reserved |= RESERVED
         endings = {offer.ending.casefold(): offer.name for offer in FORMATS.values()}
-        added = self.named("ortho_formats", "format", Format, lambda offer: _format_faults(offer, endings))
-        return {name: replace(offer, write=_checked(offer, self.owner[name])) for name, offer in added.items()}
+        kinds = (Format, BlockFormat)
+        added = self.named("ortho_formats", "format", kinds, lambda offer: _format_faults(offer, endings))
+        return {name: _checked(offer, self.owner[name]) for name, offer in added.items()}
 
     def commands(self) -> Mapping[str, Subcommand]:
         """Collect the commands of all packages, by name."""
         return self.named("ortho_commands", "command", Subcommand, _command_faults)
 
     def named(
-        self, hook: str, what: str, kind: type[Any], faults: Callable[[Any], Iterator[str]] = lambda _: iter(())
+        self,
+        hook: str,
+        what: str,
+        kind: type[Any] | tuple[type[Any], ...],
+        faults: Callable[[Any], Iterator[str]] = lambda _: iter(()),
     ) -> Mapping[str, Any]:
         """Collect the offers of a hook, by name.
 
         Parameters
         ----------
         hook : str
-            Returns an iterable of values of `kind`.
+            Returns an iterable of values of `kind`, or of one of several kinds.
         what : str
             Word for such a value in messages.
         faults : callable(offer) -> iterator of str
             Faults of an offer; the first one is an error of its plugin.
         """
         offers: dict[str, Any] = {}
-        advice = f"yield the {kind.__name__}, or return [{kind.__name__}(...)]"
+        wanted = (kind if isinstance(kind, tuple) else (kind,))[0].__name__
+        advice = f"yield the {wanted}, or return [{wanted}(...)]"
         for plugin, offered in self._returned(hook, Iterable, list, advice):
             with self._judged(self.origin[plugin]):
                 for offer in offered:
                     if not isinstance(offer, kind):
-                        raise PluginError(f"plugin {plugin}: {hook} yields {type(offer).__name__}, not {kind.__name__}")
+                        raise PluginError(f"plugin {plugin}: {hook} yields {type(offer).__name__}, not {wanted}")
                     if fault := next(faults(offer), None):
                         raise PluginError(f"plugin {plugin}: {fault}")
                     if offer.name in offers and self.owner[offer.name] == plugin:
@@ -272,34 +278,56 @@ class Registry:
         self.owner[name] = plugin
 
 
-def _format_faults(offer: Format, endings: dict[str, str]) -> Iterator[str]:
+def _format_faults(offer: Format | BlockFormat, endings: dict[str, str]) -> Iterator[str]:
     """Yield the faults of an offered format; `endings` are those in use, with the names of their formats."""
+    of_block = isinstance(offer, BlockFormat)
+    ending = offer.file if isinstance(offer, BlockFormat) else offer.ending
     if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
         yield f"{offer.name!r} is not a valid format name; use lower case, digits and dashes"
     elif not isinstance(offer.title, str) or not offer.title.strip():
         yield f"format {offer.name!r}: the title is empty"
-    elif not isinstance(offer.ending, str) or not _ENDING.fullmatch(offer.ending):
-        yield f"format {offer.name!r}: the ending must be like '_name.json', not {offer.ending!r}"
-    elif not callable(offer.write):
-        yield f"format {offer.name!r}: write must be callable"
-    elif (other := endings.setdefault(offer.ending.casefold(), offer.name)) != offer.name:
-        yield f"format {offer.name!r}: the format {other!r} has the same ending {offer.ending!r}"
+    elif of_block and not (isinstance(ending, str) and _FILE.fullmatch(ending)):
+        yield f"format {offer.name!r}: the file must be like 'name.json', not {ending!r}"
+    elif not of_block and not (isinstance(ending, str) and _ENDING.fullmatch(ending)):
+        yield f"format {offer.name!r}: the ending must be like '_name.json', not {ending!r}"
+    elif isinstance(offer, BlockFormat) and not (offer.models and all(isinstance(one, str) for one in offer.models)):
+        yield f"format {offer.name!r}: models must name formats"
+    elif not callable(offer.text if isinstance(offer, BlockFormat) else offer.write):
+        yield f"format {offer.name!r}: {'text' if of_block else 'write'} must be callable"
+    elif (other := endings.setdefault(ending.casefold(), offer.name)) != offer.name:
+        yield f"format {offer.name!r}: the format {other!r} has the same ending {ending!r}"
 
 
-def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
-    """Return a function that writes a plugin's format completely or not at all; its errors name the plugin."""
+def _checked(offer: Format | BlockFormat, plugin: str) -> Format | BlockFormat:
+    """Return a format that writes completely or not at all; errors name its plugin."""
+    label = f"format {offer.name!r} of plugin {plugin}"
+    if isinstance(offer, BlockFormat):
+        return replace(offer, text=_checked_text(offer, label))
+    return replace(offer, write=_checked_write(offer, label))
+
+
+def _checked_text(offer: BlockFormat, label: str) -> Callable[[Any], str]:
+    """Return the function for the text of a plugin's format."""
+
+    def text(export: Any) -> str:
+        with _of_plugin(label, offer.text, offer.file):
+            content = offer.text(export)
+        if not isinstance(content, str) or not content.strip():
+            raise PluginError(f"{label}: text returned {content!r}", remedy="authors: return the text of the file")
+        return content
+
+    return text
+
+
+def _checked_write(offer: Format, label: str) -> Callable[[Any, Path], float]:
+    """Return the function that writes a plugin's format."""
 
     def write(export: Any, path: Path) -> float:
         from ortho_pipeline.files import whole_or_nothing
 
-        label = f"format {offer.name!r} of plugin {plugin}"
         with whole_or_nothing(path) as temporary:
-            try:
+            with _of_plugin(label, offer.write, path):
                 worst = offer.write(export, temporary)
-            except OrthoError:
-                raise
-            except (Exception, SystemExit) as error:
-                raise PluginError(f"{label} failed ({described(error, offer.write)})", file=path) from error
             if not temporary.stat().st_size:
                 raise PluginError(f"{label} wrote nothing", file=path, remedy="authors: write to the given path")
             if isinstance(worst, bool) or not isinstance(worst, int | float) or not worst >= 0:
@@ -311,6 +339,17 @@ def _checked(offer: Format, plugin: str) -> Callable[[Any, Path], float]:
         return float(worst)
 
     return write
+
+
+@contextlib.contextmanager
+def _of_plugin(label: str, function: Callable[..., Any], file: str | Path) -> Iterator[None]:
+    """Let an error of a plugin's function name the plugin."""
+    try:
+        yield
+    except OrthoError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise PluginError(f"{label} failed ({described(error, function)})", file=file) from error
 
 
 def _command_faults(command: Subcommand) -> Iterator[str]:

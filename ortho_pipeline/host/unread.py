@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,19 +13,8 @@ from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import place
 
-_RECONSTRUCTIONS = ("reconstruction.json", "opensfm/reconstruction.json")
-#: Names of orthority's files of cameras and of orientations.
-_INTERIOR, _EXTERIOR = re.compile(r"int_param.*\.ya?ml$", re.I), re.compile(r"ext_param.*\.(geojson|csv)$", re.I)
 _NUMBERS = r"(?:[\s,;]+[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?){6}"
 _TABLE_BYTES = 1_000_000
-_BY_HAND = Text(
-    "write a camera file (JSON) and a table of orientations (CSV) as in docs/formats/frame.md, and give ",
-    Setting("scene.sensor_options", "FILE", key="camera"),
-    " ",
-    Setting("scene.sensor_options", "FILE", key="exterior"),
-    " ",
-    Setting("scene.sensor_options", "DATUM", key="vertical"),
-)
 
 
 class Unread(NamedTuple):
@@ -39,33 +27,19 @@ class Unread(NamedTuple):
 def unread(dataset: Any) -> Unread | None:
     """Return what describes the orientation of an image, next to it or in it; None if nothing does."""
     image = place(dataset.GetDescription())
-    if isinstance(image, Path):
-        for file in (folder / name for folder in (image.parent, image.parent.parent) for name in _RECONSTRUCTIONS):
-            if file.is_file():
-                options = Text(
-                    Setting("scene.sensor_options", str(file), key="exterior"),
-                    " ",
-                    Setting("scene.sensor_options", "ellipsoid", key="vertical"),
-                )
-                return Unread(
-                    f"this image belongs to an OpenDroneMap or OpenSfM project ({file})",
-                    Text("give ", options, " (replace ellipsoid if its altitudes have another datum)"),
-                )
-        if files := list(_of_orthority(image.parent)):
-            return Unread(f"this image belongs to an orthority project ({', '.join(files)})", _BY_HAND)
-        if table := _table_of(image):
-            return Unread(f"{table} seems to have an exterior orientation for this image (six numbers)", _BY_HAND)
-    tags = {**(dataset.GetMetadata() or {}), **(dataset.GetMetadata("EXIF") or {})}
-    if "EXIF_GPSLatitude" in tags:
-        camera = " ".join(str(tags[key]).strip() for key in ("EXIF_Make", "EXIF_Model") if tags.get(key))
-        return Unread(f"this is a photo with a GPS position in EXIF{f' ({camera})' if camera else ''}", _BY_HAND)
+    if isinstance(image, Path) and (table := _table_of(image)):
+        remedy = Text(
+            "give it with a camera file (docs/formats/frame.md): ",
+            Setting("scene.sensor_options", str(image.parent / table), key="exterior"),
+            " ",
+            Setting("scene.sensor_options", "FILE", key="camera"),
+            " ",
+            Setting("scene.sensor_options", "EPSG:N", key="crs"),
+            " ",
+            Setting("scene.sensor_options", "DATUM", key="vertical"),
+        )
+        return Unread(f"{table} seems to have an exterior orientation for this image (six numbers)", remedy)
     return None
-
-
-def _of_orthority(folder: Path) -> Iterator[str]:
-    """Yield the names of orthority's parameter files in a folder."""
-    names = os.listdir(folder) if folder.is_dir() else []
-    return (name for name in sorted(names) if _INTERIOR.search(name) or _EXTERIOR.search(name))
 
 
 def _table_of(image: Path) -> str | None:

@@ -142,7 +142,7 @@ class OutputOptions:
         Option(
             "--visibility",
             "Find ground that other terrain hides: write a mask of it, or leave its pixels empty. With a DSM, the "
-            "latter gives a true ortho.",
+            "latter gives a true ortho, whose pixels are empty at gaps of the DSM, too.",
             choices=("mask", "nodata"),
         ),
     ] = None

@@ -256,3 +256,28 @@ def _accuracy(report: SceneReport) -> dict[str, Any]:
             found[f"accuracy:geometric_{axis}_bias"] = round(float(values.mean()), 4)
             found[f"accuracy:geometric_{axis}_stddev"] = round(float(values.std(ddof=1)), 4)
     return found
+
+
+def ortho_accuracy(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a STAC item that a verified ortho adds: extensions and properties.
+
+    As above, an accuracy relative to a reference does not say where the ortho is: it gets a field of its own.
+    """
+    what = next((name for name in ("points", "absolute", "relative") if document[name] is not None), None)
+    if what is None:
+        return {"stac_extensions": [], "properties": {}}
+    found = document[what]
+    if what == "relative":
+        fields = {"ortho:relative_rmse": round(found["rmse_m"]["value"], 4), "ortho:accuracy_from": "reference"}
+        return {"stac_extensions": [], "properties": fields}
+    places = found["residuals"] if what == "points" else document["field"]["cells"]
+    spread = np.array([[one["east_m"], one["north_m"]] for one in places]).std(axis=0, ddof=1)
+    fields = {"accuracy:geometric_rmse": round(found["rmse_m"]["value"], 4)}
+    for axis, name, deviation in zip("xy", ("east", "north"), spread.tolist(), strict=True):
+        fields[f"accuracy:geometric_{axis}_bias"] = round(found[f"bias_{name}_m"]["value"], 4)
+        fields[f"accuracy:geometric_{axis}_stddev"] = round(deviation, 4)
+    if what == "points":
+        fields |= {"ortho:accuracy_from": "check points", "ortho:accuracy_points": found["count"]}
+    else:
+        fields["ortho:accuracy_from"] = "reference of known accuracy"
+    return {"stac_extensions": [_URIS["accuracy"]], "properties": fields}

@@ -11,7 +11,6 @@ import ctypes
 import functools
 import itertools
 import os
-import resource
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -73,15 +72,11 @@ def require_memory(size: int = LEAST, threads: int = 0) -> None:
     OrthoError
         If the limit (``ulimit -v``) leaves less.
     """
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit == resource.RLIM_INFINITY:
-        return
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    needed = size + threads * _PER_THREAD
-    if limit - used < needed:
+    left, needed = _address_space(), size + threads * _PER_THREAD
+    if left is not None and left < needed:
         raise OrthoError(
-            f"not enough memory: the limit of this process leaves {max(0, limit - used) >> 20} MB of address "
-            f"space, but the work needs {needed >> 20} MB",
+            f"not enough memory: the limit of this process leaves {max(0, left) >> 20} MB of address space, but "
+            f"the work needs {needed >> 20} MB",
             field="ulimit -v",
             remedy=Text(
                 "raise the limit, or reduce the work at a time (",
@@ -91,6 +86,19 @@ def require_memory(size: int = LEAST, threads: int = 0) -> None:
                 ")",
             ),
         )
+
+
+def _address_space() -> int | None:
+    """Return how many bytes the limit of this process leaves; None without a limit, or where the system tells none."""
+    try:
+        import resource
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit == resource.RLIM_INFINITY:
+            return None
+        return limit - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except (ImportError, OSError):  # Windows has none, macOS does not tell
+        return None
 
 
 def startable_threads(wanted: int) -> int:

@@ -10,9 +10,13 @@ import pyproj
 from numpy.typing import ArrayLike
 from osgeo import gdal, osr
 
+from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.raster.verified_writing import raster_output, written
-from ortho_pipeline.surface.base import Array
+from ortho_pipeline.surface.base import Array, Surface
+
+#: Least step (degrees) of a coarse DEM, an arc second, and most posts along a side.
+_COARSE, _MOST_POSTS = 1 / 3600, 4000
 
 
 def write_dem(path: str | os.PathLike[str], heights: Array, corner: tuple[float, float], step: float, crs: str) -> None:
@@ -70,3 +74,34 @@ def write_terrain(
     # A decimetre is finer than any DEM of such a scene, and packs well.
     heights = np.round(heights, 1).reshape(rows, columns)
     write_dem(path, heights, (west, north), step, f"{crs}+{vertical.split(':')[1]}")
+
+
+def write_ellipsoidal(path: str | os.PathLike[str], surface: Surface, box: ArrayLike) -> None:
+    """Write heights above the WGS 84 ellipsoid as a coarse DEM in EPSG:4326, for programs without height datums.
+
+    Voids get the median height, because such programs take them for heights.
+
+    Parameters
+    ----------
+    box : (2, 2)
+        Least and greatest longitude and latitude.
+
+    Raises
+    ------
+    CoverageError
+        If the surface has no height there.
+    """
+    low, high = np.asarray(box, dtype=np.float64)
+    step = max(_COARSE, float((high - low).max()) / _MOST_POSTS)
+    columns, rows = np.ceil((high - low) / step).astype(int).tolist()
+    lon, lat = low[0] + step * (np.arange(columns) + 0.5), high[1] - step * (np.arange(rows) + 0.5)
+    heights = np.stack([surface.heights(np.stack([lon, np.full(columns, y)], axis=1), "EPSG:4326") for y in lat])
+    known = np.isfinite(heights)
+    if not known.any():
+        raise CoverageError(
+            "the DEM has no heights under the images",
+            field="surface.dem",
+            remedy="give a DEM of the ground that the images show",
+        )
+    heights[~known] = np.median(heights[known])
+    write_dem(path, heights, (float(low[0]), float(high[1])), step, "EPSG:4326")

@@ -345,8 +345,8 @@ class TileHeights:
             self._whole = self._read(tile)
         bounds = self._height_ranges(together)
         for k, window, (lowest, highest) in zip(present, together.tolist(), bounds, strict=True):
-            # A cubic DEM overshoots between its samples by up to a quarter of their range.
-            extra = 0.25 * (highest - lowest) if self._cubic else 0.0
+            # A cubic DEM overshoots by 9/32 of its samples' range at most: what their negative weights sum to.
+            extra = 9 / 32 * (highest - lowest) if self._cubic else 0.0
             blocks[k].terrain, blocks[k].middle = tuple(window), (lowest + highest) / 2
             blocks[k].half = max((highest - lowest) / 2 + extra, 0.5)
         return [k for k, (lowest, highest) in zip(present, bounds, strict=True) if lowest <= highest]

@@ -1,4 +1,7 @@
-"""Sensor plugin for cameras of Ames Stereo Pipeline and ISIS next to an image: CSM states, .tsai, ASTER, .adjust."""
+"""Plugin for Ames Stereo Pipeline: its cameras and those of ISIS next to an image, and the format ``asp``.
+
+The sensor reads CSM states, .tsai, ASTER and .adjust. The format gives ASP an adjusted block.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ from ortho_csm.files import has_csm, read_csm
 from osgeo import gdal
 
 from ortho_asp.cameras import adjusted, read_adjust, read_aster, read_tsai
+from ortho_asp.stereo import asp_text
 from ortho_pipeline.plugin import (
+    BlockFormat,
     FrameCamera,
     InputError,
     Notice,
@@ -41,6 +46,12 @@ def ortho_sensors() -> Iterable[Sensor]:
             "adjust": "an adjustment (.adjust) for the CSM state of a line scanner",
         },
     )
+
+
+@hookimpl
+def ortho_formats() -> Iterable[BlockFormat]:
+    """Offer the format ``asp``."""
+    yield BlockFormat("asp", "Ames Stereo Pipeline 3", "asp.sh", ("csm", "rpc-xml"), asp_text, "sh")
 
 
 def camera_of(name: str) -> Path | None:

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ortho_pipeline.plugin import (
-    Array,
-    InputError,
-    Interior,
-    angles_of_rotation,
-    counted,
-    read_bounded,
-    read_json,
-    reads,
-)
+from ortho_frame import orthority
+from ortho_frame.fields import DISTORTION_KEYS, interior_of, number
+from ortho_frame.pose import Pose, Shot
+from ortho_pipeline.plugin import InputError, Interior, counted, place, read_bounded, read_json, reads
 
 MAX_BYTES = 5_000_000
 #: A reconstruction also has the points of the whole block.
@@ -35,6 +27,8 @@ GEOGRAPHIC_COLUMNS = (
     ("pitch",),
     ("yaw",),
 )
+#: OpenSfM's cameras that Brown's model represents exactly.
+EXACT = ("brown", "perspective", "simple_radial", "radial")
 CAMERA_KEYS = {
     "name",
     "width",
@@ -45,39 +39,6 @@ CAMERA_KEYS = {
     "principal_point_mm",
     "distortion",
 }
-DISTORTION_KEYS = ("k1", "k2", "k3", "p1", "p2")
-
-
-@dataclass(frozen=True)
-class Pose:
-    """One row of the table: position and angles (degrees) as written."""
-
-    source: str
-    where: str
-    geographic: bool
-    position: tuple[float, float, float]
-    angles: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One shot of an OpenSfM reconstruction: a pose in east, north, up about `origin` (lon, lat, altitude)."""
-
-    source: str
-    where: str
-    origin: tuple[float, float, float]
-    rotation: tuple[float, float, float]
-    translation: tuple[float, float, float]
-    camera: str
-
-    def exterior(self) -> Array:
-        """Return the perspective centre (m) and omega, phi, kappa (rad) in east, north, up: ``(6,)``."""
-        from scipy.spatial.transform import Rotation  # half of what all plugins together would take to load
-
-        turn = Rotation.from_rotvec(self.rotation).as_matrix()
-        # Its camera has y down and z forward.
-        angles = angles_of_rotation(np.diag([1.0, -1.0, -1.0]) @ turn)
-        return np.array([*(-turn.T @ self.translation), *angles])
 
 
 # -- the camera ------------------------------------------------------------------------------------------------------
@@ -87,7 +48,7 @@ class Shot:
 def read_camera(path: str | PathLike[str], width: int, height: int, name: str | None = None) -> Interior:
     """Read the interior orientation for an image of `width` x `height` pixels.
 
-    `name` chooses among the cameras of an OpenSfM file.
+    `name` chooses among the cameras of a file of OpenSfM or orthority.
 
     A camera of another size with the same proportions is scaled: the image is then a reduced copy.
 
@@ -96,8 +57,11 @@ def read_camera(path: str | PathLike[str], width: int, height: int, name: str | 
     InputError
         If the file is not a camera, a field is missing, unknown or wrong, or the proportions differ.
     """
-    document = _json(path)
-    interior = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
+    document = orthority.read_yaml(path) if Path(path).suffix.lower() in (".yaml", ".yml") else _json(path)
+    if orthority.is_camera(document):
+        interior = orthority.camera_of(path, document, name)
+    else:
+        interior = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
     if interior.width * height != interior.height * width:
         raise InputError(
             f"the camera has {interior.width} x {interior.height} pixels, but the image {width} x {height}",
@@ -121,8 +85,8 @@ def _own(path: str | PathLike[str], document: Any) -> Interior:
             field=unknown[0] or repr(unknown[0]),
             remedy=f"use one of {', '.join(sorted(CAMERA_KEYS))}",
         )
-    width, height = (_number(path, key, document.get(key)) for key in ("width", "height"))
-    focal = _number(path, "focal_length_mm", document.get("focal_length_mm")) * 1e-3
+    width, height = (number(path, key, document.get(key)) for key in ("width", "height"))
+    focal = number(path, "focal_length_mm", document.get("focal_length_mm")) * 1e-3
     if ("sensor_mm" in document) == ("pixel_pitch_um" in document):
         raise InputError("give either sensor_mm or pixel_pitch_um", file=path, field="sensor_mm")
     if "sensor_mm" in document:
@@ -139,8 +103,8 @@ def _own(path: str | PathLike[str], document: Any) -> Interior:
         raise InputError(
             f"distortion can only have the fields {', '.join(DISTORTION_KEYS)}", file=path, field="distortion"
         )
-    brown = {key: _number(path, f"distortion.{key}", value) for key, value in lens.items()}
-    return _interior(path, width, height, focal, *pitch, x0=x0 * 1e-3, y0=y0 * 1e-3, **brown)
+    brown = {key: number(path, f"distortion.{key}", value) for key, value in lens.items()}
+    return interior_of(path, width, height, focal, *pitch, x0=x0 * 1e-3, y0=y0 * 1e-3, **brown)
 
 
 def _is_opensfm(document: Any) -> bool:
@@ -168,24 +132,24 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
             remedy="give a file with one camera",
         )
     kind = camera.get("projection_type")
-    if kind not in ("brown", "perspective"):
+    if kind not in EXACT:
         raise InputError(
-            f"cameras of the type {kind!r} are not supported",
+            f"cameras of the type {kind!r} are not supported: the model of frames cannot represent them exactly",
             file=path,
             field="projection_type",
-            remedy="use brown or perspective",
+            remedy=f"use {', '.join(EXACT)}; or the undistorted photos of the project with their cameras",
         )
-    width, height = (_number(path, key, camera.get(key)) for key in ("width", "height"))
+    width, height = (number(path, key, camera.get(key)) for key in ("width", "height"))
     size = max(width, height) * 1e-6  # with pixels of 1 µm
     focal = camera.get("focal_x", camera.get("focal"))
-    focal_x = _number(path, "focal_x", focal)
-    focal_y = _number(path, "focal_y", camera.get("focal_y", focal))
+    focal_x = number(path, "focal_x", focal)
+    focal_y = number(path, "focal_y", camera.get("focal_y", focal))
     if not focal_x > 0 or not focal_y > 0:
         raise InputError("the focal length must be positive", file=path, field="focal_x")
-    brown = {key: _number(path, key, camera.get(key, 0.0)) for key in DISTORTION_KEYS}
-    c_x, c_y = (_number(path, key, camera.get(key, 0.0)) for key in ("c_x", "c_y"))
+    brown = {key: number(path, key, camera.get(key, 0.0)) for key in DISTORTION_KEYS}
+    c_x, c_y = (number(path, key, camera.get(key, 0.0)) for key in ("c_x", "c_y"))
     # Its y points down; different focal lengths of the axes are different pitches here.
-    return _interior(
+    return interior_of(
         path,
         width,
         height,
@@ -198,25 +162,10 @@ def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Inte
     )
 
 
-def _interior(path: str | PathLike[str], width: float, height: float, *values: float, **others: float) -> Interior:
-    try:
-        if width != int(width) or height != int(height) or not 0 < width < 1e6 or not 0 < height < 1e6:
-            raise InputError("width and height must be whole numbers", field="width, height")
-        return Interior(int(width), int(height), *values, **others)
-    except InputError as error:
-        raise InputError(error.message, file=path, field=error.field, remedy=error.remedy) from error
-
-
 def _pair(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
         raise InputError("this must be a list of two numbers, x first", file=path, field=field)
-    return _number(path, field, value[0]), _number(path, field, value[1])
-
-
-def _number(path: str | PathLike[str], field: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
-        raise InputError("is missing" if value is None else f"{value!r} is not a number", file=path, field=field)
-    return float(value)
+    return number(path, field, value[0]), number(path, field, value[1])
 
 
 # -- exterior orientations -------------------------------------------------------------------------------------------
@@ -229,13 +178,15 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
     Raises
     ------
     InputError
-        If the table has no header, the image is missing or appears twice, or a number is wrong.
+        If the columns are unknown, the image is missing or appears twice, or a number is wrong.
     """
+    wanted = Path(image)
     if is_reconstruction(path):
-        return _shot(path, Path(image))
+        return shot_of(path, _json(path), wanted)
+    if is_orthority(path):
+        return orthority.pose_in(path, wanted)
     header, rows = _table(path)
     geographic, columns = _columns(path, header)
-    wanted = Path(image)
     matches = [(line, row) for line, row in rows if row and row[0] in (wanted.name, wanted.stem)]
     if len(matches) != 1:
         what = "appears twice" if matches else "is not in this table"
@@ -253,7 +204,22 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
     if geographic and not (abs(values[0]) <= 360 and abs(values[1]) <= 90):
         raise InputError("this position is not on Earth", file=path, field=f"line {line}, lon, lat")
     x, y, z, first, second, third = values
-    return Pose(str(path), f"line {line}", geographic, (x, y, z), (first, second, third))
+    camera = row[header.index("camera")] if "camera" in header and header.index("camera") < len(row) else None
+    crs = None if geographic else _crs_beside(path)
+    return Pose(str(path), f"line {line}", geographic, (x, y, z), (first, second, third), crs, camera)
+
+
+def _crs_beside(path: str | PathLike[str]) -> str | None:
+    """Return the CRS in the file of a table's name with the ending .prj; None without."""
+    beside = place(str(path)).with_suffix(".prj")
+    if not beside.is_file():
+        return None
+    return _text(beside).strip() or None
+
+
+def is_orthority(path: str | PathLike[str]) -> bool:
+    """Return whether a file of exterior orientations is orthority's GeoJSON."""
+    return Path(path).suffix.lower() == ".geojson"
 
 
 def is_reconstruction(path: str | PathLike[str]) -> bool:
@@ -261,8 +227,8 @@ def is_reconstruction(path: str | PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".json"
 
 
-def _shot(path: str | PathLike[str], image: Path) -> Shot:
-    document = _json(path)
+def shot_of(path: str | PathLike[str], document: Any, image: Path) -> Shot:
+    """Return the shot of an image in the document of a reconstruction."""
     parts = [part for part in (document if isinstance(document, list) else [document]) if isinstance(part, dict)]
     shots = [(part, name) for part in parts for name in (image.name, image.stem) if name in _object(part, "shots")]
     if len(shots) != 1:
@@ -278,7 +244,7 @@ def _shot(path: str | PathLike[str], image: Path) -> Shot:
             remedy="give the georeferenced reconstruction.json, or a table (docs/formats/frame.md)",
         )
     keys = ("longitude", "latitude", "altitude")
-    lon, lat, altitude = (_number(path, f"reference_lla.{key}", place.get(key)) for key in keys)
+    lon, lat, altitude = (number(path, f"reference_lla.{key}", place.get(key)) for key in keys)
     if not (abs(lon) <= 360 and abs(lat) <= 90):
         raise InputError("this position is not on Earth", file=path, field="reference_lla")
     where = f"shots.{name}"
@@ -294,7 +260,7 @@ def _object(parent: Any, key: str) -> dict[str, Any]:
 def _triple(path: str | PathLike[str], field: str, value: Any) -> tuple[float, float, float]:
     if not isinstance(value, list) or len(value) != 3:
         raise InputError("this must be a list of three numbers", file=path, field=field)
-    x, y, z = (_number(path, field, part) for part in value)
+    x, y, z = (number(path, field, part) for part in value)
     return x, y, z
 
 
@@ -306,13 +272,22 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
     delimiter = next((sign for sign in (",", ";", "\t") if sign in first), " ")
     quote = "'" if first.lstrip().startswith("'") else '"'
     rows = []
-    for number, line in lines:
+    for at, line in lines:
         try:
             cells = next(csv.reader([line.strip()], delimiter=delimiter, quotechar=quote, skipinitialspace=True))
         except (csv.Error, StopIteration) as error:
-            raise InputError(f"this row cannot be read ({error})", file=path, field=f"line {number}") from error
-        rows.append((number, [cell.strip() for cell in cells]))
+            raise InputError(f"this row cannot be read ({error})", file=path, field=f"line {at}") from error
+        rows.append((at, [cell.strip() for cell in cells]))
+    if len(rows[0][1]) >= 7 and all(map(_is_number, rows[0][1][1:7])):
+        # Without a header, as in the tables of many programs.
+        return ["filename", *(names[0] for names in MAP_COLUMNS)], rows
     return [cell.lower() for cell in rows[0][1]], rows[1:]
+
+
+def _is_number(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return math.isfinite(float(text))
+    return False
 
 
 def _columns(path: str | PathLike[str], header: list[str]) -> tuple[bool, list[tuple[str, int]]]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import Lock, allowed, parse_json, sync_folder
+from ortho_pipeline.files import Lock, allowed, open_itself, parse_json, sync_folder
 
 #: A larger file (bytes) is not a journal of manual measurements.
 MAX_BYTES = 256_000_000
@@ -55,7 +55,7 @@ class Journal:
                 self._lock: Lock | None = Lock(path, wait=False)
                 self._file = self._lock.descriptor
             except BlockingIOError:
-                self._lock, self._file = None, os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+                self._lock, self._file = None, open_itself(path, os.O_RDONLY)
             self.read_only = self._lock is None
             data = _whole(self._file, path)
         except OSError as error:

@@ -30,6 +30,7 @@ from ortho_rpc.dimap import read_dimap_pushbroom
 from ortho_sar import read_extended
 from ortho_spot.dimap import read_spot
 from osgeo import gdal
+from photos import DJI, packet, photo
 
 from ortho_pipeline import commands
 from ortho_pipeline.batch import plan as batch_plan
@@ -184,6 +185,12 @@ def _frame(camera: str, exterior: str, **more: str) -> Callable[[Path], Any]:
         return [*scene.models.values(), scene.facts]
 
     return read
+
+
+def _photo(path: Path) -> Any:
+    xmp = path.read_bytes().decode("utf-8", "replace").replace("\0", "")
+    scene = open_scene(photo(path.with_name("one.tif"), xmp=xmp), SceneOptions(sensor="photo"))
+    return [*scene.models.values(), scene.facts, scene.priors]
 
 
 def _frame_seed(text: str) -> Callable[[Path], bytes]:
@@ -489,6 +496,7 @@ READERS = (
     ),
     Reader("opensfm", "json", "reconstruction.json", _frame_seed(seeds.OPENSFM),
            _frame("reconstruction.json", "reconstruction.json")),
+    Reader("photo-xmp", "xml", "xmp.xml", _text(packet(DJI).partition("?>\n")[2]), _photo, of_files=False),
     Reader("points-csv", "text", "p.csv", _sample("gcps.csv"), _points(), unknown=True),
     Reader("points-geojson", "json", "p.geojson", _sample("gcps.geojson"), _points(), unknown=True),
     Reader("points-matched", "text", "p.csv", _text(seeds.MATCHED), _points(), unknown=True),

@@ -15,7 +15,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import append_line, confined, together, whole_or_nothing, write_text
 
 POINTS = "--gcps gcps.geojson"
-FORMATS = "rpc-txt,rpb,tag,vrt,gcp,gcp-tag,geolocation"
+FORMATS = "rpc-txt,rpb,tag,vrt,geom,rpc-xml,gcp,gcp-tag,geolocation"
 EXTRAS = "--stac --acquired 2005-08-03T08:12:31Z --angles --accuracy-raster"
 #: Every command that writes files, with what its outputs are called.
 COMMANDS = {

@@ -18,6 +18,7 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.points.heights.spot_heights import SpotHeights
 from ortho_pipeline.surface.dem import DemSurface, open_dem
 from ortho_pipeline.surface.writing import write_dem
 
@@ -214,12 +215,13 @@ def dem(
     cell: float = 10.0,
     trees: float = 0.0,
     void: float = 0.0,
+    lake: float = 0.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> DemSurface:
     """Return a DEM of the ground under a chain: with white errors, a common one, and one that is alike over a length.
 
-    `trees` is the part of the cells that stand 15 m higher; `void` metres in the west have no height; `shift`
-    moves the DEM to the east and north, metres.
+    `trees` is the part of the cells that stand 15 m higher; `void` metres in the west have no height, and `lake` metres
+    there are level, 5 m below the ground; `shift` moves the DEM to the east and north, metres.
     """
     random = np.random.default_rng(10_000 + seed)
     low, high = block.ground[:, :2].min(axis=0) - _MARGIN, block.ground[:, :2].max(axis=0) + _MARGIN
@@ -231,10 +233,22 @@ def dem(
     if correlated:
         heights += correlated * field(heights.shape, length / cell, random)
     heights += 15.0 * (random.random(heights.shape) < trees)
+    if lake:
+        heights[x < low[0] + _MARGIN + lake] = LEVEL - 5.0
     if void:
         heights[x < low[0] + _MARGIN + void] = -32768.0
     write_dem(path, heights, (float(low[0]), float(high[1])), cell, CRS)
     return open_dem(path, "ellipsoid", override=True)
+
+
+def spots_of(block: Block, part: float, sigma: float, random: np.random.Generator, wrong: int = 0) -> SpotHeights:
+    """Return heights of a part of the ties; some are of clouds."""
+    rows = random.choice(len(block.ground), round(part * len(block.ground)), replace=False)
+    ground = ground_transform(CRS, GEODETIC)(block.ground[rows])
+    ground[:, 2] += sigma * random.normal(0, 1, len(rows))
+    ground[:wrong, 2] += 800.0
+    ids = tuple(f"s{k}" for k in range(len(rows)))
+    return SpotHeights(ground, np.full(len(rows), sigma), np.zeros(len(rows)), ids)
 
 
 def field(shape: tuple[int, int], length: float, random: np.random.Generator) -> Array:

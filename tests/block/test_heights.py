@@ -94,9 +94,31 @@ def test_no_heights_in_voids(tmp_path: Path) -> None:
     fit = adjust(block.start, block.points, heights=heights)
     assert fit.heights is not None
     assert fit.heights.without > 20
-    taken = fit.heights.used + len(fit.heights.left_out) + fit.heights.at_breaks
+    taken = fit.heights.used + len(fit.heights.left_out) + fit.heights.at_breaks + fit.heights.on_water
     assert taken + fit.heights.without == len(block.points)
     assert fit.used_rays.all()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_heights_on_water(tmp_path: Path, seed: int) -> None:
+    """Half of an overlap is a lake that was 5 m lower in the DEM: its heights shift images by 0.4 to 1.2 px."""
+    block = fly(Chain(convergence_deg=10.0, relief=2.0), seed)
+    heights = dem(block, tmp_path / "dem.tif", seed, white=2.0, lake=70.0).with_sigma(2.0)
+    fit = adjust(block.start, block.points, heights=heights)
+    assert fit.heights is not None
+    # On the lake, or as near to it as the heights for a slope are to each other.
+    offshore = block.ground[:, 0] - block.ground[:, 0].min() - 70.0
+    assert (offshore < -5.0).sum() <= fit.heights.on_water <= (offshore < 30.0).sum()
+    assert fit.used_rays.all()
+    assert misfits(block, fit)[0] < 0.2
+
+
+def test_level_ground_is_no_water(tmp_path: Path) -> None:
+    block = fly(Chain(relief=0.0), 0)
+    fit = adjust(block.start, block.points, heights=dem(block, tmp_path / "dem.tif", 0).with_sigma(2.0))
+    assert fit.heights is not None
+    assert fit.heights.on_water == 0
+    assert fit.heights.used > 190
 
 
 def test_flat_ground_is_no_observation() -> None:
@@ -147,8 +169,27 @@ def test_slopes_of_interpolated_heights_err_as_predicted(tmp_path: Path) -> None
     inside = np.random.default_rng(1).uniform([500_000.0, 4_100_000.0], [500_400.0, 4_100_050.0], (20_000, 2))
     ground = ground_transform("EPSG:32636", "EPSG:4979")(np.column_stack([inside, np.zeros(20_000)]))
     for spacing in (10.0, 16.0, 30.0):
-        slopes = source.slopes(ground, spacing)
+        slopes, _ = source.slopes(ground, spacing)
         assert np.var(slopes) == pytest.approx(4.0 * source.slope_variance(spacing), rel=0.25)
+
+
+@pytest.mark.parametrize("ties", [150, 400, 1000])
+def test_heights_between_the_same_samples_share_information(tmp_path: Path, ties: int) -> None:
+    """The variance of a weighted mean is what its weights claim, for the correlation of interpolated errors."""
+    block = fly(Chain(images=4, ties=ties), 0)
+    surface = dem(block, tmp_path / "dem.tif", 0, white=1.0)
+    weights = 1.0 / DemHeights(surface).sharing(ground_transform("EPSG:32636", "EPSG:4979")(block.ground))
+    samples = surface.samples_at(block.ground[:, :2])
+    # Errors of samples by their weights in the heights.
+    shares = np.zeros((ties, *surface.shape))
+    cells, parts = np.floor(samples).astype(int), samples % 1.0
+    for east in (0, 1):
+        for south in (0, 1):
+            share = np.abs(1 - east - parts[:, 0]) * np.abs(1 - south - parts[:, 1])
+            shares[np.arange(ties), cells[:, 1] + south, cells[:, 0] + east] = share
+    shares = shares.reshape(ties, -1)
+    alike = shares @ shares.T / np.mean(np.sum(shares**2, axis=1))
+    assert weights @ alike @ weights / weights.sum() == pytest.approx(1.0, abs=0.12)
 
 
 @pytest.mark.slow

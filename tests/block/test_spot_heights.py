@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chains import CRS, Block, Chain, apart, dem, fly, neighbours
+from chains import CRS, Block, Chain, apart, dem, fly, neighbours, spots_of
 
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.heights.source import DemHeights
@@ -16,16 +16,6 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
-
-
-def spots_of(block: Block, part: float, sigma: float, random: np.random.Generator, wrong: int = 0) -> SpotHeights:
-    """Return heights of a part of the ties; some are of clouds."""
-    rows = random.choice(len(block.ground), round(part * len(block.ground)), replace=False)
-    ground = ground_transform(CRS, "EPSG:4979")(block.ground[rows])
-    ground[:, 2] += sigma * random.normal(0, 1, len(rows))
-    ground[:wrong, 2] += 800.0
-    ids = tuple(f"s{k}" for k in range(len(rows)))
-    return SpotHeights(ground, np.full(len(rows), sigma), np.zeros(len(rows)), ids)
 
 
 def errors(block: Block, found: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 import numpy as np
+import pyproj
 import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
@@ -15,6 +16,7 @@ from osgeo import gdal
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
 from ortho_pipeline.options import SurfaceOptions
+from ortho_pipeline.raster.source import Grid
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
@@ -70,6 +72,22 @@ def test_the_grid_is_that_of_gdalwarp(tiny, tmp_path, tap):
     ours = ortho(tiny.image, tmp_path / "out", "-te", *EXTENT, "-tr", *size, *(["-tap"] if tap else []))
     theirs = gdalwarp(tiny.image, outputBounds=EXTENT, xRes=size[0], yRes=size[1], targetAlignedPixels=tap)
     same_grid(ours, theirs)
+
+
+@pytest.mark.parametrize("size", [(12.5, 8.0), (0.1, 0.3), (1 / 3, 1 / 7)])
+def test_an_extent_that_is_aligned_stays(size):
+    """Whether or not its sides are whole multiples in floating point; where they are, as in any gdalwarp."""
+    west, south, columns, rows = 41_237, 523_111, 120, 70
+    extent = west * size[0], south * size[1], (west + columns) * size[0], (south + rows) * size[1]
+    grid = Grid.of_extent(pyproj.CRS.from_epsg(32734), extent, size, align=True)
+    assert grid.extent == pytest.approx(extent, abs=1e-6)
+    assert (grid.width, grid.height) == (columns, rows)
+    if size == (12.5, 8.0):
+        source = gdal.GetDriverByName("MEM").Create("", 2, 2)
+        source.SetGeoTransform((extent[0] - 1, 500, 0, extent[3] + 1, 0, -500))
+        options = {"xRes": size[0], "yRes": size[1], "targetAlignedPixels": True}
+        theirs = gdal.Warp("", source, format="MEM", srcSRS="EPSG:32734", outputBounds=extent, **options)
+        assert (theirs.RasterXSize, theirs.RasterYSize) == (columns, rows)
 
 
 def given_output(monkeypatch, *words: Any) -> Any:

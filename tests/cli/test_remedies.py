@@ -386,6 +386,15 @@ def _tested(printed: Printed, folder: Path) -> None:
     assert "passes" in printed.paste(several, IMAGE=str(SAMPLE / "scene.tif"))
 
 
+@case("commands", "ortho info")
+def _one_scene_in_a_folder(printed: Printed, folder: Path) -> None:
+    (folder / "my photos").mkdir()
+    for name in ("scene.tif", "scene_RPC.TXT"):
+        (folder / "my photos" / name).symlink_to(SAMPLE / name)
+    told = ortho("adjust", "my photos", "--ties", "auto", "--height", "900", "-o", "out")
+    assert "1000 x 1000, rpc" in printed.paste(told)
+
+
 @case("imaging", "ortho info")
 def _elsewhere(printed: Printed, folder: Path) -> None:
     far = tiff(folder / "far.tif", GREY, dem=True)

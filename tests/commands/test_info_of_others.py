@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -65,50 +64,28 @@ def test_a_dem_without_a_datum_asks_for_it(tmp_path):
     assert "--dem-vertical DATUM" in info(dem).output
 
 
-@pytest.mark.parametrize("folder", ["images", "."])
-def test_an_opensfm_project_is_named(tmp_path, folder):
-    image = picture(tmp_path / folder / "a.tif")
-    (tmp_path / "opensfm").mkdir()
-    (tmp_path / "opensfm" / "reconstruction.json").write_text("[]")
-    done = info(image)
-    assert done.exit_code == 2
-    assert "OpenDroneMap or OpenSfM project" in done.output
-    assert f"--sensor-option exterior={tmp_path / 'opensfm' / 'reconstruction.json'}" in done.output
-    assert "OpenSfM project" in info(tmp_path).output
-
-
-def test_an_orthority_project_is_named(tmp_path):
-    image = picture(tmp_path / "a.tif")
-    (tmp_path / "int_param.yaml").write_text("camera: {}")
-    (tmp_path / "ext_param.geojson").write_text("{}")
-    done = info(image)
-    assert done.exit_code == 2
-    assert "orthority project (ext_param.geojson, int_param.yaml)" in done.output
-    assert "docs/formats/frame.md" in done.output
-
-
 def test_a_table_that_names_the_image_is_named(tmp_path):
     image = picture(tmp_path / "a_b.tif")
     (tmp_path / "positions.txt").write_text("x 1 2 3 4 5 6\na_b -5.5 -3.7e6 5258.3 -0.3 0.29 -179.0\n")
-    assert "positions.txt seems to have an exterior orientation for this image" in info(image).output
+    done = info(image)
+    assert "positions.txt seems to have an exterior orientation for this image" in done.output
+    assert f"--sensor-option exterior={tmp_path / 'positions.txt'}" in done.output
     other = picture(tmp_path / "c.tif")
     assert "no sensor recognises this image" in info(other).output
 
 
-def test_a_photo_with_a_position_is_named(tmp_path):
+def test_a_photo_with_a_position_says_what_is_missing(tmp_path):
     tags = {"EXIF_GPSLatitude": "(24) (41) (5.7)", "EXIF_Make": "DJI", "EXIF_Model": "FC6310R"}
     done = info(picture(tmp_path / "a.tif", tags), "--json")
     assert done.exit_code == 2
-    assert "a photo with a GPS position in EXIF (DJI FC6310R)" in json.loads(done.stdout)["error"]["message"]
+    assert "this photo has no position" in json.loads(done.stdout)["error"]["message"]
+    assert "no model: this photo has no position" in info(tmp_path).output
 
 
 @pytest.mark.realdata
-def test_the_remedy_for_a_real_project_works(real):
+def test_a_real_project_opens_and_a_table_next_to_frames_is_named(real):
     image = real / "orthority" / "odm" / "images" / "100_0005_0018.tif"
-    done = info(image)
-    assert done.exit_code == 2
-    options = done.output.split("give ")[1].split(" (replace ")[0]
-    assert info(image, *shlex.split(options)).exit_code == 0
+    assert json.loads(info(image, "--json").stdout)["sensor"] == "odm"
     # A frame that was laid on the map roughly is no ortho, and the DEM next to it is a DEM.
     ngi = real / "orthority" / "ngi"
     assert "camera_pos_ori.txt" in info(ngi / "3324c_2015_1004_05_0182_RGB.tif").output

@@ -8,9 +8,12 @@ import numpy as np
 import pyproj
 import pytest
 
+from ortho_pipeline.commands.scene_fit import relative_to_reference
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.estimation.fit import Fit, Prior, fit
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.options import MatchOptions
 from ortho_pipeline.points import Points
 
 SIZE = 10_000.0
@@ -153,3 +156,18 @@ def test_surveyed_check_points_may_lie_off_by_it(rpc: RPC) -> None:
     image = unstated.image.copy()
     image[81] += (5.0, 0.0)
     assert [one.id for one in adjusted(rpc, replace(unstated, image=image)).outlying] == ["81"]
+
+
+def test_check_points_tell_a_displaced_reference_by_the_accuracy_of_their_mean(rpc: RPC) -> None:
+    """36 points of 0.3 m place it to 0.05 m: 0.35 m is told, though less than one of them may err; nothing is not."""
+
+    def noted(off: float, seed: int) -> list[Notice]:
+        points = scene(rpc, np.random.default_rng(seed), 200, 36, sigma=0.0, off=np.array([off, 0.0]))
+        roles = np.where(np.arange(236) < 200, "control", "check")
+        notices = relative_to_reference(adjusted(rpc, replace(points, roles=roles)), MatchOptions())
+        return [one for one in notices if one.code == "reference-displaced"]
+
+    for seed in range(10):
+        (notice,) = noted(0.35, seed)
+        np.testing.assert_allclose(notice.fields["reference_off_m"], (0.35, 0.0), atol=4 * 0.06)
+        assert noted(0.0, seed) == []

@@ -274,7 +274,7 @@ def test_geolocation_arrays_map_as_the_model(tiny, tmp_path, with_dem):
 def test_every_format_from_the_command_line(tiny, tmp_path):
     arguments = [tiny.image, "--gcps", tiny.gcps, "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
     arguments += ["-o", tmp_path / "out", "--height", "500", "--json"]
-    formats = ["--format", "rpc-txt,rpb", "--format", "tag", "--format", "vrt,gcp,gcp-tag,geolocation"]
+    formats = ["--format", "rpc-txt,rpb", "--format", "tag", "--format", "vrt,geom,rpc-xml,gcp,gcp-tag,geolocation"]
     done = CliRunner().invoke(cli, ["export", *map(str, arguments), *formats])
     assert done.exit_code == 0, done.stderr
     document = json.loads(done.stdout)

@@ -24,6 +24,7 @@ from ortho_pipeline.exchange.rpc import (
     write_tagged_copy,
     write_vrt,
 )
+from ortho_pipeline.exchange.rpc_files import write_geom, write_rpc_xml
 from ortho_pipeline.exchange.rpc_fit import domain_box, fit_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import SensorModel, as_ground
@@ -147,7 +148,19 @@ def test_crop_and_scale_move_the_model_as_the_pixels():
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("writer", "name"), [(write_rpc_txt, "a_RPC.TXT"), (write_rpb, "a.RPB")])
+def write_sized_geom(rpc: RPC, path: Path) -> None:
+    write_geom(rpc, (1200, 900), path)
+
+
+@pytest.mark.parametrize(
+    ("writer", "name"),
+    [
+        (write_rpc_txt, "a_RPC.TXT"),
+        (write_rpb, "a.RPB"),
+        (write_sized_geom, "a.geom"),
+        (write_rpc_xml, "a_rpc.xml"),
+    ],
+)
 def test_text_is_read_again_to_the_last_bit(tmp_path, writer, name):
     for seed in range(20):
         rpc = make_rpc(seed, err_rand=None if seed % 2 else 1 / 3, col_off=seed * 7001.1 + 1.1)
@@ -690,6 +703,32 @@ def test_ikonos_geo_corner():
     image = rpc.ground_to_image(np.column_stack([lon, lat, [85.9509811401441] * 2]))
     assert np.abs(image[0] - 0.5).max() < 0.005
     assert np.abs(image[1] - image[0] - 1000).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("bias", "random", "metres"), [(0.3, 0.4, 0.5), (0.6, -1.0, 0.6), (0.0, 0.8, 0.8), (-1.0, 0.0, None)]
+)
+def test_the_stated_accuracy_is_that_of_both_errors(bias, random, metres):
+    """RPC00B: ERR_BIAS and ERR_RAND are standard deviations of independent errors; -1 is unknown, and so is 0."""
+    assert make_rpc(err_bias=bias, err_rand=random).stated_accuracy == pytest.approx(metres)
+
+
+def test_a_geom_file_counts_from_the_centre_of_the_first_pixel(tmp_path):
+    """As RPC00B does: GDAL, given the same numbers, finds the same pixels, which it measures from the corner."""
+    rpc, path = make_rpc(), tmp_path / "a.geom"
+    fields = rpc_metadata(rpc)
+    lines = [f"{key.lower().replace('long_', 'lon_')}:  {value}" for key, value in fields.items() if "COEFF" not in key]
+    for key, value in fields.items():
+        if "COEFF" in key:
+            lines += [f"{key.lower()}_{k:02d}:  {number}" for k, number in enumerate(value.split())]
+    path.write_text("\n".join(["polynomial_format:  B", "type:  ossimRpcModel", *lines, "number_lines:  1600", ""]))
+    dataset = gdal.GetDriverByName("MEM").Create("", 2000, 1600)
+    dataset.SetMetadata(fields, "RPC")
+    transformer = gdal.Transformer(dataset, None, ["METHOD=RPC", "RPC_PIXEL_ERROR_THRESHOLD=1e-9"])
+    centre, half = rpc.domain
+    ground = centre + half * np.array([[-0.5, 0.4, 0.2], [0.6, -0.7, -0.9], [0.1, 0.2, 0.8]])
+    theirs = np.array([transformer.TransformPoint(1, *point)[1][:2] for point in ground.tolist()])
+    np.testing.assert_allclose(read_rpc(path).ground_to_image(ground), theirs, atol=1e-6)
 
 
 @pytest.mark.realdata

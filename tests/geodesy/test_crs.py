@@ -350,6 +350,11 @@ def test_only_what_can_be_a_name_is_sought_among_names(monkeypatch: pytest.Monke
         (179.9, -1.0, 32760),
         (5.0, 85.0, 5041),
         (0.0, -89.0, 5042),
+        # UTM is from 80 S to 84 N (NGA.SIG.0012).
+        (31.0, -79.9, 32736),
+        (31.0, -80.1, 5042),
+        (31.0, 83.9, 32636),
+        (31.0, 84.1, 5041),
     ],
 )
 def test_utm(lon: float, lat: float, code: int) -> None:

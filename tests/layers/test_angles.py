@@ -50,17 +50,18 @@ def test_angles_of_view_are_those_of_the_rays_in_space(tiny, tmp_path):
     np.testing.assert_allclose(azimuth[found], np.degrees(np.arctan2(ray[:, 0], ray[:, 1])) % 360, atol=0.3)
 
 
-def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path):
+@pytest.mark.parametrize(("east", "north"), [(0.3, 0.0), (0.0, 0.4), (-0.2, -0.3)])
+def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path, east, north):
     from ortho_pipeline.surface.writing import write_dem
 
-    x = np.arange(0, 400.0, 4)
-    heights = FLOOR + 0.3 * np.broadcast_to(x, (100, 100))  # rises to the east
+    step = np.arange(0, 400.0, 4)
+    heights = FLOOR + 50 + east * step - north * step[:, None]  # rows go south
     write_dem(tmp_path / "dem.tif", heights, (WEST - 70, NORTH + 70), 4.0, "EPSG:32636")
     surface, grid = open_dem(tmp_path / "dem.tif", "ellipsoid"), City(()).grid(1.0)
     sight = Sight(Parallel(0.0, 0.0, 1.0, 256.0), grid)
-    write_angles(sight, surface, (256, 256), tmp_path / "a.tif", heights=(100.0, 220.0), step=8, sun=SUN)
+    write_angles(sight, surface, (256, 256), tmp_path / "a.tif", heights=(0.0, 300.0), step=8, sun=SUN)
     zenith, _, incidence = read(tmp_path / "a.tif")[:, 10, 10]
-    normal, sun = np.array([-0.3, 0.0, 1.0]), np.array([*towards(50.0, 142.0), 1.0])
+    normal, sun = np.array([-east, -north, 1.0]), np.array([*towards(50.0, 142.0), 1.0])
     cosine = normal @ sun / np.linalg.norm(normal) / np.linalg.norm(sun)
     # The map's north is a third of a degree from the true one here.
     assert incidence == pytest.approx(np.degrees(np.arccos(cosine)), abs=0.4)

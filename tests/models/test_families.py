@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyproj
@@ -99,6 +100,19 @@ def test_contract(name, crs):
     points = make_points(60)
     model = start_model(name, points, crs=crs, size=SIZE)
     check_sensor_model(model, points.to_crs(model.crs).ground)
+
+
+def test_flat_ground_has_as_many_metres_of_height_in_any_crs():
+    """A model of flat ground is meant for heights of a thousandth of the scene's extent, in degrees or in metres."""
+    points = make_points(60)
+    flat = replace(points, ground=np.column_stack([points.ground[:, :2], np.full(60, 500.0)]))
+    metres = start_model("affine3d", flat, crs="utm").domain[1]
+    degrees = start_model("affine3d", flat, crs="geographic").domain[1]
+    assert metres[2] == pytest.approx(1e-3 * metres[:2].max())
+    # A degree of longitude counts as one of latitude.
+    longest = metres[2] / np.cos(np.radians(points.to_crs("EPSG:4979").ground[:, 1].mean()))
+    assert 0.95 * metres[2] < degrees[2] < 1.05 * longest
+    assert metres[2] > 5.0
 
 
 def test_crs_of_models():

@@ -186,10 +186,10 @@ def drawn(seed: int, *, elsewhere: bool = False) -> Pair:
     reference = Look(gsd=coarse[1], noise=float(random.choice([0.01, 0.03])))
     pixel = max(coarse)
     side = int(random.choice([300, 450, 600]) if 1 / 3 < ratio < 3 else 300)
-    angle, length = random.uniform(0, 2 * np.pi), random.choice([random.uniform(0, 3), random.uniform(3, 40)])
+    angle, length = random.uniform(0, 2 * np.pi), random.choice([random.uniform(0, 3), random.uniform(3, 100)])
     shift = length * pixel * np.cos(angle), length * pixel * np.sin(angle)
     slopes = random.choice([0.0, 0.002]) * random.normal(0, 1, (2, 2))
-    bend = float(random.choice([0.0, 0.0, random.uniform(0.1, 1.2)])) * pixel
+    bend = float(random.choice([0.0, 0.0, random.uniform(0.1, 3.0)])) * pixel
     return Pair(
         ground=KINDS[seed % 3] if elsewhere else KINDS[int(random.integers(0, 3))], seed=seed, side=side, ortho=ortho,
         reference=reference, shift=(float(shift[0]), float(shift[1])), bend=bend,

@@ -18,6 +18,7 @@ from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.options import PointOptions
 from ortho_pipeline.points import Points, one_mark, read_points, write_points
+from ortho_pipeline.points.formats import read_block_table
 from ortho_pipeline.points.rows import MAX_FILE
 
 
@@ -457,3 +458,22 @@ def test_memory_of_reading_many_points_is_bounded(tmp_path: Path) -> None:
         tracemalloc.stop()
     # As much as a file may hold is set aside for its bytes.
     assert peak < MAX_FILE + 2000 * count
+
+
+def test_a_tie_point_of_geojson_needs_no_place(tmp_path):
+    """RFC 7946: the geometry of what is not located is null. 'ji' counts from the centre of the first pixel."""
+    path = tmp_path / "block.geojson"
+    located = {"type": "Point", "coordinates": [33.35, 37.25, 850.0]}
+    marks = {"a.tif": [1, 2], "b.tif": [3, 4]}
+    features = [
+        {"type": "Feature", "geometry": place, "properties": {"id": name, "role": role, "ji": marks}}
+        for name, role, place in (("c", "control", located), ("t", "tie", None))
+    ]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    rows = read_block_table(path).rows
+    assert [(row.id, row.role, row.image_name, row.image) for row in rows] == [
+        ("c", "control", "a.tif", (1.5, 2.5)), ("c", "control", "b.tif", (3.5, 4.5)),
+        ("t", "tie", "a.tif", (1.5, 2.5)), ("t", "tie", "b.tif", (3.5, 4.5)),
+    ]  # fmt: skip
+    assert rows[0].ground == rows[1].ground == (33.35, 37.25, 850.0)
+    assert np.isnan([rows[2].ground, rows[3].ground]).all()

@@ -27,7 +27,7 @@ from ortho_pipeline.errors import InputError, OrthoError, StorageError
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.stores import objects
-from ortho_pipeline.stores.objects import Conflict, Objects
+from ortho_pipeline.stores.objects import PART, Conflict, Objects
 
 gdal.UseExceptions()
 QUICK: dict[str, Any] = {
@@ -101,6 +101,17 @@ def test_what_is_stored_in_parts_is_checked_too(
     back = tmp_path / "back"
     assert store.fetch("large", back, 1 << 30).sha256 == content.sha256
     assert back.read_bytes() == data
+
+
+@pytest.mark.parametrize("size", [PART, 2 * PART, 2 * PART + 17])
+def test_a_part_that_ends_with_what_is_read_is_a_whole_one(server: Address, tmp_path: Path, size: int) -> None:
+    """With parts as large as they are in use, the tag is the one that the store computes."""
+    path = tmp_path / "large"
+    path.write_bytes(np.random.default_rng(1).bytes(size))
+    store = Objects("s3://bucket/whole", allow_network=True)
+    content = store.put("large", path)
+    assert store.stated("large")[1].strip('"') in content.tags
+    assert store.fetch("large", tmp_path / "back", 1 << 30).tags == content.tags
 
 
 def test_of_two_that_write_one_object_one_is_told(moto: Address, monkeypatch: pytest.MonkeyPatch) -> None:

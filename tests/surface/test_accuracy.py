@@ -12,7 +12,7 @@ from osgeo import gdal, osr
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.surface.accuracy import check_dem, read_check_heights, slopes_at
+from ortho_pipeline.surface.accuracy import HeightErrors, check_dem, read_check_heights, slopes_at
 from ortho_pipeline.surface.dem import open_dem
 
 UTM = "EPSG:32634"
@@ -71,6 +71,20 @@ def test_the_error_of_each_class_of_slope_is_found(made):
         assert errors.median == pytest.approx(bias, abs=0.03)
         assert errors.nmad == pytest.approx(0.1, rel=0.25)
         assert errors.le90 == pytest.approx(abs(bias) + 1.2816 * 0.1, abs=0.05)
+
+
+def test_statistics_are_by_their_definitions():
+    """The sizes count, not the signs: of 100 differences ten are beyond LE90, and the worst is one below zero."""
+    differences = np.random.default_rng(3).permutation(np.r_[-np.arange(1.0, 51.0) * 2, np.arange(50.0)])
+    found = HeightErrors.of(differences)
+    assert found.largest == -100.0
+    assert (np.abs(differences) > found.le90).sum() == 10
+    assert found.mean == pytest.approx(-1325 / 100)
+    assert found.rmse**2 == pytest.approx((4 * 42925 + 40425) / 100)
+    assert (differences < found.median).sum() == (differences > found.median).sum() == 50
+    # 1.4826 times the median distance is the standard deviation of normal errors, whatever their mean.
+    normal = HeightErrors.of(np.random.default_rng(4).normal(7.0, 2.0, 20_000))
+    assert normal.nmad == pytest.approx(2.0, rel=0.03)
 
 
 def test_slopes_are_those_of_the_terrain(made):

@@ -261,15 +261,17 @@ def test_voids_are_not_heights_and_do_not_mix(tmp_path: Path, void: float) -> No
     assert surface.height_range[1] < 400
 
 
-def test_scale_offset_and_integers(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("unit", "metres"), [("", 1.0), ("ft", 0.3048)])
+def test_scale_offset_and_integers(tmp_path: Path, unit: str, metres: float) -> None:
+    """GDAL: what scale and offset make of a number is in the unit of the band."""
     raw = np.array([[1000, 2000], [-32768, 3000]], dtype=np.int16)
-    path = write_dem(tmp_path / "d.tif", raw, nodata=-32768, kind=gdal.GDT_Int16)
+    path = write_dem(tmp_path / "d.tif", raw, nodata=-32768, kind=gdal.GDT_Int16, unit=unit)
     dataset = gdal.Open(str(path), gdal.GA_Update)
     dataset.GetRasterBand(1).SetScale(0.1)
     dataset.GetRasterBand(1).SetOffset(50.0)
     dataset = None
     window = open_dem(path, "ellipsoid").window(0, 0, 2, 2)
-    assert window == pytest.approx(np.array([[150.0, 250.0], [np.nan, 350.0]]), nan_ok=True)
+    assert window == pytest.approx(metres * np.array([[150.0, 250.0], [np.nan, 350.0]]), nan_ok=True)
 
 
 def test_outside_is_nan_and_fill_rules_say_otherwise(tmp_path: Path) -> None:
@@ -296,6 +298,23 @@ def test_outside_is_nan_and_fill_rules_say_otherwise(tmp_path: Path) -> None:
     assert nearest.coverage([void, far]) == 0.0
     assert nearest.window(120, 120, 2, 2) == pytest.approx(np.full((2, 2), heights[-1, -1]))
     assert np.isnan(nearest.window(600, 600, 2, 2)).all()
+
+
+@pytest.mark.parametrize(("step", "reach"), [(1000.0, 20), (100.0, 200), (10.0, 512), (30_000.0, 1)])
+def test_the_nearest_height_is_at_most_20_km_and_512_samples_away(tmp_path: Path, step: float, reach: int) -> None:
+    """As docs/faq.md promises, beyond the DEM and in a void, for single places and for windows."""
+    heights = np.full((3, reach + 12), np.nan)
+    heights[:, :4] = 7.0
+    grid = UTM_BOX[0], step, 0.0, UTM_BOX[1], 0.0, -step
+    dem = open_dem(write_dem(tmp_path / "d.tif", heights, transform=grid), "ellipsoid", fill="nearest")
+    first = 3 + reach
+    found = np.stack(
+        [dem.heights_at(np.array([first - 1.0, first + 2.0]), np.ones(2)), dem.window(first - 1, 1, 4, 1)[0, ::3]]
+    )
+    assert np.array_equal(found, [[7.0, np.nan]] * 2, equal_nan=True)
+    outside = np.array([1.0 - reach, -2.0 - reach])
+    found = np.stack([dem.heights_at(outside, np.ones(2)), dem.window(-2 - reach, 1, 4, 1)[0, ::-3]])
+    assert np.array_equal(found, [[7.0, np.nan]] * 2, equal_nan=True)
 
 
 @pytest.mark.parametrize("fill", ["nearest", "-3.5", "mask"])

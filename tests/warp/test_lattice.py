@@ -27,8 +27,9 @@ from ortho_pipeline.runtime.process_limits import Resources
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
+from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.job import WarpRecord
-from ortho_pipeline.warp.lattice import Lattices, OutputBlock, TileHeights
+from ortho_pipeline.warp.lattice import BLOCK, Lattices, OutputBlock, TileHeights
 
 UTM = pyproj.CRS.from_epsg(32651)
 EAST, NORTH = 500_000.0, 1_000_000.0
@@ -257,6 +258,24 @@ def test_refined_blocks_are_the_same_for_any_memory_and_threads(tmp_path, amplit
     for pixels, *other in found[1:]:
         np.testing.assert_array_equal(pixels, found[0][0])
         assert other == list(found[0][1:])
+
+
+def test_the_heights_of_a_block_hold_what_a_cubic_dem_makes_between_its_samples(tmp_path):
+    """The worst of Keys' kernel: in the middle of four samples, of which each has the least weight that it can."""
+    signs = np.sign(np.outer([-1, 1, 1, -1], [-1, 1, 1, -1]))
+    heights = np.where(np.tile(signs, (16, 16)) > 0, 500.0, 100.0)
+    write_dem(tmp_path / "d.tif", heights, (EAST - 320, NORTH + 320), 10.0, UTM.to_string())
+    surface = open_dem(tmp_path / "d.tif", "ellipsoid")
+    grid = Grid(UTM, EAST - 200, NORTH + 200, 0.5, 0.5, 512, 512)
+    heights = TileHeights(surface, True, 64_000_000)
+    lattices = Lattices(Rising(0.0, 1), surface, grid, (6000, 6000), tolerance=TOLERANCE, reach=1, averages=False)
+    block = OutputBlock(0, 0)
+    assert lattices.build([block], heights)
+    x, y = np.meshgrid(EAST - 200 + 0.5 * np.arange(BLOCK + 1), NORTH + 200 - 0.5 * np.arange(BLOCK + 1))
+    uv = surface.samples_at(np.column_stack([x.ravel(), y.ravel()])).reshape(BLOCK + 1, BLOCK + 1, 2)
+    found = heights.heights(block, uv)
+    assert np.nanmax(found) > 600
+    assert np.nanmax(np.abs(found - block.middle)) <= block.half
 
 
 def test_a_block_more_takes_few_calls(tmp_path, calls):

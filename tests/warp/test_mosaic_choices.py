@@ -111,6 +111,20 @@ def test_gains_that_are_known_are_found(tmp_path, clouds):
     assert (found.outlying > 0.05) == (clouds != "none")
 
 
+@pytest.mark.parametrize("changed", [lambda seen: seen + 400, lambda seen: 0.6 * seen + 700])
+def test_gains_are_found_where_almost_half_of_an_overlap_has_changed(tmp_path, changed):
+    """What has changed keeps to a line of its own, which steps from any other start than the truth would take."""
+    first, second = GROUND[:240, :320], 1.5 * GROUND[:240, 120:440] - 300
+    second[:96, :200] = changed(second[:96, :200])
+    placed = lay_out([write(tmp_path, "a", first, 0, 0), write(tmp_path, "b", second, 120, 0)], "first-on-top")
+    found = balanced(placed, overlaps(placed))
+    gain, offset = found.gains[:, 0], found.offsets[:, 0]
+    assert gain[0] == pytest.approx(gain[1] * 1.5, rel=1e-3)
+    assert offset[0] == pytest.approx(offset[1] - gain[1] * 300, abs=0.5)
+    # Every cell with a changed pixel in it.
+    assert found.outlying == pytest.approx(6 / 16, abs=1 / 32)
+
+
 def test_a_balanced_mosaic_has_no_steps_and_clamps_what_does_not_fit(tmp_path):
     orthos = quartet(tmp_path)
     result = mosaic(

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
+from blocks import FLOOR, WEST, Parallel
+from blocks import NORTH as TOP
 from orthos import rectify, rectify_gdal
 from osgeo import gdal, gdal_array
 from scipy.interpolate import RegularGridInterpolator
@@ -641,6 +643,36 @@ def test_average_is_the_mean_under_the_output_pixel(scene, tmp_path):
     mean = fine.reshape(40, 64, 40, 64).mean(axis=(1, 3))
     # The box follows the image's axes, a rotated pixel does not: agree within a tenth of the pattern's spread.
     assert np.sqrt(np.mean((coarse - mean) ** 2)) < 0.1 * pixels.std()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_average_weighs_pixels_by_their_area_in_the_box(scene, tmp_path, masked):
+    """Exactly: the integral of the source over the box, which the edge of the source may cut."""
+    random = np.random.default_rng(4)
+    pixels = random.uniform(0, 1000, (1, 64, 64)).astype(np.float32)
+    if masked:
+        pixels[0, 20:23, 30:36] = -1.0
+    path = scene.write(pixels, nodata=-1.0 if masked else None)
+    model, step = Parallel(0.0, 0.0, 1.0, 64.0), 2.7  # pixels of a source of 1 m, from its corner
+    grid = Grid(pyproj.CRS(model.crs), WEST - 0.8, TOP + 0.7, step, step, 24, 24)
+    rectify(
+        model, RasterSource(path), FlatSurface(FLOOR), grid, tmp_path / "a.tif", resampling="average", driver="GTiff"
+    )
+    found, valid = read(tmp_path / "a.tif")
+
+    def integral(values: np.ndarray) -> np.ndarray:
+        """Return the integral of a picture over each box, from sums that are linear between the pixels' edges."""
+        for axis, first in ((0, -0.7), (1, -0.8)):
+            sums = np.concatenate([np.zeros_like(values.take([0], axis)), np.cumsum(values, axis)], axis)
+            edges = first + step * np.arange(25)
+            at = np.apply_along_axis(lambda line, x=edges: np.interp(x, np.arange(65), line), axis, sums)
+            values = np.diff(at, axis=axis)
+        return values
+
+    whole = (pixels[0] >= 0).astype(float)
+    expected = integral(np.where(whole > 0, pixels[0], 0).astype(float)) / integral(whole)
+    np.testing.assert_allclose(found[0][valid], expected[valid], rtol=1e-5)
+    assert valid.all() != masked
 
 
 # -- files -----------------------------------------------------------------------------------------------------------

@@ -130,7 +130,8 @@ class CommonHeights(CommonUnknown):
         for image, rays in enumerate(ordering.rays_of_image):
             columns = problem.columns.of_image(image)
             by_point = linear.by_point[rays].swapaxes(1, 2) @ linear.by_params[rays][:, :, : len(columns)]
-            np.subtract.at(taken, of[rays], by_point @ step[columns])
+            # An image has at most one ray of a point.
+            taken[of[rays]] -= by_point @ step[columns]
         shift = inverse @ taken
         left = units - np.einsum("nc,nck->nk", by_height, shift)
         by_points = np.zeros_like(self.by_points)

@@ -27,10 +27,11 @@ _NAMED = 10
 class HeightsRecord(Record):
     """What a block took from a DEM: how many heights, their sigma, and the DEM's bias and shift, metres.
 
-    The heights of `left_out` contradict their ties. At breaks the DEM is no plane; ties `without` a height are in voids
-    or outside the DEM. Shifts are east and north; `shift_chance` is the probability of one as large without a shift.
-    A prior is the standard deviation before the adjustment. A stated sigma is enlarged if the residuals are
-    significantly larger. `mean_error_m` is the mean of the shared errors at the ties, without a shift that was applied.
+    The heights of `left_out` contradict their ties. At breaks the DEM is no plane, `on_water` it is flattened; ties
+    `without` a height are in voids or outside the DEM. Shifts are east and north; `shift_chance` is the probability of
+    one as large without a shift. A prior is the standard deviation before the adjustment. A stated sigma is enlarged if
+    the residuals are significantly larger. `mean_error_m` is the mean of the shared errors at the ties, without a shift
+    that was applied.
     """
 
     used: Count
@@ -51,6 +52,7 @@ class HeightsRecord(Record):
     shift_applied: bool
     correlation_m: float | None
     spots: SpotsRecord | None = None
+    on_water: Count = 0
 
     @property
     def shift_significant(self) -> bool:
@@ -117,12 +119,14 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
     active = np.zeros(len(heights.of), dtype=bool)
     active[solved.linear.ordering.numbers] = True
     wrong, broken = active & heights.wrong, active & heights.broken & ~heights.wrong
+    water = active & heights.terrain.water & ~wrong & ~broken
     shift, shift_covariance = heights.common.shift(heights.shift)
     return HeightsRecord(
         used=len(used),
         left_out=tuple(solved.problem.points.ids[k] for k in np.flatnonzero(wrong)),
         at_breaks=int(broken.sum()),
-        without=int((active & heights.of & ~wrong & ~broken).sum()) - len(used),
+        on_water=int(water.sum()),
+        without=int((active & heights.of & ~wrong & ~broken & ~water).sum()) - len(used),
         sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
         sigma_is=heights.sigma_is,
         rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,

@@ -1,7 +1,8 @@
 """Heights of a DEM in a block, repeated until they are stable: planes under the points, shared errors, wrong heights.
 
 A height that contradicts its tie is left out and the tie stays: on a roof or a tree both are right. It takes part again
-if it agrees again. No height is used in a void, next to one, or at a cliff within the uncertainty of the point's place.
+if it agrees again. No height is used in a void, next to one, on water, or at a cliff within the uncertainty of the
+point's place.
 """
 
 from __future__ import annotations

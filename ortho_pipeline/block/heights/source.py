@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.equations.problem import BlockProblem, State
+from ortho_pipeline.block.equations.problem import BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.local_frame import GEODETIC
@@ -15,7 +15,7 @@ from ortho_pipeline.block.points import Index
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
@@ -29,8 +29,10 @@ _FOLLOWED, _NEAR_ENOUGH = 6, 1.0
 _OPTIONS = {"bias": "dem_bias", "correlation": "dem_correlation", "shift": "dem_shift_sigma"}
 #: The heights for a slope are so many of their sigmas apart, from one to so many samples.
 _SLOPE, _WIDEST = 8.0, 3.0
-#: Interpolated errors are alike over so many samples (an integral of their correlation).
-_SHARED = 2.25
+#: Water that a DEM has flattened is this even (m), and has no larger slope; that of the geoid is smaller.
+_EVEN, _LEVEL = 0.002, 1e-3
+#: Mean correlation (`_interpolated`) along an axis of errors in one cell, in the next, and in the one after that.
+_SHARED = (0.825, 0.325, 0.0125)
 _CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 _NINE = np.array([(east, north) for north in (-1.0, 0.0, 1.0) for east in (-1.0, 0.0, 1.0)])
 
@@ -106,10 +108,20 @@ class DemHeights:
         side, known = self.surface.sample_size, sigmas[np.isfinite(sigmas)]
         return float(np.clip(_SLOPE * np.median(known), side, _WIDEST * side)) if len(known) else side
 
-    def slopes(self, ground: Array, spacing: float) -> Array:
-        """Return the slopes ``(n, 2)`` to the east and north of planes through nine heights; NaN next to a void."""
+    def slopes(self, ground: Array, spacing: float) -> tuple[Array, Mask]:
+        """Return the slopes ``(n, 2)`` to the east and north of planes through nine heights; NaN next to a void.
+
+        And where ``(n,)`` four of these heights, on one side, are equal, as on water that a DEM has flattened.
+        """
         heights = self._around(ground, _NINE, np.full(len(ground), spacing))
-        return np.asarray(heights.T @ _NINE) / (6.0 * spacing)
+        quarters = heights.reshape(3, 3, -1)
+        south, north = quarters[:2], quarters[1:]
+        southwest, southeast, northwest, northeast = south[:, :2], south[:, 1:], north[:, :2], north[:, 1:]
+        with np.errstate(invalid="ignore"):
+            level = np.abs(southwest - southeast - northwest + northeast) < _EVEN
+            for one, other in ((southwest, southeast), (southwest, northwest)):
+                level &= np.abs(one - other) < _LEVEL * spacing
+        return np.asarray(heights.T @ _NINE) / (6.0 * spacing), np.asarray(level.any(axis=(0, 1)))
 
     def slope_variance(self, spacing: float) -> float:
         """Return the variance of such a slope by errors of the heights, over their variance."""
@@ -144,35 +156,38 @@ class DemHeights:
     def sharing(self, ground: Array) -> Array:
         """Return how many of the places, lon, lat ``(n, 2+)``, share the information of each ``(n,)``.
 
-        Those between the same four samples, and those that share one or two of these.
+        The sum of the correlations with all others, by the mean of two places in cells of four samples.
         """
         places = np.column_stack([ground[:, :2], np.zeros(len(ground))])
         samples = np.floor(np.nan_to_num(self.surface.sampler(GEODETIC)(places))).astype(np.int64)
-        _, which, counts = np.unique(samples, axis=0, return_inverse=True, return_counts=True)
-        return np.asarray(1.0 + _SHARED * (counts[which.ravel()] - 1.0))
+        cells, which, counts = np.unique(samples, axis=0, return_inverse=True, return_counts=True)
+        row = int(np.ptp(cells[:, 1])) + 2 * len(_SHARED) if len(cells) else 1
+        numbers, near = cells @ (row, 1), range(1 - len(_SHARED), len(_SHARED))
+        found = np.full(len(cells), 1.0 - _SHARED[0] ** 2)
+        for across, down in itertools.product(near, near):
+            wanted = numbers + across * row + down
+            place = np.minimum(np.searchsorted(numbers, wanted), len(numbers) - 1)
+            there = np.where(numbers[place] == wanted, counts[place], 0)
+            found += _SHARED[abs(across)] * _SHARED[abs(down)] * there
+        return np.asarray(found[which.ravel()])
 
 
-def starts(
-    source: DemHeights, problem: BlockProblem, models: Sequence[SensorModel], near: Array, rays: Mask, of: Mask
-) -> Array:
-    """Return where points `of` a mask ``(N,)`` are ``(N, 3)``: where the first ray of each meets the DEM.
+def starts(source: DemHeights, problem: BlockProblem, rays: Mask) -> Array:
+    """Return where ties are ``(N, 3)``: where the first ray of each meets the DEM, as far as all its rays see it there.
 
-    Nearly parallel rays of models that are a few pixels off meet anywhere, even if `near` ``(N, 3)``; the DEM is right
-    to a few metres.
+    Nearly parallel rays of models that are a few pixels off meet anywhere; the DEM is right to a few metres. NaN for
+    other points and where the DEM has no height.
     """
-    points, frame = problem.points, problem.frame
-    ground = frame.geodetic(near)
-    heights = source.heights(ground)
+    points, frame, models = problem.points, problem.frame, problem.models
+    of = points.tie & ~problem.placed
+    ground, heights = np.full((len(points), 3), np.nan), np.full(len(points), np.nan)
     left = np.flatnonzero(_first_rays(points.point, rays & of[points.point]))
-    seen = np.zeros(len(points), dtype=bool)
-    seen[points.point[left]] = True
     for _ in range(_FOLLOWED):
         for image in np.unique(points.image[left]):
             model, used = models[image], left[points.image[left] == image]
             of_points = points.point[used]
             at = np.where(np.isfinite(heights[of_points]), heights[of_points], model.reference_height)
-            ground[of_points] = model.image_to_ground(points.measured[used], at)
-            ground[of_points] = ground_transform(model.crs, GEODETIC)(ground[of_points])
+            ground[of_points] = ground_transform(model.crs, GEODETIC)(model.image_to_ground(points.measured[used], at))
             heights[of_points] = at
         there = source.heights(ground[points.point[left]])
         far = np.abs(there - heights[points.point[left]]) > _NEAR_ENOUGH
@@ -180,9 +195,11 @@ def starts(
         left = left[far]
         if not len(left):
             break
-    good = seen & np.isfinite(heights) & np.isfinite(ground).all(axis=1)
-    on_dem = frame.of_geodetic(np.column_stack([ground[:, :2], heights]))
-    return np.where(good[:, None], on_dem, np.nan)
+    good: Mask = np.array(np.isfinite(heights) & np.isfinite(ground).all(axis=1), dtype=bool)
+    found = np.where(good[:, None], frame.of_geodetic(np.column_stack([ground[:, :2], heights])), np.nan)
+    seen = np.isfinite(predict(frame, models, points, found)).all(axis=1)
+    found[points.point[rays & ~seen]] = np.nan
+    return found
 
 
 def _first_rays(point: Index, used: Mask) -> Mask:
@@ -190,15 +207,6 @@ def _first_rays(point: Index, used: Mask) -> Mask:
     rays, first = np.flatnonzero(used), np.zeros(len(point), dtype=bool)
     first[rays[np.unique(point[rays], return_index=True)[1]]] = True
     return first
-
-
-def started(source: DemHeights, problem: BlockProblem, state: State, rays: Mask) -> Array:
-    """Return the places ``(N, 3)`` of a state with points on the DEM, as far as all their rays see them there."""
-    found = starts(source, problem, state.models, state.local, rays, problem.points.tie & ~problem.placed)
-    seen = np.isfinite(predict(problem.frame, state.models, problem.points, found)).all(axis=1)
-    good: Mask = np.array(np.isfinite(found).all(axis=1), dtype=bool)
-    good[problem.points.point[rays & ~seen]] = False
-    return np.where(good[:, None], found, state.local)
 
 
 def _interpolated(distance: Array) -> Array:

@@ -75,7 +75,7 @@ class SpotDifferences:
             return None
         ground, stated = source.spots.ground, source.sigmas(source.spots.ground)
         spacing = source.spacing(np.full(len(ground), sigma) if stated is None else stated)
-        heights, slopes = source.heights(ground), source.slopes(ground, spacing)
+        heights, (slopes, _) = source.heights(ground), source.slopes(ground, spacing)
         apart = np.where(np.isfinite(slopes).all(axis=1), heights - ground[:, 2], np.nan)
         known = np.isfinite(apart)
         if not known.any():

@@ -29,6 +29,8 @@ from ortho_pipeline.models.base import Array
 
 #: Slopes are read again where a point has moved by more than this part of the spacing of their heights.
 _MOVED = 0.25
+#: Part of the points beyond which level ground is no water.
+_MOST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,9 @@ class LocalTerrain:
         Slopes of the DEM to the east and north, NaN next to voids, too; and lon, lat where they were read.
     slopes : ndarray (N, 2)
         Expected true slopes.
+    level, water : ndarray (N,) of bool
+        Points with equal heights of the DEM on one side, and those of them that are on water or next to it. These have
+        no expected slope, and so take no height.
     spacing : float
         How far the heights for a slope are apart, m.
     """
@@ -54,6 +59,8 @@ class LocalTerrain:
     measured: Array
     read: Array
     slopes: Array
+    level: Mask
+    water: Mask
     spacing: float
 
     @classmethod
@@ -84,17 +91,22 @@ class LocalTerrain:
         count, spacing = len(ground), source.spacing(sigmas[of])
         rows = np.flatnonzero(of & np.isfinite(ground[:, :2]).all(axis=1))
         heights, slopes, read = np.full(count, np.nan), np.full((count, 2), np.nan), np.full((count, 2), np.nan)
+        level = np.zeros(count, dtype=bool)
         heights[rows] = source.heights(ground[rows])
         anew = rows
         if before is not None and before.spacing == spacing:
             far = _MOVED * spacing / metres_per_degree(np.nan_to_num(ground[rows]))
             with np.errstate(invalid="ignore"):
                 same = rows[(np.abs(ground[rows, :2] - before.read[rows]) <= far).all(axis=1)]
-            slopes[same], read[same] = before.measured[same], before.read[same]
+            slopes[same], read[same], level[same] = before.measured[same], before.read[same], before.level[same]
             anew = rows[np.isnan(read[rows, 0])]
-        slopes[anew], read[anew] = source.slopes(ground[anew], spacing), ground[anew, :2]
-        expected = expected_slopes(slopes, sigmas, source.slope_variance(spacing), images)
-        return cls(ground, heights, slopes, read, expected, spacing)
+        slopes[anew], level[anew] = source.slopes(ground[anew], spacing)
+        read[anew] = ground[anew, :2]
+        # If most are level, it is the ground that is.
+        water: Mask = level & (level.sum() < _MOST * len(rows))
+        ashore = np.where(water[:, None], np.nan, slopes)
+        expected = expected_slopes(ashore, sigmas, source.slope_variance(spacing), images)
+        return cls(ground, heights, slopes, read, expected, level, water, spacing)
 
     def planes(self, problem: BlockProblem, of: Mask, sigmas: Array, offset: Array) -> Planes:
         """Return the planes under points `of` a mask ``(N,)``.

@@ -166,6 +166,10 @@ def next_steps(seen: FolderSurvey) -> list[str]:
         )
     if len(scenes) == 1:
         return [*notes, "Make the ortho:", "  " + shlex.join(["ortho", "rectify", at(scenes[0]), *words, "-o", "out"])]
+    frames = [file for file in seen.found if file.kind == "scene" and "frame" in file.models]
+    if len(frames) == len(scenes) and not points:
+        line = shlex.join(["ortho", "adjust", str(seen.folder), "--ties", "auto", *words, "--orthos", "-o", "out"])
+        return [*notes, f"Adjust the {len(scenes)} photos together, and make their orthos:", f"  {line}"]
     file, network = at("pipeline.yaml"), [] if dems else ["--allow-network"]
     lines = [
         shlex.join(words)

@@ -6,9 +6,11 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from ortho_pipeline.commands.heights.automatic import AUTO, extents_under, open_automatic
 from ortho_pipeline.commands.stac.given import heights_given
-from ortho_pipeline.errors import InputError, completed, of_option
+from ortho_pipeline.errors import CoverageError, InputError, completed, of_option
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import Vertical
@@ -60,7 +62,31 @@ def open_surface(
         return open_automatic(options, scene, memory, under).with_sigma(sigma)
     path = heights_given(options.dem, scene)
     extents = extents_under(under) if path.is_collection else []
-    return dem_as_stated(path, options, scene, memory, extents).with_sigma(sigma)
+    surface = dem_as_stated(path, options, scene, memory, extents)
+    _require_same_place(surface, sigma)
+    return surface.with_sigma(sigma)
+
+
+def _require_same_place(surface: DemSurface, sigma: float | Surface | None) -> None:
+    """Raise a `CoverageError` if a layer of standard deviations does not cover the file of the DEM.
+
+    DEMs of many files are not tested: a layer for the cells of one scene is enough.
+    """
+    if not isinstance(sigma, DemSurface) or len(surface.files) != 1:
+        return
+    rows, columns = surface.shape
+    v, u = (axis.ravel() for axis in np.meshgrid(np.linspace(0, rows - 1, 5), np.linspace(0, columns - 1, 5)))
+    places = np.column_stack([*surface.grid.lonlat(u, v), np.zeros(len(u))])
+    at, size = sigma.sampler("EPSG:4979")(places), np.array(sigma.shape[::-1])
+    # A sample more at each side: the grids of one program may be half a sample apart.
+    if not ((at >= -1.5) & (at <= size + 0.5)).all():
+        raise CoverageError(
+            f"the layer of height errors does not cover the DEM: it has {size[0]} x {size[1]} samples, "
+            f"the DEM {columns} x {rows}",
+            file=sigma.files[0],
+            field="surface.sigma",
+            remedy="give the layer that belongs to this DEM, or one number of metres",
+        )
 
 
 def open_sigma(

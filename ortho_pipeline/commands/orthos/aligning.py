@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,11 +35,10 @@ from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.report.orthos.page import write_page
+from ortho_pipeline.report.orthos.summary import summary_text
 from ortho_pipeline.runtime.process_limits import Progress, Resources, one_blas_thread
 from ortho_pipeline.surface.flat import FlatSurface
 
-#: The corrections, from simple to flexible.
-CORRECTIONS = ("shift", "affine", "field")
 #: A field is justified if it predicts held-out matches better: by this part of the variance, at this chance, and if it
 #: bends by so many pixels (RMS).
 _BETTER, _CHANCE, _BENDS = 0.2, 1e-3, 0.05
@@ -68,7 +67,7 @@ def align(
     output: OutputOptions = OutputOptions(resampling="cubic"),
     masks: Sequence[str | os.PathLike[str]] = (),
     band: int | None = None,
-    correction: str | None = None,
+    shift_only: bool = False,
     bending: float = BENDING,
     resample: bool = True,
     progress: Progress | None = None,
@@ -77,23 +76,23 @@ def align(
 
     Parameters
     ----------
-    correction : {'shift', 'affine', 'field'}, optional
-        Kind of correction. Default: what the matches justify.
+    shift_only : bool
+        Correct a shift only. Default: the correction that the matches justify.
     bending : float
         Largest change of a field's displacement per pixel.
     resample : bool
-        If False, keep the pixels and move the map grid: a VRT, or a copy with the format GTiff. Only for a shift.
+        If False, correct a shift only: keep the pixels and move the map grid (a VRT, or a copy with the format GTiff).
 
     Raises
     ------
     InputError
-        If the image is not an ortho, options contradict each other, or matching fails.
+        If the image is not an ortho, or matching fails.
     """
-    _refuse_contradictions(match, correction, bending, resample)
+    _refuse_unusable(match, bending)
     hidden = [ClassMask.parse(text) for text in masks]
     measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
     before = Verified.of(measured).relative().to_json(measured.pixel)
-    chosen = _choose(measured, "shift" if not resample else correction, bending)
+    chosen = _choose(measured, shift_only or not resample, bending)
     stem = Path(ortho).stem
     as_vrt = not resample and output.format != "GTiff"
     files = {"ortho": Path(folder) / f"{stem}_aligned{'.vrt' if as_vrt else '.tif'}"}
@@ -119,25 +118,15 @@ def align(
         write_page(
             document, files["html"], files["ortho"], scene.access | {"roots": (Path(ortho).parent, *scene.roots)}
         )
-    return Result(files, document, _summary(document))
+    return Result(files, document, summary_text(document))
 
 
-def _refuse_contradictions(match: MatchOptions, correction: str | None, bending: float, resample: bool) -> None:
+def _refuse_unusable(match: MatchOptions, bending: float) -> None:
     if not match.reference:
         raise InputError(
             "no reference to align the ortho with",
             field="match.reference",
             remedy=Text("give an orthoimage of the same place with ", Setting("match.reference", "FILE")),
-        )
-    if correction not in (None, *CORRECTIONS):
-        raise InputError(
-            f"unknown correction {correction!r}",
-            field="correction",
-            remedy=f"choose one of: {', '.join(CORRECTIONS)}",
-        )
-    if not resample and correction not in (None, "shift"):
-        raise InputError(
-            "only a shift can be corrected without resampling", field="correction", remedy="choose shift, or resample"
         )
     if not 0 < bending <= 0.2:
         raise InputError(
@@ -150,26 +139,23 @@ def _refuse_contradictions(match: MatchOptions, correction: str | None, bending:
 # -- which correction ------------------------------------------------------------------------------------------------
 
 
-def _choose(measured: MeasuredOrtho, wanted: str | None, bending: float) -> Chosen:
-    """Return the correction that is wanted, or the one that the matches justify."""
+def _choose(measured: MeasuredOrtho, shift_only: bool, bending: float) -> Chosen:
+    """Return a shift, or the correction that the matches justify."""
     most = _of_most(measured)
     kept = _selected(measured, most)
     cells = tested_cells(kept)
     affine = affine_of(kept)
     left = kept.image - affine.ground_to_image(kept.ground)
     field = DisplacementField.of(kept.image, left, kept.sigma, kept.chip)
-    if wanted is None:
-        wanted, reason = _justified(kept, field, cells)
-    else:
-        reason = "as requested"
+    kind, reason = ("shift", "as requested") if shift_only else _justified(kept, field, cells)
     # Of the whole displacement, in px, what an area of the ortho has in the mean, whatever the places of matches.
     whole = affine.ground_to_image(_unmoved(kept, cells)) - cells + field.mean(cells)
-    shift = np.median(whole, axis=0) if wanted != "shift" else _middle(whole)
+    shift = np.median(whole, axis=0) if kind != "shift" else _middle(whole)
     origin = (measured.size[0] / 2, measured.size[1] / 2)
-    if wanted == "shift":
+    if kind == "shift":
         coefficients = np.array([shift[0], 0.0, 0.0, shift[1], 0.0, 0.0])
         return Chosen("shift", ImageCorrection(kept.scene.model, "shift", origin, coefficients), shift, reason)
-    if wanted == "affine":
+    if kind == "affine":
         return Chosen("affine", affine, shift, reason)
     return Chosen("field", smooth_field(affine, field, measured.size, bending), shift, reason)
 
@@ -298,15 +284,3 @@ def _described(chosen: Chosen) -> dict[str, Any]:
         "coefficients": inner.coefficients.tolist(),
         "bending_px_per_px": chosen.model.bending if isinstance(chosen.model, SmoothField) else 0.0,
     }
-
-
-def _summary(document: Mapping[str, Any]) -> str:
-    correction = document["correction"]
-    called = {"shift": "a shift", "affine": "an affine transformation", "field": "a smooth field"}
-    lines = [f"Corrected by {called[correction['kind']]}: {correction['reason']}"]
-    for title, found in (("Before", document["before"]), ("After", document["relative"])):
-        numbers = ", ".join(
-            f"{name} {found[f'{key}_m']['value']:.2f} m" for key, name in (("ce90", "CE90"), ("bias", "bias"))
-        )
-        lines.append(f"{title}: {numbers}, relative to the reference")
-    return "\n".join(lines)

@@ -49,9 +49,10 @@ def datum_of(crs: pyproj.CRS, place: Array, shift: Array, interval: float) -> st
             way = pyproj.Transformer.from_crs(
                 own, f"EPSG:{info.code}", always_xy=True, area_of_interest=near, allow_ballpark=False
             )
-            if not 0 <= way.accuracy <= _CERTAIN:
-                continue
             there = np.array(way.transform(lon, lat, errcheck=True))
+            # Where a datum has several transformations, their accuracy is known once one is used.
+            if not 0 <= way.get_last_used_operation().accuracy <= _CERTAIN:
+                continue
             moved = (there - (lon, lat)) * scale
             apart = min(float(np.hypot(*(moved - shift))), float(np.hypot(*(moved + shift))))
             if apart < tolerance:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ortho_pipeline.commands.orthos.datums import datum_of
 from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho
 from ortho_pipeline.commands.orthos.statistics import Accuracy, Verified, slopes_of
 from ortho_pipeline.display.numbers import size_m
-from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
+from ortho_pipeline.estimation.spatial.displacement_field import FEWEST_POINTS, DisplacementField
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.base import Surface
@@ -113,6 +113,20 @@ def height_dependence(measured: MeasuredOrtho, surface: Surface) -> HeightDepend
     return HeightDependence(
         float(rates[0]), float(rates[1]), float(np.hypot(*(sigmas * unit))), float(about.std()), zero
     )
+
+
+def without_heights(verified: Verified, heights: HeightDependence, surface: Surface) -> Verified:
+    """Return the field without what the heights explain; cells without a height are left out."""
+    model = verified.measured.scene.model
+    ground = model.image_to_ground(verified.cells, 0.0)
+    above = surface.heights(ground[:, :2], model.crs) - (heights.zero or 0.0)
+    good = np.isfinite(above)
+    if good.sum() < FEWEST_POINTS:
+        return verified
+    noise = np.random.default_rng(1).normal(0.0, heights.sigma, (len(verified.draws), 2))
+    rates = np.array([heights.east, heights.north]) + noise
+    draws = verified.draws[:, good] - above[good, None] * rates[:, None]
+    return replace(verified, cells=verified.cells[good], draws=draws)
 
 
 def steps_of(measured: MeasuredOrtho, field: DisplacementField) -> list[FieldStep]:

@@ -41,8 +41,6 @@ _BENDS, _CONTRADICT = 0.3, 0.1
 _KNOTS = 14
 #: How much the displacement of a field may change per pixel, unless stated.
 BENDING = 0.02
-#: Matches share noise up to so many sides of their chips: calibrated with drawn pairs.
-_SHARED = 1.5
 #: Number of bands that are tried alone if all of them together do not match.
 _SINGLE = 3
 
@@ -98,8 +96,8 @@ class MeasuredOrtho:
 
     @property
     def chip(self) -> float:
-        """Distance (px) up to which matches share noise: the side of their chips, and what images are blurred by."""
-        return _SHARED * SIDE * self.matched.matches.factor
+        """Side (px) of a chip: matches share noise up to that distance."""
+        return float(SIDE * self.matched.matches.factor)
 
     @functools.cached_property
     def field(self) -> DisplacementField:

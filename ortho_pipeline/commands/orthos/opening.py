@@ -20,6 +20,8 @@ from ortho_pipeline.options import SceneOptions
 ORTHO = "ortho"
 #: Items of vendors' metadata that state the level of a product, and how the levels of raw scenes begin.
 _LEVELS = ("productLevel", "PROCESSING_LEVEL", "Processing Level", "productType")
+#: Where metadata state the time of acquisition: domain and item.
+_ACQUIRED = (("IMAGERY", "ACQUISITIONDATETIME"), ("", "PRODUCT_START_TIME"), ("", "DATE_ACQUIRED"))
 _RAW = ("LV1", "LV2", "SENSOR", "PRIMARY", "BASIC", "STANDARD GEOMETRICALLY", "L1A", "L1B", "1A", "1B")
 
 
@@ -56,7 +58,13 @@ def open_ortho(image: str | os.PathLike[str] | Scene, options: SceneOptions, *, 
         return plugins.open_scene(image, None, dict(options.sensor_options), **options.access)
     _refuse_raw(dataset, image, known)
     size = dataset.RasterXSize, dataset.RasterYSize
-    return Scene(ORTHO, image, *size, {MapGrid.kind: _grid_of(dataset, image, size)}, str(image))
+    return Scene(ORTHO, image, *size, {MapGrid.kind: _grid_of(dataset, image, size)}, str(image), _facts(dataset))
+
+
+def _facts(dataset: Any) -> dict[str, str]:
+    """Return when an ortho was acquired, if its metadata state that."""
+    items = [(dataset.GetMetadata(domain) or {}).get(name) for domain, name in _ACQUIRED]
+    return next(({"acquired": text} for text in items if text), {})
 
 
 def _grid_of(dataset: Any, image: str | os.PathLike[str], size: tuple[int, int]) -> MapGrid:

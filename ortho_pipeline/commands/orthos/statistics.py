@@ -22,6 +22,7 @@ from scipy import spatial, stats
 
 from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
+from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
 from ortho_pipeline.models.base import Array
 
 #: Cells per side in which the field is looked at; a cell is tested if a match is nearer than so many of their spacings.
@@ -29,10 +30,8 @@ _CELLS, _REACH = 16, 2.0
 _LEVELS = 0.025, 0.975
 #: Minimum number of points for a covariance.
 FEWEST_POINTS = 4
-#: Error that all matches of an ortho share (px of the coarser image, per axis), and such pixels in one of a chip.
-_ALIKE, _COARSER = 0.005, 1.5
-#: Part of what roughness that is not certain adds to CE90, by which its interval is wider downwards.
-_ROUGH = 1.0
+#: Part of the noise of a match that all matches share, besides `MATCHED_ALIKE`; of 21 drawn pairs of known truth.
+_ALIKE = 0.04
 #: Draws of means and covariances of points, and of errors for each.
 _DRAWS, _ERRORS = 2000, 500
 NAMES = ("bias_east", "bias_north", "bias", "rmse", "ce90")
@@ -76,16 +75,12 @@ class Accuracy:
     def of_fields(cls, draws: Array) -> Accuracy:
         """Return the accuracy of fields ``(k, m, 2)``."""
         mean, length = draws.mean(axis=1), np.hypot(draws[..., 0], draws[..., 1])
-        percentile = Estimate.of(np.quantile(length, 0.9, axis=1))
-        # Roughness that is likely but not certain lengthens the largest displacements of all draws. Where there is
-        # none, the percentile is that of the mean field.
-        rough = percentile.value - float(np.quantile(np.hypot(*draws.mean(axis=0).T), 0.9))
         return cls(
             Estimate.of(mean[:, 0]),
             Estimate.of(mean[:, 1]),
             Estimate.of(np.hypot(*mean.T), float(np.hypot(*np.median(mean, axis=0)))),
             Estimate.of(np.sqrt((length**2).mean(axis=1))),
-            replace(percentile, low=percentile.low - _ROUGH * max(rough, 0.0)),
+            Estimate.of(np.quantile(length, 0.9, axis=1)),
         )
 
     @classmethod
@@ -151,8 +146,8 @@ class Verified:
         draws = field.draws(cells, seed)
         # Residuals cannot show an error that all matches share.
         matches = measured.matched.matches
-        bands = float(matches.points.sigma_alike.max(initial=0.0)) * measured.pixel
-        alike = max(bands, _ALIKE * measured.pixel * _COARSER * matches.factor)
+        bands = max(float(matches.points.sigma_alike.max(initial=0.0)), MATCHED_ALIKE * matches.factor)
+        alike = np.hypot(bands * measured.pixel, _ALIKE * field.noise)
         common = np.random.default_rng([seed, 1]).normal(0.0, alike, (len(draws), 1, 2))
         return cls(measured, field, cells, draws + common, len(cells) / _CELLS**2)
 

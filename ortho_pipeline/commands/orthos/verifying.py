@@ -17,6 +17,7 @@ from ortho_pipeline.commands.orthos.dependence import (
     causes_of,
     height_dependence,
     steps_of,
+    without_heights,
 )
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, measure_ortho, pixel_of
@@ -37,7 +38,9 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.band_shifts import BandShift
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.report.orthos.page import interval_text, write_page, write_table
+from ortho_pipeline.report.orthos.page import write_page, write_table
+from ortho_pipeline.report.orthos.summary import summary_text, table_text
+from ortho_pipeline.report.stac import ortho_accuracy
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.surface.base import Surface
 
@@ -165,12 +168,16 @@ def document_of(
     """Return what is published of an ortho: of its matches, or of points alone where it was not matched."""
     opened = found if isinstance(found, Scene) else found.scene
     pixel = pixel_of(opened)
+    middle = opened.model.image_to_ground(np.array([[opened.width / 2, opened.height / 2]]), 0.0)
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "ortho": str(opened.path),
         "size": [opened.width, opened.height],
         "crs": opened.model.crs,
         "pixel_m": pixel,
+        "area_m2": opened.width * opened.height * pixel**2,
+        "lon_lat": json_value(ground_transform(opened.model.crs, "EPSG:4979")(middle)[0, :2]),
+        "acquired": opened.facts.get("acquired"),
         "references": [str(path) for path in match.reference],
     }
     notices: list[Notice] = []
@@ -182,7 +189,7 @@ def document_of(
     document["points"] = None if points is None else _of_points(points, pixel)
     document["asprs"] = _asprs(document)
     document["requirements"] = []
-    document["stac"] = _stac(document)
+    document["stac"] = ortho_accuracy(document)
     if isinstance(found, MeasuredOrtho):
         notices += _notices(document, found, match.reference_sigma)
     return document | to_document(notices)
@@ -194,6 +201,9 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
     pixel, field = measured.pixel, verified.field
     relative = verified.relative()
     heights: HeightDependence | None = None if surface is None else height_dependence(measured, surface)
+    rest = verified
+    if surface is not None and heights is not None and heights.counts(pixel):
+        rest = without_heights(verified, heights, surface)
     steps: list[FieldStep] = steps_of(measured, field)
     matched = measured.searched.record
     bands = _bands(measured)
@@ -213,6 +223,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
         },
         "relative": relative.to_json(pixel),
         "absolute": None if reference_sigma is None else verified.absolute(reference_sigma).to_json(pixel),
+        "pixel_axes_m": measured.metres.tolist(),
         "field": {"shared_m": json_value(field.shared), "range_m": json_value(field.range * pixel), "cells": cells},
         "heights": None if heights is None else heights.to_json(pixel),
         "columns": profile(verified, 0),
@@ -220,7 +231,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
         "steps": [one.to_json() for one in steps],
         "bands": bands,
         "causes": [
-            {"code": one.code, "text": one.text} for one in causes_of(verified, relative, heights, steps)
+            {"code": one.code, "text": one.text} for one in causes_of(rest, rest.relative(), heights, steps)
         ] + _band_causes(bands),
     }  # fmt: skip
 
@@ -311,18 +322,6 @@ def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sig
     return found
 
 
-def _stac(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of STAC's extension for accuracy."""
-    best = document["points"] or document["absolute"] or document["relative"]
-    if best is None:
-        return {}
-    return {
-        "accuracy:geometric_rmse": best["rmse_m"]["value"],
-        "accuracy:geometric_x_bias": best["bias_east_m"]["value"],
-        "accuracy:geometric_y_bias": best["bias_north_m"]["value"],
-    }
-
-
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
@@ -343,7 +342,7 @@ def _written(
             write_page(document, files["html"], document["ortho"], scene.access)
             if measured is not None:
                 write_json(files["displacements"], displacements(measured))
-    return Result(files, document, summary(document))
+    return Result(files, document, summary_text(document))
 
 
 def displacements(measured: MeasuredOrtho) -> dict[str, Any]:
@@ -403,50 +402,3 @@ def _verify_folder(folder: Path, out: str | os.PathLike[str] | None, job: _Job) 
         write_json(files["json"], table)
         write_table(table, files["html"])
     return Result(files, table, table_text(table))
-
-
-# -- words -----------------------------------------------------------------------------------------------------------
-
-
-def summary(document: Mapping[str, Any]) -> str:
-    """Return what people read of a verified ortho."""
-    lines = []
-    for part, title in (
-        ("points", "At points"),
-        ("absolute", "On the ground"),
-        ("relative", "Relative to the reference"),
-    ):
-        found = document[part]
-        if found is not None:
-            lines.append(f"{title}:")
-            for name, called in (("ce90", "CE90"), ("rmse", "RMSE"), ("bias", "bias")):
-                both = interval_text(found[f"{name}_m"]), interval_text(found[f"{name}_px"], "px")
-                lines.append(f"  {called:<5} {both[0]}, {both[1]}")
-            lines.append("  bias  east {:+.2f} m, north {:+.2f} m".format(
-                *(found[f"bias_{axis}_m"]["value"] for axis in ("east", "north"))
-            ))  # fmt: skip
-    if "matches" in document:
-        found = document["matches"]
-        tested = f"they test {found['tested_share']:.0%} of the ortho"
-        lines.append(f"Matches: {found['kept']} of {found['tried']} places; {tested}")
-    lines += [f"Cause: {one['text']}" for one in document["causes"]]
-    lines.append(document["asprs"])
-    for one in document["requirements"]:
-        word = "met" if one["met"] else "NOT met"
-        lines.append(f"Required {one['requirement']}: {word} (upper limit {one['upper']:.3g})")
-    return "\n".join(lines)
-
-
-def table_text(table: Mapping[str, Any]) -> str:
-    """Return the table of a folder as text."""
-    lines = [f"{'ortho':<32} {'CE90 m':>18} {'RMSE m':>18}  cause"]
-    for row in table["orthos"]:
-        name = Path(row["ortho"]).name
-        if "error" in row:
-            lines.append(f"{name:<32} {row['error']}")
-            continue
-        best = row["relative"] or row["points"]
-        numbers = (interval_text(best[f"{one}_m"], "").replace("  ", " ") for one in ("ce90", "rmse"))
-        causes = ", ".join(one["code"] for one in row["causes"]) or "none found"
-        lines.append(f"{name:<32} {next(numbers):>18} {next(numbers):>18}  {causes}")
-    return "\n".join(lines)

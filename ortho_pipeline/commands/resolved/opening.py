@@ -16,6 +16,7 @@ from ortho_pipeline.errors import InputError, ModelError, completed
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import states
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -41,10 +42,18 @@ def resolve(request: Request, *, needs_model: bool = True) -> Resolved:
     scene = open_by_evidence(request, needs_model=needs_model)
     surface = None
     if has_surface(request.surface):
-        surface = open_surface(request.surface, request.scene, request.output.memory, [scene])
+        surface = open_surface(_heights_of(request), request.scene, request.output.memory, [scene])
     ledger = Ledger.of(request, scene, surface, begun)
     scene = on_surface(scene, surface)
     return Resolved(request, scene, surface, read_control(scene, request, surface), _grid_like(request), ledger)
+
+
+def _heights_of(request: Request) -> SurfaceOptions:
+    """Return the options of heights. A true ortho has empty pixels anyway: so it has where the DSM has gaps."""
+    options = request.surface
+    if request.output.visibility == "nodata" and options.fill == SurfaceOptions.fill and options.dem is not None:
+        return dataclasses.replace(options, fill="mask")
+    return options
 
 
 def on_surface(scene: Scene, surface: Surface | None) -> Scene:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -13,8 +13,9 @@ from ortho_pipeline import host
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.host.unread import unread
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.points import read_points
@@ -50,11 +51,12 @@ _MOST, _DEPTH = 2000, 3
 
 @dataclass(frozen=True)
 class SurveyedFile:
-    """A file, by its path from the folder: its kind, and its description."""
+    """A file, by its path from the folder: its kind, its description, and the models of a scene."""
 
     path: str
     kind: Kind
     said: str
+    models: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,31 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
     return FolderSurvey(place, tuple(_without_parts(files)))
 
 
+def images_of(
+    images: Sequence[str | os.PathLike[str]], scene: SceneOptions | Sequence[SceneOptions]
+) -> Sequence[str | os.PathLike[str]]:
+    """Return the images of a command; one folder with several scenes stands for these.
+
+    Raises
+    ------
+    InputError
+        If the folder has no two scenes; the message says why its images are none.
+    """
+    if len(images) != 1 or not isinstance(scene, SceneOptions) or not Path(images[0]).is_dir():
+        return images
+    seen = survey(images[0], scene)
+    scenes = seen.of("scene")
+    if len(scenes) < 2:
+        others = [f"{file.path}: {file.said}" for file in seen.found if file.kind == "image"]
+        raise InputError(
+            "; ".join([f"this folder has {counted(len(scenes), 'scene')}, and a block needs two", *others[:3]]),
+            file=images[0],
+            field="images",
+            remedy=Text(f"see what is missing with `ortho info {typed(images[0])}`"),
+        )
+    return [seen.folder / name for name in scenes]
+
+
 def _files(folder: Path, depth: int) -> Iterator[Path]:
     """Yield the files of a folder and of those in it, by name; hidden ones and linked folders are left out."""
     with os.scandir(folder) as listed:
@@ -146,7 +173,10 @@ def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
         return _raster(path, name, options, error)
     models = ", ".join(scene.models)
     return SurveyedFile(
-        name, "scene", f"{scene.width} x {scene.height}, {scene.sensor}, {models} of {_short(scene.model_source)}"
+        name,
+        "scene",
+        f"{scene.width} x {scene.height}, {scene.sensor}, {models} of {_short(scene.model_source)}",
+        tuple(scene.models),
     )
 
 

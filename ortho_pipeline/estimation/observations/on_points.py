@@ -13,6 +13,7 @@ sigmas of a block (`block.variances`) give covariances of these points along the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,4 +78,9 @@ class Planes:
 
     def above(self, local: Array, rows: NDArray[np.int64] | slice = slice(None)) -> Array:
         """Return how far the planes are above points of `rows` ``(n,)``, along their normals; `local` is ``(N, 3)``."""
-        return np.asarray((self.axes[rows, 2] * (self.places[rows] - local[rows])).sum(axis=1))
+        return np.asarray(np.einsum("nc,nc->n", self._normals[rows], self.places[rows] - local[rows]))
+
+    @cached_property
+    def _normals(self) -> Array:
+        """Normals ``(N, 3)``, next to each other in memory."""
+        return np.ascontiguousarray(self.axes[:, 2])

@@ -2,26 +2,29 @@ r"""The displacement field of an image, from displacements that matches measured
 
 Along each of two axes, :math:`d(x) = F(x) b + s(x) + n`: an affine trend, a smooth field with
 :math:`\mathrm{cov}(s_i, s_j) = \sigma_s^2 k(d_{ij} / c)`, and noise of matching with the variances
-:math:`\sigma_n^2 w_i`. Chips that overlap share the noise of the pixels that they share: their noise is correlated by
-the part of its area that one shares with the other. So errors that neighbours share within a chip are noise and make
-the intervals wider. What they share over longer distances is the field, and counts as displacement.
+:math:`\sigma_n^2 w_i`. Chips that overlap share noise: its correlation is the square of the part of its area that one
+shares with the other. That is the measured correlation of errors of drawn pairs whose truth is known. A match
+measures the mean displacement of its chip, so no field has a shorter range than the side of a chip.
 
 Smoothness, range and strength of the field are unknown. So all functions of `shared_errors` have the same prior weight
-and are weighted by their restricted likelihood. Fields are drawn from all of them (conditional simulation by universal
+and are weighted by their restricted likelihood. A trend without slopes (a mere shift) is as likely beforehand as one
+with slopes. Fields are drawn from all of them (conditional simulation by universal
 kriging). A statistic of the field (its mean, its RMSE, a percentile of its length) is computed from each draw. Its
 spread includes the errors that neighbours share, places without matches, and the unknown function.
 
-Source: Cressie 1993, sections 3.4 (universal kriging) and 3.6.2 (conditional simulation); Handcock and Stein 1993.
+Source: Cressie 1993, sections 3.4 (universal kriging) and 3.6.2 (conditional simulation); Handcock and Stein 1993;
+Kass and Raftery 1995, section 4.1 (Schwarz criterion).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, spatial
+from scipy import linalg, spatial, special
 
 from ortho_pipeline.errors import TooFewPoints
 from ortho_pipeline.estimation.spatial.shared_errors import FAMILIES
@@ -37,8 +40,8 @@ _RANGES, _RATIOS, _LARGEST = 8, 16, 1e4
 _FUNCTIONS, _OF_EACH = 50, 20
 #: A displacement is local if it differs by so many sigmas from the prediction of its neighbours.
 _LOCAL = 4.5
-#: Part of the noise that chips share where they overlap; the rest is of each alone.
-_OF_PIXELS = 0.9
+#: Part of the noise that chips share at one place; the rest is of each alone.
+_OF_PIXELS = 0.98
 #: Rounds of leaving local displacements out.
 _ROUNDS = 3
 
@@ -170,13 +173,16 @@ class DisplacementField:
         found = np.empty((_FUNCTIONS * _OF_EACH, len(place), 2))
         for axis, one in enumerate(self.axes):
             chosen = random.choice(one.chance.size, _FUNCTIONS, p=one.chance.ravel())
+            slopes = random.random(_FUNCTIONS) >= self._constant(axis)
             rows = random.permutation(len(found)).reshape(_FUNCTIONS, _OF_EACH)
-            kriged: dict[int, tuple[Array, Array]] = {}
-            for number, part in zip(chosen.tolist(), rows, strict=True):
+            kriged: dict[tuple[int, bool], tuple[Array, Array]] = {}
+            for number, sloping, part in zip(chosen.tolist(), slopes.tolist(), rows, strict=True):
                 kernel, ratio = divmod(number, len(one.ratios))
-                if number not in kriged:
-                    kriged[number] = self._kriged(axis, one.kernels[kernel], one.ratios[ratio], inside, root=True)
-                middle, root = kriged[number]
+                if (number, sloping) not in kriged:
+                    kriged[number, sloping] = self._kriged(
+                        axis, one.kernels[kernel], one.ratios[ratio], inside, root=True, slopes=sloping
+                    )
+                middle, root = kriged[number, sloping]
                 variance = one.squares[kernel, ratio] / random.chisquare(one.freedom, _OF_EACH)
                 noise = random.standard_normal((_OF_EACH, len(place)))
                 found[part, :, axis] = middle + np.sqrt(variance)[:, None] * (noise @ root.T)
@@ -243,15 +249,22 @@ class DisplacementField:
         return lambda columns: np.asarray(linalg.solve_triangular(root, columns, lower=True))
 
     def _kriged(
-        self, axis: int, kernel: tuple[int, float], ratio: float, place: Array, *, root: bool = False
+        self,
+        axis: int,
+        kernel: tuple[int, float],
+        ratio: float,
+        place: Array,
+        *,
+        root: bool = False,
+        slopes: bool = True,
     ) -> tuple[Array, Array]:
         """Return the mean ``(m,)`` of the field of an axis at places, and a root of its covariance over the noise's."""
-        white = self._whitened(kernel, ratio)
-        design, value = white(_design(self.place)), white(self.value[:, axis])
+        white, terms = self._whitened(kernel, ratio), 3 if slopes else 1
+        design, value = white(_design(self.place)[:, :terms]), white(self.value[:, axis])
         across = white(ratio * self._covariance(kernel, self.place, place))
         normal = linalg.cho_factor(design.T @ design)
         trend = linalg.cho_solve(normal, design.T @ value)
-        left = _design(place) - across.T @ design
+        left = _design(place)[:, :terms] - across.T @ design
         mean = across.T @ value + left @ trend
         if not root:
             return mean, np.zeros((0, 0))
@@ -259,6 +272,22 @@ class DisplacementField:
         covariance += left @ linalg.cho_solve(normal, left.T)
         values, vectors = np.linalg.eigh(covariance)
         return mean, vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def _constant(self, axis: int) -> float:
+        """Return the chance that the trend of an axis has no slopes, by the information criterion of Schwarz.
+
+        The number of displacements is that of independent ones with the same information on the mean.
+        """
+        one = self.axes[axis]
+        kernel, ratio = one.best
+        white = self._whitened(one.kernels[kernel], one.ratios[ratio])
+        design, value = white(_design(self.place)), white(self.value[:, axis])
+        squares = []
+        for terms in (1, 3):
+            part = design[:, :terms]
+            squares.append(((value - part @ np.linalg.lstsq(part, value, rcond=None)[0]) ** 2).sum())
+        gain = len(value) * math.log(squares[0] / max(squares[1], 1e-300))
+        return float(special.expit(math.log(max((design[:, 0] ** 2).sum(), 1.0)) - gain / 2))
 
     def _apart(self) -> Array:
         """Return squared distances ``(n,)`` of displacements from what the others say, in sigmas."""
@@ -280,12 +309,12 @@ def _design(place: Array) -> Array:
 
 
 def _noise(place: Array, weight: Array, side: float) -> Array:
-    """Return the covariance ``(n, n)`` of the noise: chips share that of the pixels that they share."""
+    """Return the covariance ``(n, n)`` of the noise: chips that overlap share a part of it."""
     root = np.sqrt(weight)
     if not side > 0:
         return np.diag(weight)
     apart = np.abs(place[:, None] - place) / side
-    shared = np.maximum(1.0 - apart, 0.0).prod(axis=2)
+    shared = np.maximum(1.0 - apart, 0.0).prod(axis=2) ** 2
     return np.asarray((_OF_PIXELS * shared + (1.0 - _OF_PIXELS) * np.eye(len(place))) * root[:, None] * root)
 
 
@@ -304,7 +333,7 @@ def _likely(place: Array, value: Array, weight: Array, side: float) -> tuple[_Ax
     whole = np.maximum((left**2).sum(axis=0) / freedom, 1e-300)
     distance = spatial.distance.cdist(place, place)
     near = float(np.median(np.partition(distance, 1, axis=1)[:, 1]))
-    ranges = np.geomspace(np.clip(near, 0.01, 0.5), 1.0, _RANGES)
+    ranges = np.geomspace(np.clip(max(near, side), 0.01, 0.5), 1.0, _RANGES)
     ratios = np.concatenate([[0.0], np.geomspace(1.0 / count, _LARGEST, _RATIOS)])
     kernels = tuple((family, float(length)) for family in range(len(FAMILIES)) for length in ranges)
     logs, squares = (np.empty((2, len(kernels), len(ratios))) for _ in range(2))

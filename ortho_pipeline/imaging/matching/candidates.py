@@ -5,19 +5,26 @@ Source: Foerstner and Guelch 1987 (interest operator: the smaller eigenvalue of 
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.imaging.matching.targets import SceneView
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.intensity import Intensity
 
 #: Largest window (chip px) to search in a cell, so the cost does not depend on the size of the scene.
 _WINDOW = 128
 #: A chip with a larger share of saturated pixels is a cloud or a sunlit roof.
 _SATURATED = 0.2
+#: Of an image on another machine: the part of its blocks to read, the side (chip px) of the window at a spot, which is
+#: what the search for the position reads there, and the chips per side of that window.
+_READ, _SPOT, _AT_SPOT = 0.1, 168, 3
 #: Width of the border to keep free (chip px).
 _RIM = 2
 
@@ -50,12 +57,51 @@ def candidates(
         Cells to search.
     """
     width, height = region[2] - region[0], region[3] - region[1]
-    chosen = []
+    parts = []
     for number in np.flatnonzero(inside.ravel()).tolist():
         row, column = divmod(number, cells[0])
         left, right = (region[0] + width * place / cells[0] for place in (column, column + 1))
         top, bottom = (region[1] + height * place / cells[1] for place in (row, row + 1))
-        place = _best(view, (left, top, right, bottom), size, factor)
+        parts.append(((left, top, right, bottom), number))
+    return _best_of(view, parts, size, factor)
+
+
+def spots_of(view: SceneView, images: Sequence[Intensity]) -> int | None:
+    """Return how many spots per side to look at, so that few blocks are read; None if all images are on this machine.
+
+    The matcher reads a window of `_SPOT` pixels at each spot, from each image.
+    """
+    if not any(Location(image.source.path).is_far for image in images):
+        return None
+    width, height = view.size
+    columns, rows = view.intensity.source.bands[0].GetBlockSize()
+    read = (1 + _SPOT / columns) * (1 + _SPOT / rows)
+    return int(np.clip(math.sqrt(_READ * (width / columns) * (height / rows) / read), 3, view.spots))
+
+
+def at_spots(
+    view: SceneView, region: tuple[int, int, int, int], size: int, factor: int, inside: NDArray[np.bool_]
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return chips as `candidates` does, several at each spot: the middles of the cells ``(rows, columns)``."""
+    half = (_SPOT - size) / 2 * factor
+    edges = np.linspace(-half, half, _AT_SPOT + 1).tolist()
+    parts = []
+    for number in np.flatnonzero(inside.ravel()).tolist():
+        row, column = divmod(number, inside.shape[1])
+        x = region[0] + (region[2] - region[0]) * (column + 0.5) / inside.shape[1]
+        y = region[1] + (region[3] - region[1]) * (row + 0.5) / inside.shape[0]
+        for top, bottom in itertools.pairwise(edges):
+            for left, right in itertools.pairwise(edges):
+                parts.append(((x + left, y + top, x + right, y + bottom), number))
+    return _best_of(view, parts, size, factor)
+
+
+def _best_of(
+    view: SceneView, parts: Sequence[tuple[tuple[float, float, float, float], int]], size: int, factor: int
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    chosen = []
+    for cell, number in parts:
+        place = _best(view, cell, size, factor)
         if place is not None:
             chosen.append((*place, number))
     table = np.array(chosen, dtype=int).reshape(-1, 3)

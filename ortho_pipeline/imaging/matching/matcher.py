@@ -15,7 +15,7 @@ from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.band_shifts import BandShift, spread
 from ortho_pipeline.imaging.matching.agreement import agreed
-from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
+from ortho_pipeline.imaging.matching.candidates import at_spots, candidates, cells_of, spots_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
     MEASURED,
@@ -166,6 +166,8 @@ def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -
     threads = limit_cache(settings.memory, settings.threads, *(image.source.block for image in images))
     shown = _shown(view, targets)
     base = chip_factor(view, targets, shown)
+    spots = spots_of(view, images)
+    view = view if spots is None else replace(view, spots=spots)
     reach = max(reach, 2.0 * base)
     region = _region(view, shown)
     try:
@@ -176,9 +178,12 @@ def match(view: SceneView, targets: Sequence[Target], settings: MatchSettings) -
     extent = region[2] - region[0], region[3] - region[1]
     # The targets may show only a part of that rectangle.
     share = len(shown) / SAMPLES**2 * view.size[0] * view.size[1] / (extent[0] * extent[1])
-    grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0)))
-    corrected = SceneView(view.intensity, correction, view.surface)
-    origins, cells = candidates(view, region, grid, SIDE, base, _cells_shown(corrected, targets, region, grid))
+    grid = cells_of(*extent, round(settings.points / min(max(share, 0.05), 1.0))) if spots is None else (spots, spots)
+    cells_shown = _cells_shown(replace(view, model=correction), targets, region, grid)
+    if spots is None:
+        origins, cells = candidates(view, region, grid, SIDE, base, cells_shown)
+    else:
+        origins, cells = at_spots(view, region, SIDE, base, cells_shown)
     tried = _Tried(view, targets, origins, cells, base, threads, displaced)
     tried.search(correction)
     if displaced:

@@ -39,8 +39,8 @@ from ortho_pipeline.models.base import Array
 Region = tuple[int, int, int, int]
 #: Usual and least side of a coarse chip (chip px).
 _SIDE, _LEAST_SIDE = 48, 24
-#: Largest number of coarse chips per side of the scene, and least number in all.
-_PER_SIDE, _FEWEST = 6, 5
+#: Least number of coarse chips.
+_FEWEST = 5
 #: Radii of the coarsest search (chip px).
 _COMFORTABLE, _LARGEST_RADIUS = 100, 160
 #: Radius (chip px) of the searches after the first.
@@ -113,12 +113,16 @@ def place(
     middle = (region[0] + region[2]) / 2, (region[1] + region[3]) / 2
     start = ImageCorrection.identity(view.model, "affine", middle)
     factor, radius = _coarsest(region, reach, base)
-    side = _chip_side(region, factor, 3)
-    shifts = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
-    alone = [shifted(start, -shift * factor) for shift in shifts]
+    alone = _shifts_alone(view, targets, region, start, (factor, radius))
     try:
         return _refined(view, targets, reach, base, region, (factor, radius), alone)
     except InputError as error:
+        # Under clouds, or in another season, few coarse chips may decide nothing; fine ones are more.
+        finest = base, max(_NEXT, math.ceil(reach / base) + 2)
+        if factor > base and finest[1] <= _COMFORTABLE:
+            with contextlib.suppress(InputError):
+                fine = _shifts_alone(view, targets, region, start, finest)
+                return _refined(view, targets, reach, base, region, finest, fine)
         if rotation_deg:
             turned = _turned(view, targets, region, start, (factor, radius), rotation_deg)
             refined = (_settled(view, targets, region, correction, factor) for correction in turned)
@@ -128,6 +132,16 @@ def place(
             with contextlib.suppress(InputError):
                 return _refined(view, targets, reach, base, region, (factor, radius), corrections)
         raise error from None
+
+
+def _shifts_alone(
+    view: SceneView, targets: Sequence[Target], region: Region, start: ImageCorrection, level: tuple[int, int]
+) -> list[ImageCorrection]:
+    """Return the corrections of the highest peaks over shifts, the highest first."""
+    factor, radius = level
+    side = _chip_side(region, factor, 3)
+    shifts = _hypotheses(_correlated(view, targets, region, side, factor, radius), targets)
+    return [shifted(start, -shift * factor) for shift in shifts]
 
 
 def _turned(
@@ -142,7 +156,7 @@ def _turned(
     factor, radius = level
     side = _chip_side(region, factor, 3)
     origin = np.array(start.origin)
-    wide = radius + margin((_spread(region, side, factor) + side * factor / 2 - origin) / factor)
+    wide = radius + margin((_spread(region, side, factor, view.spots) + side * factor / 2 - origin) / factor)
     turns: list[Turn] = []
     for matrix in renderings(rotation_deg):
         model = followed_by(start, affine_step(matrix, np.zeros(2)))
@@ -279,11 +293,11 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
     return factor, radius
 
 
-def _spread(region: Region, side: int, factor: int) -> NDArray[np.int_]:
-    """Return first pixels ``(n, 2)`` of chips, spread over a region without overlap."""
+def _spread(region: Region, side: int, factor: int, most: int) -> NDArray[np.int_]:
+    """Return first pixels ``(n, 2)`` of chips, at most so many per side, spread over a region without overlap."""
     places = []
     for first, extent in zip(region, _extent(region), strict=False):
-        count = max(1, min(_PER_SIDE, extent // (side * factor)))
+        count = max(1, min(most, extent // (side * factor)))
         cell = extent / count
         places.append([first + int(cell * (k + 0.5) - side * factor / 2) for k in range(count)])
     columns, rows = np.meshgrid(*places)
@@ -294,7 +308,7 @@ def _correlated(
     view: SceneView, targets: Sequence[Target], region: Region, side: int, factor: int, radius: int
 ) -> _Shown:
     """Correlate chips, spread over a region, with the first target that shows enough of each."""
-    origins = _spread(region, side, factor)
+    origins = _spread(region, side, factor, view.spots)
     wide = side + 2 * radius
     scene = scene_chips(view, origins, side, factor)
     shown = Renderer(view, targets, origins - radius * factor, wide, factor).render(np.arange(len(origins)))

@@ -38,11 +38,14 @@ class SceneView:
     intensity : Intensity
     model : SensorModel
     surface : Surface
+    spots : int
+        Largest number of coarse chips per side.
     """
 
     intensity: Intensity
     model: SensorModel
     surface: Surface
+    spots: int = 6
 
     @property
     def size(self) -> tuple[int, int]:

@@ -83,6 +83,13 @@ class LightPath:
             line = line + velocity * (np.linalg.norm(line, axis=1)[:, None] / LIGHT)
         return line
 
+    def turned(self, matrix: Array, line: Array, velocity: Array) -> Array:
+        """Return matrices ``(N, 3, 3)`` by which apparent vectors are turned, as they apply to changes of `line`."""
+        if not self.aberration:
+            return matrix
+        unit = line / np.linalg.norm(line, axis=1)[:, None]
+        return np.asarray(matrix + (matrix @ velocity[:, :, None] / LIGHT) * unit[:, None, :])
+
     def straight(self, direction: Array, velocity: Array) -> Array:
         """Return the unit vectors ``(N, 3)`` along which light arrived that is seen along unit vectors `direction`."""
         if not self.aberration:

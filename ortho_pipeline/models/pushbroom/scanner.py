@@ -376,7 +376,7 @@ def _by_ground(model: Pushbroom, ground: Array) -> Array:
     moved = np.swapaxes(enu_from_ecef(ground), 1, 2).copy()
     moved[:, :, :2] *= metres_per_degree(ground)[:, None, :]
     moved[:, :, 2] *= model.light.rise(ground[:, 2], state.cosine)[:, None]
-    by_camera = model.mounting.T @ np.swapaxes(state.turn, 1, 2) @ model.orbital.T
+    by_camera = model.mounting.T @ state.by_line @ model.orbital.T
     return state.image_by(by_camera @ moved)
 
 
@@ -386,7 +386,7 @@ def _by_params(model: Pushbroom, ground: Array) -> Array:
     place = {column: at for at, column in enumerate(parameters.places(model.free))}
     by_vector = np.zeros((len(ground), 3, len(place)))
     groups = (
-        ("path", model.path, -(model.mounting.T @ np.swapaxes(state.turn, 1, 2))),
+        ("path", model.path, -(model.mounting.T @ state.by_line)),
         ("attitude", model.attitude, model.mounting.T @ state.by_angles),
     )
     for group, spline, slopes in groups:
@@ -439,13 +439,15 @@ class _State:
         line = (geocentric(ground) - flight.origin) @ flight.orbital - flight.path(self.times)
         #: Cosine of the zenith angle at the point.
         self.cosine = -(line * up).sum(axis=1) / np.linalg.norm(line, axis=1)
-        line = model.light.apparent(line, rate, up, ground[:, 2])
         back = np.swapaxes(self.turn, 1, 2)
+        #: d(vector in platform axes)/d(line from the camera to the point)
+        self.by_line = model.light.turned(back, line, rate)
+        line = model.light.apparent(line, rate, up, ground[:, 2])
         place = np.einsum("nij,nj->ni", back, line)
         #: d(vector in platform axes)/d(roll, pitch, yaw)
         self.by_angles = -np.cross(np.swapaxes(turning_axes(angles), 1, 2), place[:, None, :]).swapaxes(1, 2)
         self.vector = (place - model.lever) @ model.mounting
-        rate = np.einsum("nij,nj->ni", self.by_angles, rates) - np.einsum("nij,nj->ni", back, rate)
+        rate = np.einsum("nij,nj->ni", self.by_angles, rates) - np.einsum("nij,nj->ni", self.by_line, rate)
         x, y, z = self.vector.T
         zero, one = np.zeros_like(z), np.ones_like(z)
         #: d(u, v)/d(vector in camera axes)

@@ -1,14 +1,15 @@
-"""The page of a verified ortho (accuracy, displacements, profiles, bands, causes), and the table of a folder."""
+"""The page of a verified or aligned ortho, and the table of a folder."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, style_sheet
 from ortho_pipeline.display.numbers import size_m
@@ -16,20 +17,14 @@ from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files import write_text
 from ortho_pipeline.raster.quicklook import preview_png
+from ortho_pipeline.report.orthos.summary import about, best_part, errors_of, headline, interval_text
 from ortho_pipeline.report.page.advice import WORDS, signals
+from ortho_pipeline.report.summary import error_table, processed
 
-#: Longer side of the map, CSS px, and the space around it; the longest arrow, and cells that are drawn per side.
-_SIDE, _PAD, _LONGEST = 460.0, 22.0, 30.0
+#: Longer side of the map and its longest arrow, CSS px.
+_SIDE, _LONGEST = 460.0, 30.0
 #: A profile: width and height of its frame, and the space to its left and below.
 _PROFILE, _LEFT, _BELOW = (430.0, 150.0), 62.0, 46.0
-
-
-def interval_text(estimate: Mapping[str, float], unit: str = "m") -> str:
-    """Return an estimate with its interval: ``0.48 m (0.41 to 0.55)``."""
-    value, low, high = (estimate[name] for name in ("value", "low", "high"))
-    digits = 2 if max(abs(value), abs(high)) >= 0.1 else 3
-    text = f"{value:.{digits}f} {unit}".strip()
-    return f"{text} ({low:.{digits}f} to {high:.{digits}f})".replace("-", "−")
 
 
 def write_page(
@@ -47,7 +42,11 @@ def write_page(
         "report/ortho_check.html.j2",
         document=document,
         name=Path(document["ortho"]).name,
+        kind="Report of an aligned ortho" if "before" in document else "Accuracy of an ortho",
+        about=about(document),
         headline=headline(document),
+        best=document[part] if (part := best_part(document)) else None,
+        errors=error_table(errors_of(document)),
         parts=_parts(document),
         css=style_sheet(),
         map=None if drawn is None else drawn.svg(),
@@ -64,18 +63,12 @@ def write_page(
 
 def write_table(table: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     """Write the page of a folder: one row for each ortho."""
-    write_text(path, render("report/ortho_table.html.j2", table=table, name=os.path.basename, interval=interval_text))
-
-
-def headline(document: Mapping[str, Any]) -> str:
-    """Return what the page says first."""
-    for part, where in (("points", "at the points"), ("absolute", "on the ground"), ("relative", "of the reference")):
-        found = document[part]
-        if found is not None:
-            value = found["ce90_m"]["value"]
-            within = f"90 % of the ortho is within {size_m(value)} {where}"
-            return f"{within}." if part != "points" else f"90 % of errors are below {size_m(value)} {where}."
-    return "Accuracy unknown: there are no matches and no points."
+    known = {"Processed": processed()}
+    page = render(
+        "report/ortho_table.html.j2", table=table, name=os.path.basename, interval=interval_text, about=known,
+        best_part=best_part,
+    )  # fmt: skip
+    write_text(path, page)
 
 
 def _parts(document: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -101,27 +94,25 @@ def _parts(document: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def displacement_map(document: Mapping[str, Any]) -> tuple[Drawing | None, str]:
-    """Return the map of displacements over the frame of the image, and how long its longest arrow is."""
+    """Return the displacements in the frame of the image, and how long the longest arrow is."""
     cells = document["field"]["cells"] if "field" in document else []
-    longest = max((math.hypot(one["east_m"], one["north_m"]) for one in cells), default=0.0)
+    shifts = np.array([[one["east_m"], one["north_m"]] for one in cells]).reshape(-1, 2)
+    longest = float(np.hypot(*shifts.T).max(initial=0.0))
     if not longest > 0:
         return None, ""
     width, height = document["size"]
     scale = _SIDE / max(width, height)
-    drawing = Drawing(
-        width * scale + 2 * _PAD, height * scale + 2 * _PAD, "Map of displacements over the ortho", "displacements"
-    )
-    drawing.rect("frame", _PAD, _PAD, width * scale, height * scale)
-    length = _LONGEST / longest
-    for one in cells:
-        x, y = (_PAD + place * scale for place in one["image"])
+    drawing = Drawing(width * scale, height * scale, "Map of displacements over the ortho", "displacements")
+    drawing.rect("frame", 0.0, 0.0, width * scale, height * scale)
+    # East and north as columns and rows of this image, which may be rotated or upside down.
+    along = np.linalg.solve(np.array(document["pixel_axes_m"]), shifts.T).T * document["pixel_m"]
+    for one, (dx, dy) in zip(cells, (along * _LONGEST / longest).tolist(), strict=True):
+        x, y = (place * scale for place in one["image"])
         with drawing.titled(f"east {one['east_m']:+.2f} m, north {one['north_m']:+.2f} m"):
-            drawing.arrow("control", x, y, one["east_m"] * length, -one["north_m"] * length)
+            drawing.arrow("control", x, y, dx, dy)
     for one in document["steps"]:
-        at = _PAD + one["at"] * scale
-        ends = (
-            (at, _PAD, at, _PAD + height * scale) if one["axis"] == "column" else (_PAD, at, _PAD + width * scale, at)
-        )
+        at = one["at"] * scale
+        ends = (at, 0.0, at, height * scale) if one["axis"] == "column" else (0.0, at, width * scale, at)
         drawing.line("check-dash", *ends)
     return drawing, size_m(longest)
 

@@ -38,6 +38,9 @@ _STOP: dict[str, str] = {
     "metadata-contradict": "Find out which one is right before you use the ortho. Ask the supplier of the scene.",
 }
 _LOOK: dict[str, str] = {
+    "datum-unknown": Text(
+        "State the height datum with ", Setting("scene.sensor_options", "DATUM", key="vertical"), "."
+    ),
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "
     "there.",
     "bands-disagree": Text(

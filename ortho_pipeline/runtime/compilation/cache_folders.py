@@ -22,6 +22,8 @@ _ROOT = 0
 @functools.cache
 def own() -> tuple[Path | None, str]:
     """Return the folder to which this user's kernels are written, or None and the reason why there is none."""
+    if not hasattr(os, "geteuid"):
+        return None, "this system does not say which user a file belongs to"
     folder = _of(os.geteuid())
     if folder is None:
         return None, f"there is no home folder, and {FOLDER} names no absolute path"
@@ -38,7 +40,7 @@ def own() -> tuple[Path | None, str]:
 @functools.cache
 def of_root() -> Path | None:
     """Return the folder of the kernels that root has compiled, if it is another one and can be read and trusted."""
-    folder = _of(_ROOT)
+    folder = _of(_ROOT) if hasattr(os, "geteuid") else None
     if folder is None or not os.geteuid() or not os.access(folder, os.R_OK | os.X_OK):
         return None
     return None if fault_of(folder, _ROOT) else folder

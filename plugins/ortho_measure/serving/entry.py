@@ -93,7 +93,7 @@ def private_file(address: str, points: Path) -> Iterator[Path | None]:
     path = points.with_name(points.name + _ENDING)
     try:
         path.unlink(missing_ok=True)  # of a process that was killed
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except OSError:
         yield None
         return

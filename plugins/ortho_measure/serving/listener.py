@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import resource
 import socket
 from dataclasses import dataclass
 from typing import Any
@@ -121,5 +120,9 @@ class Listener(socket.socket):
 
 
 def _affordable() -> int:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return MOST
     descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return MOST if descriptors == resource.RLIM_INFINITY else max(2, min(MOST, descriptors // 4))

@@ -1,0 +1,345 @@
+"""Simulated flights of a drone: blocks of photos whose EXIF and XMP are wrong, with ties and a DEM.
+
+python benchmarks/flights.py                     20 flights of 30 photos of each kind
+python benchmarks/flights.py --photos 100        larger ones
+python benchmarks/flights.py --kinds rtk,focal   some kinds
+
+The truth is in ECEF, by PROJ and the formulas of this file; it shares no code with the sensor models. The estimator
+sees the photos' tags, the ties and the DEM only. "wrong" are flights that raise no error although neighbouring orthos
+do not fit, or the block is farther off than it claims; "naive" are the orthos by the tags alone, on the same DEM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import pyproj
+from osgeo import gdal, osr
+
+from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights.source import DemHeights
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.errors import OrthoError
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.surface.dem import DemSurface, open_dem
+
+gdal.UseExceptions()
+Array = np.ndarray
+#: The camera: columns, rows, focal length (px). Flying height over the mean ground, and overlaps along and across.
+COLUMNS, ROWS, FOCAL, ABOVE, OVERLAPS = 1368, 912, 915.0, 100.0, (0.75, 0.6)
+MIDDLE, GROUND_HEIGHT = (33.1, 39.4), 900.0
+#: Standard deviation (px) of ties, share of ties with a gross error in one ray, its size (px), sigma of the DEM (m).
+TIE, OUTLIERS, GROSS, DEM_SIGMA = 0.3, 0.1, 30.0, 0.3
+PARTS = {"plan": ("X_L", "Y_L"), "up": ("Z_L",), "tilt": ("omega", "phi"), "head": ("kappa",)}
+#: A flight is wrong if its neighbouring orthos are apart by more than this (px, RMS), or its mean position by so many
+#: of the sigmas that it claims.
+WRONG, FAR = 1.0, 4.0
+TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+TO_MAP = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:32636", always_xy=True)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Errors of a flight: sigmas of positions (m) and angles (degrees), the focal length, and the tags that state them.
+
+    `datum` (m) is what the altitudes of all photos are off by.
+    """
+
+    position: float = 3.0
+    angle: float = 3.0
+    focal: float = 1.0
+    datum: float = 0.0
+    tags: dict[str, str] = field(default_factory=lambda: {"Camera:GPSXYAccuracy": "3", "Camera:GPSZAccuracy": "3"})
+    options: dict[str, str] = field(default_factory=lambda: {"vertical": "ellipsoid"})
+
+
+_RTK = {"drone-dji:RtkStdLon": "0.02", "drone-dji:RtkStdLat": "0.02", "drone-dji:RtkStdHgt": "0.02"}
+KINDS = {
+    "exif": Kind(),
+    "rtk": Kind(position=0.02, tags=_RTK),
+    "focal": Kind(focal=1.02),
+    "rtk-focal": Kind(position=0.02, focal=1.02, tags=_RTK),
+    "datum": Kind(datum=30.0, options={}),
+}
+
+
+@dataclass(frozen=True)
+class Flight:
+    """The truth of a flight: positions in ECEF, rotations from ECEF to x right, y down, z forward; ties; the DEM."""
+
+    positions: Array
+    turns: Array
+    points: BlockPoints
+    scenes: dict[str, Scene]
+    dem: DemSurface
+    waves: Array
+
+
+def height(waves: Array, lon: Array, lat: Array) -> Array:
+    """Return ellipsoidal heights of rolling ground."""
+    east, north = (lon - MIDDLE[0]) * 86_000.0, (lat - MIDDLE[1]) * 111_000.0
+    return GROUND_HEIGHT + sum(a * np.sin((east * x + north * y) / size + at) for a, x, y, size, at in waves)
+
+
+def to_ecef(lonlath: Array) -> Array:
+    return np.stack(TO_ECEF.transform(*np.asarray(lonlath).T), axis=-1)
+
+
+def east_north_down(lon: float, lat: float) -> Array:
+    """Return the rows north, east, down in ECEF."""
+    sl, cl, sp, cp = (f(np.radians(a)) for a in (lon, lat) for f in (np.sin, np.cos))
+    return np.array([[-sp * cl, -sp * sl, cp], [-sl, cl, 0.0], [-cp * cl, -cp * sl, -sp]])
+
+
+def turn_of(place: Array, yaw: float, pitch: float, roll: float) -> Array:
+    """Return the rotation from ECEF to x right, y down, z forward of a gimbal (degrees; ZYX, forward right down)."""
+    sy, cy, sp, cp, sr, cr = (f(np.radians(a)) for a in (yaw, pitch, roll) for f in (np.sin, np.cos))
+    body = (
+        np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    )
+    return np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) @ body.T @ east_north_down(place[0], place[1])
+
+
+def seen(position: Array, turn: Array, ground: Array) -> Array:
+    """Return pixels of ground in ECEF; NaN outside the photo."""
+    x, y, z = turn @ (ground - position).T
+    image = np.stack([COLUMNS / 2 + FOCAL * x / z, ROWS / 2 + FOCAL * y / z], axis=1)
+    inside = (z > 0) & (image > 0).all(axis=1) & (image < (COLUMNS, ROWS)).all(axis=1)
+    image[~inside] = np.nan
+    return image
+
+
+def fly(kind: Kind, photos: int, seed: int, folder: Path) -> Flight:
+    """Fly strips to and fro, and write the photos with their wrong tags."""
+    random = np.random.default_rng(seed)
+    waves = np.column_stack(
+        [random.uniform(2, 6, 5), *random.normal(0, 0.7, (2, 5)), random.uniform(40, 120, 5), random.uniform(0, 6, 5)]
+    )
+    steps = np.array([ROWS, COLUMNS]) * (1 - np.array(OVERLAPS)) * ABOVE / FOCAL
+    strips = max(1, round(np.sqrt(photos / 1.2)))
+    poses, tags = [], []
+    for number in range(photos):
+        strip, along = number % strips, number // strips
+        north = (along - photos / strips / 2) * steps[0] + random.normal(0, 1)
+        east = (strip - strips / 2) * steps[1] + random.normal(0, 1)
+        place = np.array([MIDDLE[0] + east / 86_000.0, MIDDLE[1] + north / 111_000.0, GROUND_HEIGHT + ABOVE])
+        angles = np.add([180.0 * (strip % 2), -90.0, 0.0], random.normal(0, 2, 3))
+        poses.append((place, turn_of(place, *angles)))
+        off = np.add(random.normal(0, kind.position, 3), [0.0, 0.0, kind.datum])
+        tags.append((place + off / (86_000.0, 111_000.0, 1.0), angles + random.normal(0, kind.angle, 3)))
+    positions, turns = to_ecef(np.array([place for place, _ in poses])), np.array([turn for _, turn in poses])
+    names = [f"p{k:03d}" for k in range(photos)]
+    scenes = {
+        name: write_photo(folder / f"{name}.tif", place, angles, kind)
+        for name, (place, angles) in zip(names, tags, strict=True)
+    }
+    points = ties(positions, turns, waves, list(scenes), random)
+    return Flight(positions, turns, points, scenes, write_dem(folder / "dem.tif", waves, random), waves)
+
+
+def write_photo(path: Path, place: Array, angles: Array, kind: Kind) -> Scene:
+    """Write a photo without pixels but with tags, and open it by these."""
+    made = gdal.GetDriverByName("GTiff").Create(str(path), COLUMNS, ROWS, 1, options=["SPARSE_OK=TRUE"])
+    yaw, pitch, roll = angles
+    xmp = {
+        "drone-dji:GpsLatitude": f"{place[1]:.9f}", "drone-dji:GpsLongitude": f"{place[0]:.9f}",
+        "drone-dji:AbsoluteAltitude": f"{place[2]:.4f}", "drone-dji:RelativeAltitude": f"{ABOVE:.2f}",
+        "drone-dji:GimbalYawDegree": f"{yaw:.4f}", "drone-dji:GimbalPitchDegree": f"{pitch:.4f}",
+        "drone-dji:GimbalRollDegree": f"{roll:.4f}", "drone-dji:CalibratedFocalLength": f"{FOCAL * kind.focal:.4f}",
+        **kind.tags,
+    }  # fmt: skip
+    values = " ".join(f'{name}="{value}"' for name, value in xmp.items())
+    packet = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" '
+        f'xmlns:Camera="http://pix4d.com/camera/1.0/" {values}/></rdf:RDF></x:xmpmeta>'
+    )
+    made.SetMetadata([packet], "xml:XMP")
+    made = None
+    return open_scene(path, SceneOptions(sensor="photo", sensor_options=kind.options))
+
+
+def ties(positions: Array, turns: Array, waves: Array, names: list[str], random: np.random.Generator) -> BlockPoints:
+    """Return ties with errors, some of them gross; about 40 for each photo."""
+    spread = 1.2 * np.abs(positions - positions.mean(axis=0)).max() + ABOVE / 2
+    lonlat = np.array(MIDDLE) + random.uniform(-spread, spread, (60 * len(names), 2)) / (86_000.0, 111_000.0)
+    ground = to_ecef(np.column_stack([lonlat, height(waves, *lonlat.T)]))
+    images = np.array([seen(position, turn, ground) for position, turn in zip(positions, turns, strict=True)])
+    visible = np.isfinite(images).all(axis=2)
+    shown = np.flatnonzero(visible.sum(axis=0) >= 2)[: 15 * len(names)]
+    image, point = np.nonzero(visible[:, shown])
+    measured = images[image, shown[point]] + random.normal(0, TIE, (len(image), 2))
+    count = len(shown)
+    order = random.permutation(len(image))
+    one_each = order[np.unique(point[order], return_index=True)[1]]
+    gross = one_each[random.random(count) < OUTLIERS]
+    measured[gross] += random.uniform(-GROSS, GROSS, (len(gross), 2))
+    return BlockPoints(
+        ids=tuple(f"t{k}" for k in range(count)),
+        ground=np.full((count, 3), np.nan),
+        roles=np.full(count, "tie"),
+        sigma_ground=np.zeros((count, 3)),
+        crs=pyproj.CRS.from_epsg(4326),
+        images=tuple(names),
+        point=point.astype(np.int64),
+        image=image.astype(np.int64),
+        measured=measured,
+        sigma_image=np.full(len(image), TIE),
+        source="simulated",
+    )
+
+
+def write_dem(path: Path, waves: Array, random: np.random.Generator) -> DemSurface:
+    """Write the ground with errors as a DEM of cells of 2 m, and open it."""
+    x, y = TO_MAP.transform(*MIDDLE)
+    size, cell = 500, 2.0
+    columns, rows = np.meshgrid(np.arange(size) + 0.5 - size / 2, np.arange(size) + 0.5 - size / 2)
+    lon, lat = TO_MAP.transform(x + cell * columns, y - cell * rows, direction="INVERSE")
+    made = gdal.GetDriverByName("GTiff").Create(str(path), size, size, 1, gdal.GDT_Float32)
+    made.SetGeoTransform((x - cell * size / 2, cell, 0, y + cell * size / 2, 0, -cell))
+    system = osr.SpatialReference()
+    system.ImportFromEPSG(32636)
+    made.SetProjection(system.ExportToWkt())
+    made.WriteArray(height(waves, lon, lat) + random.normal(0, DEM_SIGMA, lon.shape))
+    made = None
+    return open_dem(path, "ellipsoid", fill="mask").with_sigma(DEM_SIGMA)
+
+
+# -- the result next to the truth ------------------------------------------------------------------------------------
+
+
+def off_by(flight: Flight, models: Any) -> Array:
+    """Return how far (m, east and north) each ortho is from the true ground: ``(photos, n, 2)``; NaN where unseen.
+
+    It is where a model shows a ground point, from where the photo has it, turned into metres by the true photo.
+    """
+    lonlat = np.array(MIDDLE) + np.random.default_rng(0).uniform(-80, 80, (400, 2)) / (86_000.0, 111_000.0)
+    steps = np.array([[0.0, 0.0], [1.0 / 86_000.0, 0.0], [0.0, 1.0 / 111_000.0]])
+    places = [np.column_stack([lonlat + step, height(flight.waves, *(lonlat + step).T)]) for step in steps]
+    found = []
+    for name, position, turn in zip(flight.scenes, flight.positions, flight.turns, strict=True):
+        at, east, north = (seen(position, turn, to_ecef(place)) for place in places)
+        by_metre = np.stack([east - at, north - at], axis=2)
+        away = models[name].ground_to_image(places[0]) - at
+        away[~np.isfinite(by_metre).all(axis=(1, 2))] = np.nan
+        by_metre[~np.isfinite(by_metre)] = 1.0
+        found.append(-np.einsum("nij,nj->ni", np.linalg.pinv(by_metre), away))
+    return np.array(found)
+
+
+def figures(off: Array) -> tuple[float, float]:
+    """Return the RMS (px per axis) of orthos, and of neighbours on the ground that both show."""
+    pixel = ABOVE / FOCAL
+    counts = np.isfinite(off[:, :, 0]).sum(axis=0)
+    mean = np.nansum(off, axis=0) / np.maximum(counts, 1)[:, None]
+    apart = (off - mean)[:, counts > 1] * np.sqrt(counts / np.maximum(counts - 1, 1))[None, counts > 1, None]
+    return float(np.sqrt(np.nanmean(off**2))) / pixel, float(np.sqrt(2 * np.nanmean(apart**2))) / pixel
+
+
+def of_block(flight: Flight, fit: BlockFit) -> float:
+    """Return the error of the mean position of the block over its sigma, the worst of east, north, up."""
+    worst = 0.0
+    for axis, parameter in enumerate(("X_L", "Y_L", "Z_L")):
+        picked = np.array([name == parameter for _, name in fit.parameters]) / len(flight.scenes)
+        errors = []
+        for name, position in zip(flight.scenes, flight.positions, strict=True):
+            model = fit.models[name]
+            axes = east_north_down(*model.origin[:2])[[1, 0, 2]] * np.array([[1.0], [1.0], [-1.0]])
+            errors.append(model.exterior[axis] - (axes @ (position - to_ecef(np.array([model.origin]))[0]))[axis])
+        worst = max(worst, abs(np.mean(errors)) / float(np.sqrt(picked @ fit.covariance @ picked)))
+    return worst
+
+
+def over_sigmas(flight: Flight, fit: BlockFit) -> dict[str, list[float]]:
+    """Return errors of positions and angles over their sigmas, by parameter."""
+    found: dict[str, list[float]] = {}
+    sigmas = np.sqrt(np.diag(fit.covariance))
+    columns = {key: k for k, key in enumerate(fit.parameters)}
+    for name, position, turn in zip(flight.scenes, flight.positions, flight.turns, strict=True):
+        model = fit.models[name]
+        lon, lat, origin = model.origin
+        axes = east_north_down(lon, lat)[[1, 0, 2]] * np.array([[1.0], [1.0], [-1.0]])
+        place = axes @ (position - to_ecef(np.array([[lon, lat, origin]]))[0])
+        rotation = np.diag([1.0, -1.0, -1.0]) @ turn @ axes.T
+        angles = (
+            np.arctan2(-rotation[2, 1], rotation[2, 2]),
+            np.arcsin(rotation[2, 0]),
+            np.arctan2(-rotation[1, 0], rotation[0, 0]),
+        )
+        for parameter, truth in zip(("X_L", "Y_L", "Z_L", "omega", "phi", "kappa"), (*place, *angles), strict=True):
+            k = columns[name, parameter]
+            error = dict(zip(model.param_names, model.params.tolist(), strict=True))[parameter] - truth
+            if parameter in ("omega", "phi", "kappa"):
+                error = (error + np.pi) % (2 * np.pi) - np.pi
+            found.setdefault(parameter, []).append(error / sigmas[k])
+    return found
+
+
+def trial(kind: Kind, photos: int, seed: int) -> dict[str, Any]:
+    """Fly, adjust and compare."""
+    with tempfile.TemporaryDirectory() as folder:
+        flight = fly(kind, photos, seed, Path(folder))
+        models = {name: scene.model for name, scene in flight.scenes.items()}
+        priors = {name: scene.priors for name, scene in flight.scenes.items()}
+        naive = figures(off_by(flight, models))
+        try:
+            fit = adjust(models, flight.points, priors=priors, heights=DemHeights(flight.dem))
+        except OrthoError as error:
+            return {"naive": naive, "error": f"{type(error).__name__}: {error}"[:100].splitlines()[0]}
+        found, shift, spread = figures(off_by(flight, fit.models)), of_block(flight, fit), over_sigmas(flight, fit)
+        wrong = found[1] > WRONG or shift > FAR
+        return {"naive": naive, "found": found, "shift": shift, "wrong": wrong, "sigma0": fit.sigma0, "spread": spread}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photos", type=int, default=30)
+    parser.add_argument("--flights", type=int, default=20)
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    given = parser.parse_args()
+    print(
+        "kind       converged wrong  ortho px (naive)  neighbours px (naive)  sigma0  shift/sigma  plan, up, tilt, head"
+    )
+    for name in given.kinds.split(","):
+        trials = [trial(KINDS[name], given.photos, seed) for seed in range(given.flights)]
+        good = [one for one in trials if "found" in one]
+        for message in sorted({one["error"] for one in trials if "error" in one}):
+            print(f"  {message}")
+        if not good:
+            print(f"{name:10}  {0:4d}/{len(trials)}")
+            continue
+        spread = {
+            part: np.sqrt(np.mean([v**2 for one in good for parameter in of for v in one["spread"][parameter]]))
+            for part, of in PARTS.items()
+        }
+        ortho, apart, naive_ortho, naive_apart = (
+            np.median([one[key][k] for one in good]) for key in ("found", "naive") for k in (0, 1)
+        )
+        print(
+            f"{name:10} {len(good):4d}/{len(trials):<4d} {sum(one['wrong'] for one in good):5d}  "
+            f"{ortho:8.2f} ({naive_ortho:5.1f})"
+            f"  {apart:13.2f} ({naive_apart:5.1f})  {np.median([one['sigma0'] for one in good]):6.2f}"
+            f"  {np.sqrt(np.mean([one['shift'] ** 2 for one in good])):11.2f}  "
+            + ", ".join(f"{value:.2f}" for value in spread.values()),
+            flush=True,
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

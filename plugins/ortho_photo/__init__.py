@@ -1,0 +1,219 @@
+"""Sensor plugin for photos of drones: pose, camera and accuracy from their EXIF and XMP tags alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from osgeo import gdal
+
+from ortho_photo.cameras import Camera, camera_of
+from ortho_photo.pose import ANGLE, HORIZON, NADIR, Pose, pose_of
+from ortho_photo.tags import Tags, has_position, tags_of
+from ortho_pipeline.plugin import (
+    FrameCamera,
+    InputError,
+    Interior,
+    Notice,
+    Prior,
+    Scene,
+    Sensor,
+    Setting,
+    Text,
+    Vertical,
+    enu_from_ecef,
+    exterior_sigmas,
+    geocentric,
+    hookimpl,
+    number_of,
+    numbers_of,
+    priors_at,
+)
+
+OPTIONS = {
+    "vertical": "height datum of the camera positions: ellipsoid, egm96, egm2008, EPSG:n, a grid file, or unknown "
+    "(default, where the tags do not state it)",
+    "sensor_width": "width of the camera's sensor in millimetres, if the tags and the table of cameras do not tell it",
+    "pitch": "where the pitch of the camera is zero: horizon or nadir (default: as the maker's tags define it)",
+    "sigmas": "standard deviations of position and angles: metres,degrees (default: as the tags state)",
+    "heights": "lowest and highest ground, ellipsoidal metres: low,high",
+    "calibrate": "whether an adjustment estimates the focal length of photos with exact heights: yes (default) or no",
+}
+UNKNOWN = "unknown"
+#: All photos of a flight share the error of a focal length, but the height that it looks like is known of each. So each
+#: counts less by this: otherwise thirty would seem to know it better by the root of thirty.
+SHARED = 5.0
+#: The parameter of the interior orientation that an adjustment may change.
+FOCAL = "focal_length"
+#: Standard deviation (m) of heights of an unknown datum: geoid and ellipsoid are within twice of it nearly everywhere.
+DATUM_SIGMA = 50.0
+#: A camera that looks flatter than this (degrees from straight down) sees the horizon.
+FLATTEST_DEG = 85.0
+#: Height (m) above ground of a flight whose tags do not state it.
+_USUAL = 100.0
+#: Lowest and highest ground below a camera where nothing states its heights: m, and parts of the height above take-off.
+_BELOW, _OF_RELATIVE = (500.0, 20.0), (2.0, 0.2)
+
+
+@hookimpl
+def ortho_sensors() -> Iterable[Sensor]:
+    """Offer the sensor ``photo``."""
+    yield Sensor(
+        "photo",
+        "drone photos with position and camera angles in EXIF and XMP (DJI, senseFly, Parrot, MicaSense, Autel)",
+        has_position,
+        open_scene,
+        options=OPTIONS,
+        fallback=True,
+    )
+
+
+def open_scene(
+    dataset: gdal.Dataset,
+    *,
+    vertical: str | None = None,
+    sensor_width: str | None = None,
+    pitch: str | None = None,
+    sigmas: str | None = None,
+    heights: str | None = None,
+    calibrate: str = "yes",
+) -> Scene:
+    """Open a photo by its tags."""
+    tags = tags_of(dataset)
+    size = dataset.RasterXSize, dataset.RasterYSize
+    if pitch not in (None, HORIZON, NADIR):
+        raise InputError(f"{pitch!r} must be {HORIZON} or {NADIR}", field="pitch")
+    pose = pose_of(tags, pitch)
+    if calibrate not in ("yes", "no"):
+        raise InputError(f"{calibrate!r} must be yes or no", field="calibrate")
+    camera = camera_of(tags, *size, _width(sensor_width))
+    stated = vertical or pose.datum or UNKNOWN
+    model = _model(camera.interior, pose, stated, heights, tags)
+    priors = _priors(model, pose, camera, stated, sigmas, _above_ground(tags) if calibrate == "yes" else 0.0)
+    model = replace(model, free=tuple(priors))
+    if not (model.sees_ground and pose.tilt_deg < FLATTEST_DEG):
+        other = HORIZON if pose.convention == NADIR else NADIR
+        again = Setting("scene.sensor_options", other, key="pitch")
+        raise tags.error(
+            f"by its angles (yaw, pitch, roll {pose.angles}) this camera does not look at the ground",
+            "Pitch",
+            Text(f"if its pitch is zero at the {other}, add ", again, "; else leave this photo out"),
+        )
+    warnings = [_unknown_datum(pose)] if stated == UNKNOWN else []
+    return Scene(
+        sensor="photo",
+        path=tags.path,
+        width=size[0],
+        height=size[1],
+        models={"frame": model},
+        model_source="EXIF and XMP",
+        facts=_facts(tags, pose, model, camera, stated),
+        warnings=tuple(warnings),
+        priors=priors,
+    )
+
+
+def _model(interior: Interior, pose: Pose, stated: str, heights: str | None, tags: Tags) -> FrameCamera:
+    altitude = pose.altitude
+    if stated != UNKNOWN:
+        altitude += float(Vertical.parse(stated).undulation(np.array([pose.lon]), np.array([pose.lat]))[0])
+    if not math.isfinite(altitude):
+        raise tags.error("the height datum does not cover this position", "vertical", "give another datum")
+    place = np.array([[pose.lon, pose.lat, altitude]])
+    position, axes = geocentric(place)[0], enu_from_ecef(place)[0]
+    ned_from_ecef = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]) @ axes
+    ground = _heights(heights, altitude, tags.positive("drone-dji:RelativeAltitude"))
+    return FrameCamera.from_geocentric(interior, position, pose.rotation @ ned_from_ecef, heights=ground)
+
+
+def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> tuple[float, float]:
+    if text is None:
+        low, high = _BELOW if above_takeoff is None else (part * above_takeoff for part in _OF_RELATIVE)
+        return altitude - low, altitude - high
+    low, high = _pair(text)
+    if not low < high:
+        raise InputError(
+            f"{text!r} is not a height range", field="heights", remedy="give low,high in metres, such as heights=0,800"
+        )
+    return low, high
+
+
+def _priors(
+    model: FrameCamera, pose: Pose, camera: Camera, stated: str, sigmas: str | None, above_ground: float
+) -> dict[str, Prior]:
+    """Return what is known of the pose, and of the focal length where an adjustment can tell it from the height.
+
+    Over flat ground a wrong focal length looks like a wrong height. So it is a parameter only if the height is known
+    better than it (`above_ground`, m, times its sigma); else its error is a part of that of the height.
+    """
+    (plan, height), angle = pose.sigmas, ANGLE
+    if sigmas is not None:
+        plan, angle = _pair(sigmas)
+        height = plan
+        if not (plan > 0 and angle > 0):
+            raise InputError(
+                f"{sigmas!r} are not two standard deviations", field="sigmas", remedy="give metres,degrees"
+            )
+    known = exterior_sigmas(plan, math.radians(angle))
+    height = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
+    if height < camera.sigma * above_ground:
+        focal = model.interior.focal_length
+        return {**priors_at(model, {**known, "Z_L": height}), FOCAL: Prior(focal, camera.sigma * focal)}
+    known["Z_L"] = math.hypot(height, SHARED * camera.sigma * above_ground)
+    return priors_at(model, known)
+
+
+def _above_ground(tags: Tags) -> float:
+    """Return about how high (m) a photo was taken."""
+    return tags.positive("drone-dji:RelativeAltitude") or _USUAL
+
+
+def _unknown_datum(pose: Pose) -> Notice:
+    text = Text(
+        "the tags do not state the height datum of the camera. Its altitude counts as ellipsoidal, within "
+        f"{DATUM_SIGMA:.0f} m. An adjustment with a DEM or control points estimates it. If you know the datum, add ",
+        Setting("scene.sensor_options", "DATUM", key="vertical"),
+    )
+    return Notice("datum-unknown", text, altitude_m=pose.altitude, sigma_m=DATUM_SIGMA)
+
+
+def _facts(tags: Tags, pose: Pose, model: FrameCamera, camera: Camera, stated: str) -> dict[str, object]:
+    taken = tags.text("DateTimeOriginal", "DateTime")
+    relative = tags.number("drone-dji:RelativeAltitude")
+    known = {
+        "acquired_local": taken.replace(":", "-", 2) if taken else None,
+        "camera": " ".join(filter(None, (tags.text("Make", "tiff:Make"), tags.text("Model", "tiff:Model")))) or None,
+        "altitude_above_takeoff_m": relative,
+    }
+    plan, height = pose.sigmas
+    return {
+        **{name: value for name, value in known.items() if value is not None},
+        "altitude_m": pose.altitude,
+        "altitude_datum": stated,
+        "positioning": f"{pose.positioning}: {plan:.3g} m in plan, {height:.3g} m in height",
+        "perspective_centre": [round(float(value), 9) for value in model.perspective_centre],
+        "perspective_centre_crs": model.crs,
+        "yaw_pitch_roll_deg": list(pose.angles),
+        "tilt_deg": round(pose.tilt_deg, 3),
+        "focal_length_px": round(model.interior.focal_length / model.interior.pitch_x, 3),
+        "interior_orientation": camera.source,
+    }
+
+
+def _width(text: str | None) -> float | None:
+    if text is None:
+        return None
+    width = number_of(text)
+    if not 0.1 < width < 1000:
+        raise InputError(
+            f"{text!r} is not the width of a sensor", field="sensor_width", remedy="give millimetres, such as 13.2"
+        )
+    return width
+
+
+def _pair(text: str) -> tuple[float, float]:
+    """Return two numbers; NaN if there are not two."""
+    numbers = numbers_of(text)
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else (math.nan, math.nan)

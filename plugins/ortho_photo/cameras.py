@@ -1,0 +1,156 @@
+"""The camera of a photo: focal length, size of the sensor, and the lens where the maker calibrated it.
+
+The first that a photo has is used: the options, DJI's calibration (``DewarpData``), Pix4D's camera tags, the table of
+sensors here, the resolution in the focal plane, DJI's nominal focal length in pixels, the focal length in 35 mm film.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ortho_photo.tags import Tags
+from ortho_pipeline.plugin import InputError, Interior
+
+#: Width (mm) of sensors by the model in EXIF, where it tells the camera; from the makers' specifications.
+SENSOR_MM = {
+    "FC220": 6.17,  # Mavic Pro
+    "FC300S": 6.17,  # Phantom 3 Advanced
+    "FC300X": 6.17,  # Phantom 3 Professional
+    "FC330": 6.17,  # Phantom 4
+    "FC3411": 13.2,  # Air 2S
+    "FC6310": 13.2,  # Phantom 4 Pro
+    "FC6310R": 13.2,  # Phantom 4 RTK
+    "FC6310S": 13.2,  # Phantom 4 Pro 2.0
+    "L1D-20c": 13.2,  # Mavic 2 Pro
+    "L2D-20c": 17.3,  # Mavic 3
+    "M3E": 17.3,  # Mavic 3 Enterprise
+    "ZenmuseP1": 35.9,
+    "S.O.D.A.": 12.75,
+}
+#: Millimetres of a unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre.
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+#: Width (mm) of a frame of 35 mm film.
+_FILM_MM = 36.0
+#: Standard deviation of focal lengths, in parts: of a maker's calibration, and of a nominal length.
+CALIBRATED, NOMINAL = 0.005, 0.02
+_PIXEL = 1e-6
+_REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The camera of a photo, its source, and the standard deviation of its focal length in parts of it."""
+
+    interior: Interior
+    source: str
+    sigma: float = NOMINAL
+
+
+def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -> Camera:
+    """Return the camera of a photo of `width` x `height` pixels.
+
+    Parameters
+    ----------
+    sensor_width : float, optional
+        mm; counts more than all tags.
+
+    Raises
+    ------
+    InputError
+        If nothing tells the focal length in pixels, the lens is a fisheye, or the photo is a crop.
+    """
+    full = _full_width(tags, width, height)
+    if tags.text("Camera:ModelType").lower() == "fisheye":
+        raise tags.error(
+            "the lens is a fisheye, which the model of frames cannot represent",
+            "Camera:ModelType",
+            "make undistorted photos with OpenDroneMap or Pix4D, and use these",
+        )
+    focal = tags.positive("FocalLength")
+    if sensor_width is not None:
+        if focal is None:
+            raise tags.error("the tags have no focal length", "FocalLength", "give camera=FILE (docs/formats/frame.md)")
+        return Camera(_plain(width, height, focal / sensor_width), "sensor width of the options")
+    try:
+        calibrated = _dewarped(tags, width, height, full) or _of_pix4d(tags, width, height, full)
+    except InputError as error:
+        raise tags.error(error.message, error.field or "", _REMEDY) from error
+    if calibrated is not None:
+        return calibrated
+    known = SENSOR_MM.get(tags.text("Model", "tiff:Model"))
+    if focal and known:
+        return Camera(_plain(width, height, focal / known), "focal length, and a known sensor")
+    pitch = _pitch_mm(tags)
+    if focal and pitch:
+        return Camera(_plain(width, height, focal / (pitch * full)), "focal length, and resolution in the focal plane")
+    nominal = tags.positive("drone-dji:CalibratedFocalLength")
+    if nominal:
+        return Camera(_plain(width, height, nominal / full), "nominal focal length in pixels")
+    film = tags.positive("FocalLengthIn35mmFilm")
+    if film:
+        return Camera(_plain(width, height, film / _FILM_MM), "focal length in 35 mm film, rounded")
+    model = tags.text("Model", "tiff:Model") or "unknown"
+    raise tags.error(f"the size of the sensor of this camera ({model}) is not known", "sensor_width", _REMEDY)
+
+
+def _full_width(tags: Tags, width: int, height: int) -> float:
+    """Return the width of the whole photo (px): the file may be a reduced copy of it, but no crop."""
+    full, rows = tags.positive("PixelXDimension"), tags.positive("PixelYDimension")
+    if not full or not rows:
+        return float(width)
+    # A reduced copy has whole pixels.
+    if abs(full * height - rows * width) > max(full, rows):
+        raise tags.error(
+            f"the photo has {full:.0f} x {rows:.0f} pixels by its tags, but the file {width} x {height}",
+            "PixelXDimension",
+            "give the whole photo; crops are not supported",
+        )
+    return full
+
+
+def _plain(width: int, height: int, by_width: float) -> Interior:
+    """Return a camera without distortion by its focal length over the width of the sensor."""
+    return Interior(width, height, by_width * width * _PIXEL, _PIXEL, _PIXEL)
+
+
+def _dewarped(tags: Tags, width: int, height: int, full: float) -> Camera | None:
+    """Return DJI's calibration: date; fx, fy, cx, cy (px, from the middle, y down), k1, k2, p1, p2, k3 of OpenCV."""
+    text, done = tags.text("drone-dji:DewarpData"), tags.number("drone-dji:DewarpFlag")
+    if not text or done:  # a photo that was dewarped has another camera
+        return None
+    values = tags.numbers_of(text.rpartition(";")[2], "drone-dji:DewarpData")
+    if len(values) != 9:
+        raise tags.error(f"{len(values)} numbers instead of 9", "drone-dji:DewarpData")
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = values
+    if not fx > 0 or not fy > 0:
+        raise tags.error("the focal length must be positive", "drone-dji:DewarpData")
+    pixel = _PIXEL * full / width
+    # Different focal lengths of the axes are different pitches here.
+    interior = Interior(
+        width, height, fx * _PIXEL, pixel, pixel * fx / fy, cx * _PIXEL, -cy * _PIXEL * fx / fy, k1, k2, k3, p1, p2
+    )
+    return Camera(interior, "the maker's calibration (DewarpData)", CALIBRATED)
+
+
+def _of_pix4d(tags: Tags, width: int, height: int, full: float) -> Camera | None:
+    """Return the camera of Pix4D's tags: mm, from the upper left corner, R1, R2, R3, T1, T2."""
+    focal, pitch = tags.positive("Camera:PerspectiveFocalLength"), _pitch_mm(tags)
+    if not focal or not pitch:
+        return None
+    pixel = pitch * 1e-3 * full / width
+    lens = tags.numbers("Camera:PerspectiveDistortion") or [0.0] * 5
+    middle = [width * pixel * 500, height * pixel * 500]
+    place = tags.numbers("Camera:PrincipalPoint") or middle
+    if len(lens) != 5 or len(place) != 2:
+        raise tags.error("a camera tag has the wrong count of numbers", "Camera:PerspectiveDistortion")
+    r1, r2, r3, t1, t2 = lens
+    x0, y0 = (place[0] - middle[0]) * 1e-3, (middle[1] - place[1]) * 1e-3
+    interior = Interior(width, height, focal * 1e-3, pixel, pixel, x0, y0, r1, r2, r3, t1, t2)
+    return Camera(interior, "the maker's calibration (Pix4D's camera tags)", CALIBRATED)
+
+
+def _pitch_mm(tags: Tags) -> float | None:
+    """Return the size (mm) of a pixel of the whole photo by its resolution in the focal plane."""
+    resolution, unit = tags.positive("FocalPlaneXResolution"), tags.number("FocalPlaneResolutionUnit")
+    millimetres = _UNIT_MM.get(int(unit)) if unit is not None else None
+    return millimetres / resolution if millimetres and resolution else None

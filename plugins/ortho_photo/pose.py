@@ -1,0 +1,182 @@
+"""Where a photo was taken and where its camera looked, by its tags.
+
+Two conventions of angles occur. Both have yaw clockwise from true north and rotate in the order yaw, pitch, roll.
+
+- DJI's gimbal: pitch 0 looks at the horizon, -90 straight down; roll turns about the optical axis (north, east, down;
+  order ZYX, as in DJI's manuals).
+- Pix4D's camera tags, which senseFly, Parrot, MicaSense and Autel write: pitch 0 looks straight down, 90 forward. The
+  axes are those of `FrameCamera.from_roll_pitch_yaw`. senseFly's own tags have the roll of the other sign.
+
+Source: DJI Mavic 3M and Matrice 4 user manuals, "Photo file"; Pix4D, "Yaw, Pitch, Roll and Omega, Phi, Kappa angles"
+and "Specifications of XMP Camera tags"; OpenDroneMap, opendm/photo.py (sign of senseFly's roll).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ortho_photo.tags import Tags
+from ortho_pipeline.plugin import Array, camera_from_platform
+
+#: Standard deviation (m) in plan and height of a position without a stated accuracy: a receiver without corrections,
+#: and a height that follows the air pressure from take-off.
+PLAN, HEIGHT = 3.0, 10.0
+#: Standard deviation (degrees) of each angle: a compass near motors.
+ANGLE = 3.0
+#: The least standard deviation (m) of a position: RTK states that of the antenna's fix, not of the time of exposure.
+LEAST = 0.02
+#: Values of the option ``pitch``.
+HORIZON, NADIR = "horizon", "nadir"
+_FIXED = 50.0
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose with its sources.
+
+    Parameters
+    ----------
+    lon, lat, altitude : float
+        Degrees, and metres as written.
+    sigmas : (float, float)
+        Standard deviations in plan and height, m.
+    rotation : ndarray (3, 3)
+        From north, east, down to camera axes (x right, y up, z backwards).
+    angles : (float, float, float)
+        Yaw, pitch, roll (degrees) as written.
+    convention : {'horizon', 'nadir'}
+        Where pitch is zero.
+    positioning, datum : str
+        How it was positioned; height datum that the tags state, or empty.
+    """
+
+    lon: float
+    lat: float
+    altitude: float
+    sigmas: tuple[float, float]
+    rotation: Array
+    angles: tuple[float, float, float]
+    convention: str
+    positioning: str
+    datum: str
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the optical axis and straight down."""
+        return math.degrees(math.acos(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
+
+
+def pose_of(tags: Tags, pitch: str | None = None) -> Pose:
+    """Return the pose in the tags; `pitch` says where pitch is zero, if the tags say it wrongly.
+
+    Raises
+    ------
+    InputError
+        If position, altitude or angles are missing or impossible.
+    """
+    lon, lat, altitude = _position(tags)
+    angles, convention = _angles(tags, pitch)
+    sigmas, positioning = _accuracy(tags)
+    return Pose(
+        lon, lat, altitude, sigmas, rotation_of(angles, convention), angles, convention, positioning, _datum(tags)
+    )
+
+
+def rotation_of(angles: tuple[float, float, float], convention: str) -> Array:
+    """Return the rotation ``(3, 3)`` from north, east, down to camera axes of yaw, pitch, roll (degrees).
+
+    Examples
+    --------
+    >>> rotation_of((0.0, -90.0, 0.0), HORIZON).round(12) + 0.0
+    array([[ 0.,  1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0., -1.]])
+    """
+    yaw, pitch, roll = np.radians(angles).tolist()
+    if convention == NADIR:
+        return camera_from_platform(roll, pitch, yaw)
+    # The roll turns about the optical axis, which is the camera's third axis backwards.
+    about_axis = np.array(
+        [[math.cos(roll), -math.sin(roll), 0.0], [math.sin(roll), math.cos(roll), 0.0], [0.0, 0.0, 1.0]]
+    )
+    return np.asarray(about_axis @ camera_from_platform(0.0, pitch + math.pi / 2, yaw))
+
+
+def _position(tags: Tags) -> tuple[float, float, float]:
+    lat = tags.number("drone-dji:GpsLatitude", "drone-dji:GPSLatitude", "drone-dji:Latitude")
+    # DJI wrote GpsLongtitude for years.
+    names = ("GpsLongtitude", "GpsLongitude", "GPSLongtitude", "GPSLongitude", "Longitude")
+    lon = tags.number(*(f"drone-dji:{name}" for name in names))
+    if not lat or not lon:  # 0, 0 is written without a fix
+        lat, lon = _degrees(tags, "GPSLatitude", "S"), _degrees(tags, "GPSLongitude", "W")
+    if lat is None or lon is None or (lat, lon) == (0.0, 0.0):
+        raise tags.error("this photo has no position", "GPSLatitude")
+    if not (abs(lat) <= 90 and abs(lon) <= 360):
+        raise tags.error(f"latitude {lat}, longitude {lon} is not on Earth", "GPSLatitude")
+    altitude = tags.number("drone-dji:AbsoluteAltitude")
+    if altitude is None:
+        altitude = tags.number("GPSAltitude")
+        # 1 and 3: below the reference surface.
+        if altitude is not None and tags.text("GPSAltitudeRef").lower().removeprefix("0x").lstrip("0") in ("1", "3"):
+            altitude = -altitude
+    if altitude is None:
+        raise tags.error("this photo has a position, but no altitude", "GPSAltitude")
+    if not -1000 < altitude < 100_000:
+        raise tags.error(f"an altitude of {altitude} m is impossible", "GPSAltitude")
+    return lon, lat, altitude
+
+
+def _degrees(tags: Tags, name: str, negative: str) -> float | None:
+    parts = tags.numbers(name)
+    if parts is None:
+        return None
+    if not 1 <= len(parts) <= 3:
+        raise tags.error(f"{len(parts)} numbers are not an angle", name)
+    value = sum(part / 60**power for power, part in enumerate(parts))
+    return -value if tags.text(f"{name}Ref").upper().startswith(negative) else value
+
+
+def _angles(tags: Tags, pitch: str | None) -> tuple[tuple[float, float, float], str]:
+    for space, names, convention in (
+        ("drone-dji", ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"), HORIZON),
+        ("Camera", ("Yaw", "Pitch", "Roll"), NADIR),
+        ("senseFly", ("Yaw", "Pitch", "Roll"), NADIR),
+    ):
+        found = [tags.number(f"{space}:{name}") for name in names]
+        if all(value is None for value in found):
+            continue
+        yaw, tilt, roll = found
+        if yaw is None or tilt is None or roll is None:
+            raise tags.error("one of yaw, pitch and roll is missing", f"{space}:{names[0]}")
+        if not all(abs(value) <= 360 for value in (yaw, tilt, roll)):
+            raise tags.error("an angle is beyond 360 degrees", f"{space}:{names[0]}")
+        if (yaw, tilt, roll) == (0.0, 0.0, 0.0) and convention == HORIZON and pitch is None:
+            raise tags.error(
+                "all gimbal angles are exactly 0: this drone does not record them", f"{space}:GimbalPitchDegree"
+            )
+        if space == "senseFly" or (space == "Camera" and tags.text("Make").lower() == "sensefly"):
+            roll = -roll
+        return (yaw, tilt, roll), pitch or convention
+    raise tags.error("this photo has no camera angles", "Yaw, Pitch, Roll")
+
+
+def _accuracy(tags: Tags) -> tuple[tuple[float, float], str]:
+    east, north = tags.positive("drone-dji:RtkStdLon"), tags.positive("drone-dji:RtkStdLat")
+    up, flag = tags.positive("drone-dji:RtkStdHgt"), tags.number("drone-dji:RtkFlag")
+    if east and north and up:
+        stated = max(east, north, LEAST), max(up, LEAST)
+        return stated, "RTK, fixed" if flag == _FIXED else "RTK, not fixed"
+    plan = tags.positive("Camera:GPSXYAccuracy", "senseFly:GPSXYAccuracy", "GPSHPositioningError")
+    height = tags.positive("Camera:GPSZAccuracy", "senseFly:GPSZAccuracy")
+    if plan:
+        return (max(plan, LEAST), max(height or max(plan, HEIGHT), LEAST)), "accuracy in the tags"
+    return (PLAN, HEIGHT), "no accuracy in the tags; assumed"
+
+
+def _datum(tags: Tags) -> str:
+    """Return the height datum that Pix4D's tag states, in the words of the option ``vertical``; else empty."""
+    stated = tags.text("Camera:VertCS")
+    return "ellipsoid" if stated.lower() == "ellipsoidal" else stated

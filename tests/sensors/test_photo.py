@@ -1,0 +1,308 @@
+"""The sensor `photo`: poses and cameras of EXIF and XMP, by directions that the test computes for itself."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ortho_photo import DATUM_SIGMA
+from photos import DJI, EXIF, jpeg, photo
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.inputs import open_scene
+from ortho_pipeline.commands.survey.folder import images_of
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical
+from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.testing import check_sensor_model
+
+#: Metres of a degree of longitude and of latitude at 39.5° N on WGS 84.
+METRES = np.array([86_070.0, 111_025.0])
+PLACE, ALTITUDE = (33.26, 39.5), 1000.5
+
+
+def opened(path: Path, **options: str) -> Any:
+    given = {"vertical": "ellipsoid", "calibrate": "no", **options}
+    return open_scene(path, SceneOptions(sensor_options=given))
+
+
+def without(tags: dict[str, str], *names: str) -> dict[str, str]:
+    return {name: value for name, value in tags.items() if not any(part in name for part in names)}
+
+
+def looking(scene: Any, image: Any, below: float = 100.0) -> np.ndarray:
+    """Return where a pixel sees ground `below` the camera: metres east and north of the camera."""
+    ground = scene.model.image_to_ground([image], ALTITUDE - below)[0]
+    return (ground[:2] - PLACE) * METRES
+
+
+def along(yaw: float, forward: float, right: float) -> np.ndarray:
+    """Return metres east and north of what is forward and to the right of a heading."""
+    s, c = math.sin(math.radians(yaw)), math.cos(math.radians(yaw))
+    return np.array([forward * s + right * c, forward * c - right * s])
+
+
+MIDDLE, TOP, RIGHT = (300.0, 200.0), (300.0, 0.0), (600.0, 200.0)
+#: Half of the field of view as tangents: 8.8 mm before a sensor of 13.2 mm with 600 x 400 pixels.
+HALF_WIDTH, HALF_HEIGHT = 6.6 / 8.8, 4.4 / 8.8
+
+
+def test_a_nadir_photo_of_dji_has_its_top_forward(tmp_path):
+    scene = opened(photo(tmp_path / "a.tif"))
+    assert scene.sensor == "photo"
+    np.testing.assert_allclose(scene.model.perspective_centre, [*PLACE, ALTITUDE], atol=1e-8)
+    np.testing.assert_allclose(looking(scene, MIDDLE), 0.0, atol=0.02)
+    np.testing.assert_allclose(looking(scene, TOP), along(40, 100 * HALF_HEIGHT, 0), atol=0.05)
+    np.testing.assert_allclose(looking(scene, RIGHT), along(40, 0, 100 * HALF_WIDTH), atol=0.05)
+
+
+def test_an_oblique_photo_of_dji_looks_forward(tmp_path):
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, "drone-dji:GimbalPitchDegree": "-60.00"}))
+    # 30 degrees off the vertical: the middle 57.7 m ahead, the top further, what is right of it to the right.
+    np.testing.assert_allclose(looking(scene, MIDDLE), along(40, 100 * math.tan(math.radians(30)), 0), atol=0.05)
+    tilt = math.radians(30) + math.atan(HALF_HEIGHT)
+    np.testing.assert_allclose(looking(scene, TOP), along(40, 100 * math.tan(tilt), 0), atol=0.2)
+    ahead, aside = 100 * math.tan(math.radians(30)), 100 / math.cos(math.radians(30)) * HALF_WIDTH
+    np.testing.assert_allclose(looking(scene, RIGHT), along(40, ahead, aside), atol=0.1)
+
+
+def test_djis_roll_turns_about_the_optical_axis(tmp_path):
+    # A gimbal over its pole: yaw and roll of 180 degrees are the heading of 40 degrees again.
+    turned = {**DJI, "drone-dji:GimbalYawDegree": "-140.00", "drone-dji:GimbalRollDegree": "180.00"}
+    scene = opened(photo(tmp_path / "a.tif", xmp=turned))
+    np.testing.assert_allclose(looking(scene, TOP), along(40, 100 * HALF_HEIGHT, 0), atol=0.05)
+    # Seen along the axis, a positive roll lowers the right side: what is right of the middle is nearer.
+    rolled = {**DJI, "drone-dji:GimbalPitchDegree": "-60.00", "drone-dji:GimbalRollDegree": "10.00"}
+    scene = opened(photo(tmp_path / "b.tif", xmp=rolled))
+    np.testing.assert_allclose(looking(scene, MIDDLE), along(40, 100 * math.tan(math.radians(30)), 0), atol=0.05)
+    left, right = looking(scene, (100.0, 200.0)), looking(scene, (500.0, 200.0))
+    assert np.linalg.norm(right) < np.linalg.norm(left)
+
+
+CAMERA = {"Camera:Yaw": "40", "Camera:Pitch": "30", "Camera:Roll": "0"}
+
+
+def test_pix4ds_angles_are_zero_at_nadir(tmp_path):
+    exif = {**EXIF, "Make": "Parrot"}
+    scene = opened(photo(tmp_path / "a.tif", exif, CAMERA))
+    np.testing.assert_allclose(looking(scene, MIDDLE), along(40, 100 * math.tan(math.radians(30)), 0), atol=0.05)
+    # A positive roll lowers the right wing, so the camera looks to the left.
+    scene = opened(photo(tmp_path / "b.tif", exif, {**CAMERA, "Camera:Pitch": "0", "Camera:Roll": "10"}))
+    aside = 100 * math.tan(math.radians(10))
+    np.testing.assert_allclose(looking(scene, MIDDLE), along(40, 0, -aside), atol=0.05)
+    # senseFly writes the roll with the other sign, and the angles of the DLS of MicaSense are not those of the camera.
+    sensefly = {"senseFly:Yaw": "40", "senseFly:Pitch": "0", "senseFly:Roll": "10", "DLS:Yaw": "1", "DLS:Pitch": "2"}
+    scene = opened(photo(tmp_path / "c.tif", {**EXIF, "Make": "senseFly"}, sensefly))
+    np.testing.assert_allclose(looking(scene, MIDDLE), along(40, 0, aside), atol=0.05)
+
+
+def test_a_pitch_that_is_written_against_its_definition_asks_for_the_option(tmp_path):
+    # As an Autel does: Pix4D's tag with zero at the horizon.
+    path = photo(tmp_path / "a.tif", {**EXIF, "Make": "Autel Robotics"}, {**CAMERA, "Camera:Pitch": "-90"})
+    with pytest.raises(InputError, match="does not look at the ground") as error:
+        opened(path)
+    assert "pitch=horizon" in error.value.remedy
+    np.testing.assert_allclose(looking(opened(path, pitch="horizon"), MIDDLE), 0.0, atol=0.02)
+    with pytest.raises(InputError, match="must be horizon or nadir"):
+        opened(path, pitch="sky")
+
+
+def test_a_jpeg_is_recognised_and_has_the_same_model(tmp_path):
+    scene = opened(jpeg(tmp_path / "a.jpg"))
+    same = opened(photo(tmp_path / "a.tif"))
+    np.testing.assert_allclose(scene.model.exterior, same.model.exterior, atol=1e-9)
+    assert scene.facts["acquired_local"] == "2019-04-11 11:01:21"
+    assert scene.facts["camera"] == "DJI FC6310R"
+    check_sensor_model(scene.model, scene.model.image_to_ground([[50.0, 60.0], [300.0, 200.0], [550.0, 390.0]], 890.0))
+
+
+def test_exif_alone_gives_the_position(tmp_path):
+    exif = {**EXIF, "GPSLatitudeRef": "S", "GPSLongitudeRef": "W", "GPSAltitudeRef": "0x01", "GPSAltitude": "(80)"}
+    scene = opened(photo(tmp_path / "a.tif", exif, without(DJI, "Altitude")))
+    np.testing.assert_allclose(scene.model.perspective_centre, [-33.26, -39.5, -80.0], atol=1e-8)
+
+
+# -- heights and accuracy --------------------------------------------------------------------------------------------
+
+
+def sigmas(scene: Any) -> list[float]:
+    return [scene.priors[name].sigma for name in ("X_L", "Y_L", "Z_L")]
+
+
+def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
+    path = photo(tmp_path / "a.tif")
+    unknown = open_scene(path)
+    assert [notice.code for notice in unknown.notices] == ["datum-unknown"]
+    # The unknown datum, the height by air pressure, and five times a focal length within 2 % of 100 m.
+    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 10.0**2))
+    assert unknown.model.perspective_centre[2] == pytest.approx(ALTITUDE)
+    above_geoid = opened(path, vertical="egm96")
+    undulation = float(Vertical.parse("egm96").undulation(np.array([33.26]), np.array([39.5]))[0])
+    assert above_geoid.model.perspective_centre[2] == pytest.approx(ALTITUDE + undulation, abs=1e-6)
+    assert above_geoid.notices == ()
+    stated = open_scene(photo(tmp_path / "b.tif", xmp={**CAMERA, "Camera:VertCS": "ellipsoidal"}))
+    assert stated.facts["altitude_datum"] == "ellipsoid"
+    assert stated.notices == ()
+
+
+@pytest.mark.parametrize(
+    ("tags", "wanted"),
+    [
+        ({}, [3.0, 3.0, 10.0]),
+        ({"drone-dji:RtkStdLon": ".05", "drone-dji:RtkStdLat": ".04", "drone-dji:RtkStdHgt": ".1"}, [0.05, 0.05, 0.1]),
+        ({"drone-dji:RtkStdLon": "0.002", "drone-dji:RtkStdLat": "0.002", "drone-dji:RtkStdHgt": "0.003"}, [0.02] * 3),
+        ({"drone-dji:RtkStdLon": "0", "drone-dji:RtkStdLat": "0", "drone-dji:RtkStdHgt": "0"}, [3.0, 3.0, 10.0]),
+        ({"Camera:GPSXYAccuracy": "1.5", "Camera:GPSZAccuracy": "5/2"}, [1.5, 1.5, 2.5]),
+    ],
+)  # fmt: skip
+def test_sigmas_are_those_of_the_tags(tmp_path, tags, wanted):
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, **tags}))
+    assert sigmas(scene) == pytest.approx(wanted)
+    assert scene.priors["omega"].sigma == pytest.approx(math.radians(3.0))
+    given = opened(tmp_path / "a.tif", sigmas="0.5,1")
+    assert sigmas(given) == pytest.approx([0.5] * 3)
+    assert given.priors["kappa"].sigma == pytest.approx(math.radians(1.0))
+
+
+def test_the_focal_length_is_a_parameter_where_the_height_is_known_better(tmp_path):
+    rtk = {"drone-dji:RtkStdLon": "0.02", "drone-dji:RtkStdLat": "0.02", "drone-dji:RtkStdHgt": "0.03"}
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, **rtk}), calibrate="yes")
+    assert scene.model.param_names[-1] == "focal_length"
+    assert scene.priors["focal_length"].sigma == pytest.approx(0.02 * scene.model.interior.focal_length)
+    assert scene.priors["Z_L"].sigma == pytest.approx(0.03)
+    data = "2018-09-07;400,400,0,0,0,0,0,0,0"
+    calibrated = opened(photo(tmp_path / "b.tif", xmp={**DJI, **rtk, "drone-dji:DewarpData": data}), calibrate="yes")
+    assert calibrated.priors["focal_length"].sigma == pytest.approx(0.005 * 400e-6)
+    # A height within 10 m says less than a focal length within 2 % of 100 m; the height has both errors.
+    plain = opened(photo(tmp_path / "c.tif"), calibrate="yes")
+    assert plain.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
+    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 10.0))
+
+
+# -- cameras ---------------------------------------------------------------------------------------------------------
+
+
+def test_djis_calibration_is_opencvs_formula(tmp_path):
+    numbers = (365.7, 365.1, -4.0, 2.3, -0.267, 0.112, 0.0009, 0.0001, -0.033)
+    data = "2018-09-07;" + ",".join(map(str, numbers))
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, "drone-dji:DewarpData": data, "drone-dji:DewarpFlag": "0"}))
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
+    directions = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
+    x, y = directions.T
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    wanted = np.stack([fx * u + cx + 300, fy * v + cy + 200], axis=1)
+    np.testing.assert_allclose(scene.model.interior.image_of(directions), wanted, atol=1e-9)
+    # A reduced copy of the photo: all pixels are twice as large.
+    half = opened(photo(tmp_path / "b.tif", xmp={**DJI, "drone-dji:DewarpData": data}, size=(300, 200)))
+    np.testing.assert_allclose(half.model.interior.image_of(directions), wanted / 2, atol=1e-9)
+    # A photo that was dewarped is not distorted.
+    dewarped = opened(photo(tmp_path / "c.tif", xmp={**DJI, "drone-dji:DewarpData": data, "drone-dji:DewarpFlag": "1"}))
+    assert dewarped.model.interior.k1 == 0.0
+
+
+PLANE = {"FocalPlaneXResolution": "(50)", "FocalPlaneResolutionUnit": "4"}
+
+
+@pytest.mark.parametrize(
+    ("exif", "xmp", "options", "pixels"),
+    [
+        ({}, {}, {}, 600 * 8.8 / 13.2),  # the table
+        ({}, {}, {"sensor_width": "10"}, 600 * 0.88),
+        ({"Model": "X"}, {}, {}, 600 * 24 / 36),
+        ({"Model": "X", **PLANE}, {}, {}, 8.8 * 50),
+        ({"Model": "X"}, {"drone-dji:CalibratedFocalLength": "366.6"}, {}, 366.6),
+        ({"Model": "X", **PLANE}, {"Camera:PerspectiveFocalLength": "5.5"}, {}, 275.0),
+    ],
+)
+def test_focal_lengths_in_the_order_of_their_worth(tmp_path, exif, xmp, options, pixels):
+    scene = opened(photo(tmp_path / "a.tif", {**EXIF, **exif}, {**DJI, **xmp}), **options)
+    assert scene.facts["focal_length_px"] == pytest.approx(pixels, abs=1e-3)
+
+
+def test_pix4ds_camera_counts_from_the_corner(tmp_path):
+    lens = {
+        "Camera:PerspectiveFocalLength": "5.5",
+        "Camera:PrincipalPoint": "6.1,3.9",
+        "Camera:PerspectiveDistortion": "-0.1,0.02,0.003,0.0004,0.0005",
+    }
+    scene = opened(photo(tmp_path / "a.tif", {**EXIF, **PLANE}, {**DJI, **lens}))
+    # 50 pixels per millimetre.
+    np.testing.assert_allclose(scene.model.interior.image_of(np.zeros((1, 2))), [[305.0, 195.0]], atol=1e-9)
+    interior = scene.model.interior
+    found = (interior.k1, interior.k2, interior.k3, interior.p1, interior.p2)
+    assert found == pytest.approx((-0.1, 0.02, 0.003, 0.0004, 0.0005))
+
+
+# -- errors ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("exif", "xmp", "message"),
+    [
+        (without(EXIF, "GPS"), DJI, "no position"),
+        ({**EXIF, "GPSLatitude": "(0) (0) (0)", "GPSLongitude": "(0) (0) (0)"}, DJI, "no position"),
+        ({**EXIF, "GPSLatitude": "(139) (0) (0)"}, DJI, "not on Earth"),
+        ({**EXIF, "GPSLatitude": "(nan) (0) (0)"}, DJI, "'nan' is not a number"),
+        ({**EXIF, "GPSLatitude": "(1) (2) (3) (4)"}, DJI, "4 numbers are not an angle"),
+        (without(EXIF, "Altitude"), without(DJI, "Altitude"), "no altitude"),
+        (EXIF, {**DJI, "drone-dji:AbsoluteAltitude": "1e7"}, "is impossible"),
+        (EXIF, without(DJI, "Gimbal"), "no camera angles"),
+        (EXIF, without(DJI, "Roll"), "one of yaw, pitch and roll is missing"),
+        (EXIF, {**DJI, "drone-dji:GimbalYawDegree": "0", "drone-dji:GimbalPitchDegree": "0"}, "does not record them"),
+        (EXIF, {**DJI, "drone-dji:GimbalPitchDegree": "20"}, "does not look at the ground"),
+        (EXIF, {**DJI, "Camera:ModelType": "fisheye"}, "a fisheye"),
+        ({**EXIF, "PixelXDimension": "1200"}, DJI, "crops are not supported|by its tags"),
+        ({**without(EXIF, "35mm"), "Model": "X"}, DJI, r"sensor of this camera \(X\) is not known"),
+        (EXIF, {**DJI, "drone-dji:DewarpData": "x;1,2,3"}, "3 numbers instead of 9"),
+        (EXIF, {**DJI, "drone-dji:DewarpData": "x;0,1,2,3,4,5,6,7,8"}, "must be positive"),
+        (EXIF, "<x:xmpmeta", "not well-formed XML"),
+        (EXIF, '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "not well-formed XML"),
+        (EXIF, "<a>" + "x" * 1_100_000 + "</a>", "larger than 1 MB"),
+    ],
+)
+def test_damaged_or_missing_tags_are_one_error_each(tmp_path, exif, xmp, message):
+    path = photo(tmp_path / "a.tif", exif, xmp)
+    with pytest.raises(InputError, match=message) as error:
+        open_scene(path, SceneOptions(sensor="photo"))
+    assert str(error.value.file) == str(path)
+    assert error.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("sensor_width", "x"), ("sigmas", "1"), ("heights", "9,1"), ("calibrate", "x")]
+)
+def test_wrong_options_are_errors(tmp_path, option, value):
+    with pytest.raises(InputError) as error:
+        opened(photo(tmp_path / "a.tif"), **{option: value})
+    assert error.value.field == option
+
+
+def test_a_folder_stands_for_its_photos_and_says_what_they_lack(tmp_path):
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    one, _ = photo(folder / "a.tif"), photo(folder / "b.tif", xmp=without(DJI, "Gimbal"))
+    with pytest.raises(InputError, match=r"1 scene, .*b.tif: .*no camera angles") as error:
+        images_of([folder], SceneOptions())
+    assert "ortho info" in error.value.remedy
+    other = photo(folder / "c.tif")
+    assert images_of([folder], SceneOptions()) == [one, other]
+    assert images_of([one], SceneOptions()) == [one]
+    shown = CliRunner().invoke(cli, ["info", str(folder)]).output
+    assert f"ortho adjust '{folder}' --ties auto" in shown
+    assert "no camera angles" in shown
+
+
+def test_photos_that_do_not_overlap_are_an_error(tmp_path):
+    far = {**EXIF, "GPSLongitude": "(33) (45) (0)"}
+    files = [str(photo(tmp_path / "a.tif")), str(photo(tmp_path / "b.tif", far, without(DJI, "Gps")))]
+    words = ["--sensor-option", "vertical=ellipsoid", "--ties", "auto", "--height", "900", "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(cli, ["adjust", *files, *words])
+    assert done.exit_code == 2
+    assert "no two scenes overlap" in done.output
