@@ -105,7 +105,7 @@ def test_the_created_package_imports_what_is_public(package: Path) -> None:
     ("name", "good", "bad"),
     [
         ("sensor", ("norna", "norna-2", "n2"), ("Norna", "2norna", "-n", "nor na", "nor_na", "", "nørna")),
-        ("title", ("Norna-2, level 1", "Norna's"), ('the "best"', "a\\b")),
+        ("title", ("Norna-2, level 1", "Norna's"), ('the "best"', "a\\b", "a {b}", "}")),
         ("ending", ("_rpc.txt", ".norna.json"), ("", 'a"', "\\x.txt")),
     ],
 )

@@ -117,7 +117,7 @@ def adjust(
     scenes = scenes_of(images, scene, models)
     refuse_contradictions(points, match, surface, orthos=orthos is not None)
     programs = block_formats(export)
-    written = of_orthos | {"export": files_for(programs, Path(folder), labels)}
+    written = of_orthos | ({"export": files_for(programs, Path(folder), labels)} if programs else {})
     _check_paths(files, images, points, scenes, *models, match=match, surface=surface, further=written)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)

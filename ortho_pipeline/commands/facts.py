@@ -98,7 +98,7 @@ def sensor_test(
         )
     origin = plugins.provenance(sensor.name)
     require_declared(sensor, options.sensor_options, image)
-    again = shlex.join(["ortho", "sensors", "--test", sensor.name, str(image)])
+    again = f"ortho sensors --test {sensor.name} {shlex.quote(str(image))}"
     remedy = f"correct the plugin, or give an image of its sensor; then test again: `{again}`"
     with _contract_of(sensor, remedy):
         scene = check_sensor(sensor, image, **options.sensor_options)
