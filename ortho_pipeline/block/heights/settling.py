@@ -28,7 +28,9 @@ from ortho_pipeline.models.base import Array
 
 #: Planes are renewed so often at most. They are stable if few heights (a share) changed by more than a part of a sigma,
 #: and hardly any (a share) were left out anew or take part again.
-_ROUNDS, _STABLE, _FEW, _HARDLY_ANY = 10, 0.02, 0.02, 1e-3
+_ROUNDS, _STABLE, _FEW, _HARDLY_ANY = 20, 0.02, 0.02, 1e-3
+#: Rounds after which the heights that are left out stay the same.
+_SEARCHED = 5
 #: The estimate of shared errors is stable if it changes by less than this, in standard deviations.
 _SHARED_STABLE = 0.02
 #: A height farther off than so many of its sigmas is left out; it takes part again if it is nearer than so many.
@@ -187,7 +189,7 @@ class Heights:
         if np.abs(step).max() > _SHARED_STABLE:
             common = replace(common, value=common.value + step)
         # Otherwise heights at the limit may be left out and return without end.
-        settled = number > _ROUNDS // 2
+        settled = number > _SEARCHED
         spots = self.spots if self.spots is None or settled else self.spots.judged(common, self.sigma)
         judged = replace(self, common=common, spots=spots)
         residuals, variances, used = judged._residuals(solved)
@@ -255,6 +257,9 @@ class Heights:
         if len(scaled) < _ENOUGH:
             return self
         sigma = NORMAL * float(np.median(scaled))
+        if self.estimated:
+            # Points and images follow the sigma rounds later: all of the way would swing about it without end.
+            sigma = math.sqrt(sigma * self.sigma)
         same = abs(sigma / self.sigma - 1.0) < 2 * _STABLE
         return self if same else replace(self, sigma=max(sigma, 0.01), estimated=True)
 
