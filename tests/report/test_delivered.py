@@ -72,7 +72,7 @@ def test_a_model_of_a_block_says_so(sample, tmp_path):
     truth = made.document["report"]["adjustment"]["images"]["BANDF"]["rms"]["back_projected"]["check"]
     assert head["figure"].startswith(f"{truth['total']:.2f}")
     assert f"{truth['n']} measurements of check points" in head["what"]
-    assert "datum" in head["notes"][0]
+    assert "control points" in head["notes"][0]
     assert not [word for word in WRONG if word in result.summary]
 
 

@@ -66,16 +66,14 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
                 field="points.gcps",
                 remedy="give a file of points",
             )
+        return
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
     if chosen is not None and points.gcps is None:
-        remedy = "leave it out; one cell in five of the matches is reserved for checking"
         raise InputError(
             Text(Setting(f"points.{chosen}"), " selects from ", Setting("points.gcps"), ", which is not given"),
             field=f"points.{chosen}",
-            remedy=remedy if match.reference else "give a file of points",
+            remedy="leave it out; one cell in five of the matches is reserved for checking",
         )
-    if not match.reference:
-        return
     if chosen is not None and match.gcps_as == "check":
         raise InputError(
             Text(Setting(f"points.{chosen}"), " selects control points, but these points are all check points"),
