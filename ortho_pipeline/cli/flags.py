@@ -10,16 +10,7 @@ import click
 
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.options import GROUPS, BlockOptions, MosaicOptions, options_of
-
-#: Options of a scene and of a mosaic.
-_GROUPS = {**GROUPS, "mosaic": MosaicOptions}
-#: Name of an option in messages -> its flag, if a command has it.
-FLAGS = {
-    f"{group}.{name}": option.flags.split()[0]
-    for group, options in (("points", BlockOptions), *_GROUPS.items())
-    for name, option in options_of(options).items()
-}
+from ortho_pipeline.options.flags import FLAGGED, FLAGS, flag_of, value_of
 
 
 def flags_of(command: click.Command) -> dict[str, str]:
@@ -33,7 +24,7 @@ def flags_of(command: click.Command) -> dict[str, str]:
         group, _, field = str(param.name).partition("_")
         if not isinstance(param, click.Option):
             continue
-        if group in _GROUPS and field:
+        if group in FLAGGED and field:
             flags[f"{group}.{field}"] = param.opts[0]
         else:
             flags[str(param.name)] = param.opts[0]
@@ -45,15 +36,7 @@ def with_flags(text: str, flags: Mapping[str, str]) -> str:
     """Return a text with the options that it names as they are typed; names without a flag stay as they are."""
     if not isinstance(text, Text):
         return text
-    return "".join(part if isinstance(part, str) else _typed(part, flags) for part in text.parts)
-
-
-def _typed(setting: Setting, flags: Mapping[str, str]) -> str:
-    return f"{flags[setting.name]} {_value(setting)}".strip() if setting.name in flags else str(setting)
-
-
-def _value(setting: Setting) -> str:
-    return "=".join(part for part in (setting.key, setting.value) if part is not None)
+    return "".join(part if isinstance(part, str) else flag_of(part, flags) for part in text.parts)
 
 
 def as_typed(text: str) -> str:
@@ -88,6 +71,6 @@ def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) 
     typed = click.get_current_context().meta.get("command")
     if typed is not None and all(name in flags for name in (error.field or "").split(", ")):
         for setting, meaning in error.choices:
-            value = shlex.quote(_value(of_image(setting)))
+            value = shlex.quote(value_of(of_image(setting)))
             remedy = Text(remedy, f"\n    {typed} {flags[setting.name]} {value}  # {meaning}")
     error.remedy = remedy

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, counted
+from ortho_pipeline.options.flags import flag_of
 
 
 def render(template: str, package: str = "ortho_pipeline", **values: Any) -> str:
@@ -34,13 +35,16 @@ def render(template: str, package: str = "ortho_pipeline", **values: Any) -> str
 
 
 def _coded(text: str) -> Any:
-    """Return a text with what stands between backticks as code; everything is escaped."""
+    """Return a text with what stands between backticks as code, options as they are typed; everything is escaped."""
     from markupsafe import Markup, escape
 
-    parts = [escape(part) for part in str(text).split("`")]
+    parts = str(text).split("`")
     if len(parts) % 2 == 0:
         return escape(text)
-    return Markup("").join(Markup("<code>{}</code>").format(part) if k % 2 else part for k, part in enumerate(parts))
+    return Markup("").join(
+        Markup("<code>{}</code>").format(flag_of(Setting.read(part)).strip("`")) if number % 2 else escape(part)
+        for number, part in enumerate(parts)
+    )
 
 
 @functools.cache

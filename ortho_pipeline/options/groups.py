@@ -290,7 +290,7 @@ class MatchOptions:
         float | None,
         Option(
             "--search",
-            "Search radius on the ground: the largest expected error of the image's model.",
+            "Search radius on the ground: the largest expected error of the image's position.",
             "M",
             kind="number",
             above=0,

@@ -63,17 +63,10 @@ class HeightsRecord(Record):
         """Return notices of an unstated sigma, of a shift, and of heights that were left out."""
         found = []
         if self.sigma_is == "assumed":
-            text = Text(
-                f"DEM accuracy not given; assuming {metres(self.sigma_m)}. Set it with ",
-                Setting("surface.sigma"),
-            )
+            text = f"DEM accuracy not given; assuming {metres(self.sigma_m)}"
             found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
         elif self.sigma_is == "estimated":
-            text = Text(
-                f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from "
-                f"{counted(self.used, 'height')}. Set it with ",
-                Setting("surface.sigma"),
-            )
+            text = f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from {counted(self.used, 'height')}"
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         elif self.sigma_is == "enlarged":
             text = Text(

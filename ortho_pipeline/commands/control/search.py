@@ -9,7 +9,6 @@ import numpy as np
 
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
-from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import MatchOptions
 
@@ -92,8 +91,5 @@ def default_search(search: Search) -> list[Notice]:
     """Return a notice if neither user nor scene states the search radius."""
     if search.known:
         return []
-    text = Text(
-        f"no stated accuracy for this scene's model; searched within {metres(search.distance)}. Change this with ",
-        Setting("match.search"),
-    )
+    text = f"no stated accuracy for this scene's model; searched within {metres(search.distance)}"
     return [Notice("search-by-default", text, search_m=search.distance)]

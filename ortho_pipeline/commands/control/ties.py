@@ -26,7 +26,7 @@ from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
@@ -159,9 +159,7 @@ def tie_scenes(
     ties = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
     notices = [*_few(ties, tuple(scenes))]
     if stated is None:
-        text = Text(
-            f"accuracy of the heights not given; assuming {metres(sigma)}. Set it with ", Setting("surface.sigma")
-        )
+        text = f"accuracy of the heights not given; assuming {metres(sigma)}"
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
     return Tied(_points(ties, tuple(scenes)), ties, search, sigma, tuple(notices))
 

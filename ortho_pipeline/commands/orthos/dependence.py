@@ -264,7 +264,8 @@ def _of_shift(verified: Verified, relative: Accuracy) -> list[Cause]:
         )
         return [Cause("datum", text)]
     azimuth = math.degrees(math.atan2(bias[0], bias[1])) % 360
-    return [Cause("shift", f"the whole ortho is shifted by {size_m(length)} towards azimuth {azimuth:.0f}°")]
+    shifted = f"the whole ortho is shifted by {size_m(length)} towards azimuth {azimuth:.0f}°"
+    return [Cause("shift", f"{shifted}. If the reference is right, correct it with ortho align")]
 
 
 def _of_step(step: FieldStep, measured: MeasuredOrtho) -> Cause:

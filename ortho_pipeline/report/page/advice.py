@@ -70,7 +70,7 @@ _LOOK: dict[str, str] = {
     "uncertain-at-edge": "Add control points near the corners, or use a simpler correction.",
     "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
-    "search-by-default": Text("State the accuracy of the delivered model with ", Setting("match.search"), "."),
+    "search-by-default": Text("Change the radius with ", Setting("match.search"), "."),
     "points-cover-part": "Add ties there (matching finds them), and control near the corners of the block.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
     "few-ties": "Measure some ties between these images.",
