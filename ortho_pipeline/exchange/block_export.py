@@ -21,7 +21,7 @@ _CELLS = 32
 
 
 @dataclass(frozen=True)
-class BlockImage:
+class ExportedImage:
     """An image of a block, as a configuration names it.
 
     Parameters
@@ -37,7 +37,7 @@ class BlockImage:
 
     Examples
     --------
-    >>> BlockImage("../aft.tif", "aft.geom", (1000, 800)).bands
+    >>> ExportedImage("../aft.tif", "aft.geom", (1000, 800)).bands
     1
     """
 
@@ -74,7 +74,7 @@ class BlockExport:
 
     Parameters
     ----------
-    images : mapping of str to BlockImage
+    images : mapping of str to ExportedImage
         In the order of the user.
     models : str
         Name of the format of the model files.
@@ -88,13 +88,13 @@ class BlockExport:
 
     Examples
     --------
-    >>> images = {name: BlockImage(f"{name}.tif", f"{name}.geom", (1000, 800)) for name in ("aft", "fore")}
+    >>> images = {name: ExportedImage(f"{name}.tif", f"{name}.geom", (1000, 800)) for name in ("aft", "fore")}
     >>> block = BlockExport(images, "geom", [ImagePair("aft", "fore", 0.9, 20.0)], 2.5, "EPSG:32636")
     >>> [pair.second for pair in block.pairs]
     ['fore']
     """
 
-    images: Mapping[str, BlockImage]
+    images: Mapping[str, ExportedImage]
     models: str
     pairs: Sequence[ImagePair]
     resolution: float

@@ -34,7 +34,7 @@ _REACH = 3
 
 
 @dataclass(frozen=True)
-class Overlap:
+class CommonExtent:
     """The common area of two orthos on the grid of the panchromatic one.
 
     Parameters
@@ -53,7 +53,7 @@ class Overlap:
     ratio: int
 
     @classmethod
-    def of(cls, pan: Grid, colours: Grid) -> Overlap:
+    def of(cls, pan: Grid, colours: Grid) -> CommonExtent:
         """Return the common area.
 
         Raises
@@ -129,7 +129,7 @@ class Pansharpened:
         threads: int = 1,
         memory: int = 64_000_000,
     ) -> None:
-        self.overlap = Overlap.of(*grids)
+        self.overlap = CommonExtent.of(*grids)
         self._pan, self._colours, self._grids = pan, colours, grids
         self._weights, self._profile, self._threads, self._memory = weights, profile, threads, memory
         self._nodata, self._held = _common_nodata(pan, colours), list[gdal.Dataset]()

@@ -15,7 +15,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_frame.pose import Pose, Shot
-from ortho_frame.projects import MAP, Axes, orthority_of, reconstruction_of, shot_in
+from ortho_frame.projects import MAP, ProjectAxes, orthority_of, reconstruction_of, shot_in
 from ortho_frame.tables import is_orthority, is_reconstruction, read_camera, read_exterior
 from ortho_pipeline.plugin import (
     LOOKS_PAST,
@@ -254,23 +254,23 @@ def _model(
     return FrameCamera.from_map(interior, str(crs), np.concatenate([position, angles]), frame=frame, **others)
 
 
-def _axes_of(shot: Shot, frame: str, crs: str | None) -> Axes:
+def _axes_of(shot: Shot, frame: str, crs: str | None) -> ProjectAxes:
     """Return the axes that the options state for a reconstruction."""
     if frame == TOPOCENTRIC:
-        return Axes(TOPOCENTRIC)
+        return ProjectAxes(TOPOCENTRIC)
     if crs is None:
         raise InputError(
             "frame=map needs a map projection", file=shot.source, field="crs", remedy="give one, such as crs=EPSG:32636"
         )
     # OpenDroneMap takes east and north for axes of the map.
     x, y, _ = ground_transform("EPSG:4979", crs)([shot.origin])[0].tolist()
-    return Axes(frame, crs, (x, y))
+    return ProjectAxes(frame, crs, (x, y))
 
 
 def _shot_model(
     interior: Interior,
     shot: Shot,
-    axes: Axes,
+    axes: ProjectAxes,
     vertical: Vertical,
     *,
     heights: str | None = None,

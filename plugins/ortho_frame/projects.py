@@ -46,7 +46,7 @@ _MOST = 200
 
 
 @dataclass(frozen=True)
-class Axes:
+class ProjectAxes:
     """The axes of a reconstruction: topocentric, or those of a map about a corner (its x, y)."""
 
     frame: str
@@ -84,7 +84,7 @@ def orthority_of(name: str) -> tuple[Path, Path] | None:
     return folder / cameras[0], folder / orientations[0]
 
 
-def shot_in(path: Path, image: Path) -> tuple[Shot, Axes]:
+def shot_in(path: Path, image: Path) -> tuple[Shot, ProjectAxes]:
     """Return the shot of an image in the reconstruction of a project, and the axes of the reconstruction.
 
     Raises
@@ -96,7 +96,7 @@ def shot_in(path: Path, image: Path) -> tuple[Shot, Axes]:
     document = _document(str(path), state.st_mtime_ns, state.st_size)
     shot = shot_of(path, document, image)
     if path.name != "reconstruction.json":
-        return shot, Axes(TOPOCENTRIC)
+        return shot, ProjectAxes(TOPOCENTRIC)
     stated = path.parent.parent / "odm_georeferencing" / "coords.txt"
     if stated.is_file():
         return shot, _of_coordinates(stated)
@@ -109,7 +109,7 @@ def _document(path: str, _modified: int, _size: int) -> Any:
     return read_json(path, MAX_JSON_BYTES, _REMEDY, unique=True)
 
 
-def _of_coordinates(path: Path) -> Axes:
+def _of_coordinates(path: Path) -> ProjectAxes:
     """Return the axes that ``coords.txt`` states: the zone, then the offset east and north."""
     remedy = "copy odm_georeferencing/coords.txt of the project again"
     lines = read_bounded(path, 100_000_000, remedy=remedy)[:4096].decode("ascii", "replace").splitlines()
@@ -118,10 +118,10 @@ def _of_coordinates(path: Path) -> Axes:
     if zone is None or not 1 <= int(zone[1]) <= 60 or len(offset) != 2 or not all(map(_NUMBER.fullmatch, offset)):
         raise InputError("expected 'WGS84 UTM zone', then the offset east and north", file=path, remedy=remedy)
     east, north = map(float, offset)
-    return Axes(MAP, f"EPSG:{326 if zone[2].upper() == 'N' else 327}{int(zone[1]):02d}", (east, north))
+    return ProjectAxes(MAP, f"EPSG:{326 if zone[2].upper() == 'N' else 327}{int(zone[1]):02d}", (east, north))
 
 
-def _of_positions(document: Any, origin: tuple[float, float, float]) -> Axes:
+def _of_positions(document: Any, origin: tuple[float, float, float]) -> ProjectAxes:
     """Return the axes along which the cameras are nearest to their GPS positions."""
     parts = document if isinstance(document, list) else [document]
     shots = [shot for part in parts for shot in part.get("shots", {}).values() if isinstance(shot, dict)][:_MOST]
@@ -130,7 +130,7 @@ def _of_positions(document: Any, origin: tuple[float, float, float]) -> Axes:
         (shot, gps) for shot, gps in known if all(_is_triple(shot.get(key)) for key in ("rotation", "translation"))
     ]
     if not known:
-        return Axes(TOPOCENTRIC)
+        return ProjectAxes(TOPOCENTRIC)
     centres = np.array([Shot("", "", origin, shot["rotation"], shot["translation"], "").centre for shot, _ in known])
     gps = np.array([position for _, position in known], dtype=np.float64)
     start = np.array([origin])
@@ -140,7 +140,9 @@ def _of_positions(document: Any, origin: tuple[float, float, float]) -> Axes:
     corner = to_map(start)[0]
     in_map: Array = to_map(on_earth) - corner
     apart = [float(np.median(np.hypot(*(centres - places)[:, :2].T))) for places in (gps, in_map)]
-    return Axes(MAP, crs, (float(corner[0]), float(corner[1]))) if apart[1] < apart[0] else Axes(TOPOCENTRIC)
+    return (
+        ProjectAxes(MAP, crs, (float(corner[0]), float(corner[1]))) if apart[1] < apart[0] else ProjectAxes(TOPOCENTRIC)
+    )
 
 
 def _is_triple(value: Any) -> bool:

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 from osgeo import gdal
 
-from ortho_photo.cameras import Camera, camera_of
-from ortho_photo.pose import ANGLE, HORIZON, NADIR, Pose, pose_of
+from ortho_photo.cameras import PhotoCamera, camera_of
+from ortho_photo.pose import ANGLE, HORIZON, NADIR, PhotoPose, pose_of
 from ortho_photo.tags import Tags, has_position, tags_of
 from ortho_pipeline.plugin import (
     FrameCamera,
@@ -115,7 +115,7 @@ def open_scene(
     )
 
 
-def _model(interior: Interior, pose: Pose, stated: str, heights: str | None, tags: Tags) -> FrameCamera:
+def _model(interior: Interior, pose: PhotoPose, stated: str, heights: str | None, tags: Tags) -> FrameCamera:
     altitude = pose.altitude
     if stated != UNKNOWN:
         altitude += float(Vertical.parse(stated).undulation(np.array([pose.lon]), np.array([pose.lat]))[0])
@@ -141,7 +141,7 @@ def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> 
 
 
 def _priors(
-    model: FrameCamera, pose: Pose, camera: Camera, stated: str, sigmas: str | None, above_ground: float
+    model: FrameCamera, pose: PhotoPose, camera: PhotoCamera, stated: str, sigmas: str | None, above_ground: float
 ) -> dict[str, Prior]:
     """Return what is known of the pose, and of the focal length where an adjustment can tell it from the height.
 
@@ -170,7 +170,7 @@ def _above_ground(tags: Tags) -> float:
     return tags.positive("drone-dji:RelativeAltitude") or _USUAL
 
 
-def _unknown_datum(pose: Pose) -> Notice:
+def _unknown_datum(pose: PhotoPose) -> Notice:
     text = Text(
         "the tags do not state the height datum of the camera. Its altitude counts as ellipsoidal, within "
         f"{DATUM_SIGMA:.0f} m. An adjustment with a DEM or control points estimates it. If you know the datum, add ",
@@ -179,7 +179,7 @@ def _unknown_datum(pose: Pose) -> Notice:
     return Notice("datum-unknown", text, altitude_m=pose.altitude, sigma_m=DATUM_SIGMA)
 
 
-def _facts(tags: Tags, pose: Pose, model: FrameCamera, camera: Camera, stated: str) -> dict[str, object]:
+def _facts(tags: Tags, pose: PhotoPose, model: FrameCamera, camera: PhotoCamera, stated: str) -> dict[str, object]:
     taken = tags.text("DateTimeOriginal", "DateTime")
     relative = tags.number("drone-dji:RelativeAltitude")
     known = {

@@ -38,7 +38,7 @@ _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs
 
 
 @dataclass(frozen=True)
-class Camera:
+class PhotoCamera:
     """The camera of a photo, its source, and the standard deviation of its focal length in parts of it."""
 
     interior: Interior
@@ -46,7 +46,7 @@ class Camera:
     sigma: float = NOMINAL
 
 
-def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -> Camera:
+def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -> PhotoCamera:
     """Return the camera of a photo of `width` x `height` pixels.
 
     Parameters
@@ -70,7 +70,7 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     if sensor_width is not None:
         if focal is None:
             raise tags.error("the tags have no focal length", "FocalLength", "give camera=FILE (docs/formats/frame.md)")
-        return Camera(_plain(width, height, focal / sensor_width), "sensor width of the options")
+        return PhotoCamera(_plain(width, height, focal / sensor_width), "sensor width of the options")
     try:
         calibrated = _dewarped(tags, width, height, full) or _of_pix4d(tags, width, height, full)
     except InputError as error:
@@ -79,16 +79,18 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
         return calibrated
     known = SENSOR_MM.get(tags.text("Model", "tiff:Model"))
     if focal and known:
-        return Camera(_plain(width, height, focal / known), "focal length, and a known sensor")
+        return PhotoCamera(_plain(width, height, focal / known), "focal length, and a known sensor")
     pitch = _pitch_mm(tags)
     if focal and pitch:
-        return Camera(_plain(width, height, focal / (pitch * full)), "focal length, and resolution in the focal plane")
+        return PhotoCamera(
+            _plain(width, height, focal / (pitch * full)), "focal length, and resolution in the focal plane"
+        )
     nominal = tags.positive("drone-dji:CalibratedFocalLength")
     if nominal:
-        return Camera(_plain(width, height, nominal / full), "nominal focal length in pixels")
+        return PhotoCamera(_plain(width, height, nominal / full), "nominal focal length in pixels")
     film = tags.positive("FocalLengthIn35mmFilm")
     if film:
-        return Camera(_plain(width, height, film / _FILM_MM), "focal length in 35 mm film, rounded")
+        return PhotoCamera(_plain(width, height, film / _FILM_MM), "focal length in 35 mm film, rounded")
     model = tags.text("Model", "tiff:Model") or "unknown"
     raise tags.error(f"the size of the sensor of this camera ({model}) is not known", "sensor_width", _REMEDY)
 
@@ -113,7 +115,7 @@ def _plain(width: int, height: int, by_width: float) -> Interior:
     return Interior(width, height, by_width * width * _PIXEL, _PIXEL, _PIXEL)
 
 
-def _dewarped(tags: Tags, width: int, height: int, full: float) -> Camera | None:
+def _dewarped(tags: Tags, width: int, height: int, full: float) -> PhotoCamera | None:
     """Return DJI's calibration: date; fx, fy, cx, cy (px, from the middle, y down), k1, k2, p1, p2, k3 of OpenCV."""
     text, done = tags.text("drone-dji:DewarpData"), tags.number("drone-dji:DewarpFlag")
     if not text or done:  # a photo that was dewarped has another camera
@@ -129,10 +131,10 @@ def _dewarped(tags: Tags, width: int, height: int, full: float) -> Camera | None
     interior = Interior(
         width, height, fx * _PIXEL, pixel, pixel * fx / fy, cx * _PIXEL, -cy * _PIXEL * fx / fy, k1, k2, k3, p1, p2
     )
-    return Camera(interior, "the maker's calibration (DewarpData)", CALIBRATED)
+    return PhotoCamera(interior, "the maker's calibration (DewarpData)", CALIBRATED)
 
 
-def _of_pix4d(tags: Tags, width: int, height: int, full: float) -> Camera | None:
+def _of_pix4d(tags: Tags, width: int, height: int, full: float) -> PhotoCamera | None:
     """Return the camera of Pix4D's tags: mm, from the upper left corner, R1, R2, R3, T1, T2."""
     focal, pitch = tags.positive("Camera:PerspectiveFocalLength"), _pitch_mm(tags)
     if not focal or not pitch:
@@ -146,7 +148,7 @@ def _of_pix4d(tags: Tags, width: int, height: int, full: float) -> Camera | None
     r1, r2, r3, t1, t2 = lens
     x0, y0 = (place[0] - middle[0]) * 1e-3, (middle[1] - place[1]) * 1e-3
     interior = Interior(width, height, focal * 1e-3, pixel, pixel, x0, y0, r1, r2, r3, t1, t2)
-    return Camera(interior, "the maker's calibration (Pix4D's camera tags)", CALIBRATED)
+    return PhotoCamera(interior, "the maker's calibration (Pix4D's camera tags)", CALIBRATED)
 
 
 def _pitch_mm(tags: Tags) -> float | None:

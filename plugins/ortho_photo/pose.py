@@ -34,7 +34,7 @@ _FIXED = 50.0
 
 
 @dataclass(frozen=True)
-class Pose:
+class PhotoPose:
     """A pose with its sources.
 
     Parameters
@@ -69,7 +69,7 @@ class Pose:
         return math.degrees(math.acos(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
 
 
-def pose_of(tags: Tags, pitch: str | None = None) -> Pose:
+def pose_of(tags: Tags, pitch: str | None = None) -> PhotoPose:
     """Return the pose in the tags; `pitch` says where pitch is zero, if the tags say it wrongly.
 
     Raises
@@ -80,7 +80,7 @@ def pose_of(tags: Tags, pitch: str | None = None) -> Pose:
     lon, lat, altitude = _position(tags)
     angles, convention = _angles(tags, pitch)
     sigmas, positioning = _accuracy(tags)
-    return Pose(
+    return PhotoPose(
         lon, lat, altitude, sigmas, rotation_of(angles, convention), angles, convention, positioning, _datum(tags)
     )
 

@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from networks import Made, Truth
 
-from ortho_pipeline.block.stack.adjustment import Adjusted, adjust
+from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
 from ortho_pipeline.block.stack.edges import Cells
 from ortho_pipeline.block.stack.graph import pairs_of
 from ortho_pipeline.block.stack.steps import steps_of
 
 
-def solved(**given: Any) -> tuple[Made, Adjusted]:
+def solved(**given: Any) -> tuple[Made, AdjustedStack]:
     made = Truth(**given).made()
     return made, adjust(made.truth.cells, made.edges, made.years.tolist())
 
 
-def errors(made: Made, stack: Adjusted) -> np.ndarray:
+def errors(made: Made, stack: AdjustedStack) -> np.ndarray:
     return stack.network.value[:, 0] - (made.shift - made.shift.mean(axis=0))
 
 
-def spread(stacks: list[tuple[Made, Adjusted]]) -> float:
+def spread(stacks: list[tuple[Made, AdjustedStack]]) -> float:
     ratio = np.concatenate([errors(made, stack) / stack.sigma for made, stack in stacks])
     return float(np.sqrt((ratio**2).mean()))
 

@@ -14,9 +14,9 @@ from ortho_pipeline.batch.freshness import DIGESTS
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked
 from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, time_of
 from ortho_pipeline.batch.stack.document import record_of
-from ortho_pipeline.batch.stack.matching import Matcher, Pair
+from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, geotransform_of, pixel_of
-from ortho_pipeline.block.stack.adjustment import Adjusted, adjust
+from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.graph import NEIGHBOURS, pairs_of
 from ortho_pipeline.commands.orthos.opening import open_ortho
@@ -132,9 +132,9 @@ def _with_datum(
 
 
 def _adjusted(
-    nodes: Sequence[Dated], dates: Sequence[Dated], placed: Placed, pairs: Sequence[Pair], datum: int | None,
+    nodes: Sequence[Dated], dates: Sequence[Dated], placed: Placed, pairs: Sequence[DatePair], datum: int | None,
     affine: bool,
-) -> Adjusted:  # fmt: skip
+) -> AdjustedStack:  # fmt: skip
     """Return the adjustment of matched pairs."""
     matched = [pair for pair in pairs if pair.matches is not None]
     if not matched:
@@ -180,7 +180,7 @@ class _Writer:
         self.corrections_only, self.rebuild = corrections_only, rebuild
         self.software = versions()
 
-    def write(self, dates: Sequence[Dated], solved: Adjusted, told: Told) -> dict[str, str]:
+    def write(self, dates: Sequence[Dated], solved: AdjustedStack, told: Told) -> dict[str, str]:
         """Return the files of dates, relative to the folder of the stack."""
         found = {}
         for number, one in enumerate(dates):
@@ -189,7 +189,7 @@ class _Writer:
             told("writing", (number + 1) / len(dates))
         return found
 
-    def _one(self, one: Dated, solved: Adjusted, number: int) -> str:
+    def _one(self, one: Dated, solved: AdjustedStack, number: int) -> str:
         model = self.placed.corrected(one, solved, number)
         name = f"{one.name}_aligned{'.vrt' if self.corrections_only else '.tif'}"
         path, place = self.folder / name, self.folder / f"{one.name}.record.json"

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.batch.stack.dates import Dated
-from ortho_pipeline.batch.stack.matching import Pair
+from ortho_pipeline.batch.stack.matching import DatePair
 from ortho_pipeline.batch.stack.placing import Placed
-from ortho_pipeline.block.stack.adjustment import Adjusted
+from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.results import SCHEMA_VERSION
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors.texts import counted
@@ -30,7 +30,12 @@ from ortho_pipeline.report.stack.records import (
 
 
 def record_of(
-    dates: Sequence[Dated], placed: Placed, pairs: Sequence[Pair], stack: Adjusted, outputs: dict[str, str], datum: str
+    dates: Sequence[Dated],
+    placed: Placed,
+    pairs: Sequence[DatePair],
+    stack: AdjustedStack,
+    outputs: dict[str, str],
+    datum: str,
 ) -> StackRecord:
     """Return the record of a stack; `outputs` are the files of dates by name."""
     metres = _metres(placed)
@@ -79,7 +84,9 @@ def _pair(values: Array) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-def _date(dates: Sequence[Dated], number: int, stack: Adjusted, metres: Array, outputs: dict[str, str]) -> DateRecord:
+def _date(
+    dates: Sequence[Dated], number: int, stack: AdjustedStack, metres: Array, outputs: dict[str, str]
+) -> DateRecord:
     one, known = dates[number], bool(stack.determined[number])
     accepted, edges = stack.closures.accepted, stack.edges
     count = int((accepted & ((edges.first == number) | (edges.second == number))).sum())
@@ -103,7 +110,7 @@ def _date(dates: Sequence[Dated], number: int, stack: Adjusted, metres: Array, o
     )
 
 
-def _pairs(dates: Sequence[Dated], pairs: Sequence[Pair], stack: Adjusted) -> list[PairRecord]:
+def _pairs(dates: Sequence[Dated], pairs: Sequence[DatePair], stack: AdjustedStack) -> list[PairRecord]:
     names = [one.name for one in dates]
     found, edge = [], 0
     for pair in pairs:
@@ -134,7 +141,7 @@ def _pairs(dates: Sequence[Dated], pairs: Sequence[Pair], stack: Adjusted) -> li
     return found
 
 
-def closures(stack: Adjusted, shifts: Array, some: NDArray[np.bool_]) -> ClosureRecord:
+def closures(stack: AdjustedStack, shifts: Array, some: NDArray[np.bool_]) -> ClosureRecord:
     """Return the closing errors of loops of three of some edges ``(E,)``."""
     edges = stack.edges
     number = {(int(a), int(b)): e for e, (a, b) in enumerate(zip(edges.first, edges.second, strict=True)) if some[e]}
@@ -152,7 +159,7 @@ def closures(stack: Adjusted, shifts: Array, some: NDArray[np.bool_]) -> Closure
     )  # fmt: skip
 
 
-def _moving(stack: Adjusted, placed: Placed, metres: Array) -> list[MovingRecord]:
+def _moving(stack: AdjustedStack, placed: Placed, metres: Array) -> list[MovingRecord]:
     motion, found = stack.motion, []
     to_lon_lat = ground_transform(placed.model.crs, "EPSG:4979")
     cell = (stack.cells.side**2) * abs(float(np.linalg.det(metres)))
@@ -174,7 +181,7 @@ def _moving(stack: Adjusted, placed: Placed, metres: Array) -> list[MovingRecord
     return found
 
 
-def _notices(dates: Sequence[Dated], stack: Adjusted, matched: Sequence[Pair], tried: int) -> list[Notice]:
+def _notices(dates: Sequence[Dated], stack: AdjustedStack, matched: Sequence[DatePair], tried: int) -> list[Notice]:
     found = []
     lost = [one.name for one, known in zip(dates, stack.determined, strict=False) if not known]
     if lost:

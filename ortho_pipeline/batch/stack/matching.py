@@ -44,7 +44,7 @@ class EdgeMatches(Record):
 
 
 @dataclass(frozen=True)
-class Pair:
+class DatePair:
     """A pair of dates with its matches; None if it could not be matched, for the reason."""
 
     first: int
@@ -72,7 +72,7 @@ class Matcher:
 
     def pairs(
         self, dates: Sequence[Dated], wanted: Sequence[tuple[int, int]], told: Callable[[int, int], None]
-    ) -> list[Pair]:
+    ) -> list[DatePair]:
         """Return all pairs, matched now or before; `told` hears how many are done."""
         software = versions()
         found = []
@@ -81,7 +81,7 @@ class Matcher:
             told(number + 1, len(wanted))
         return found
 
-    def _pair(self, dates: Sequence[Dated], one: int, other: int, software: dict[str, Any]) -> Pair:
+    def _pair(self, dates: Sequence[Dated], one: int, other: int, software: dict[str, Any]) -> DatePair:
         first, second = dates[one], dates[other]
         name = f"{first.name}__{second.name}"
         data, place = self.folder / f"{name}.json", self.folder / f"{name}.record.json"
@@ -97,18 +97,18 @@ class Matcher:
         key = key_of(inputs, self._configuration(), software)
         if record is not None and record.key == key and record.intact(self.folder):
             if record.status == "failed" and record.error is not None:
-                return Pair(one, other, None, str(record.error["message"]), True)
+                return DatePair(one, other, None, str(record.error["message"]), True)
             if record.status == "done" and len(record.outputs) == 1:
-                return Pair(one, other, read_matches(data), fresh=True)
+                return DatePair(one, other, read_matches(data), fresh=True)
         made = RunRecord(name=name, key=key, status="failed", inputs=inputs)
         try:
             matches = self._matched(first, second)
         except InputError as error:
             made.replaced(error=error_document(error)).write(place)
-            return Pair(one, other, None, error.message)
+            return DatePair(one, other, None, error.message)
         write_json(data, matches.to_json())
         made.replaced(status="done", outputs=(FileState.of("matches", data, name=data.name),)).write(place)
-        return Pair(one, other, matches)
+        return DatePair(one, other, matches)
 
     def _configuration(self) -> dict[str, Any]:
         return {

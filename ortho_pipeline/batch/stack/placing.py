@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ortho_pipeline.batch.stack.dates import Dated
-from ortho_pipeline.block.stack.adjustment import Adjusted
+from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.errors import CrsError
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
@@ -67,7 +67,7 @@ class Placed:
         places = np.concatenate([self.at(_corners(map_grid_of(one))) for one in dates])
         return places.min(axis=0), places.max(axis=0)
 
-    def corrected(self, one: Dated, stack: Adjusted, date: int) -> ImageCorrection:
+    def corrected(self, one: Dated, stack: AdjustedStack, date: int) -> ImageCorrection:
         """Return the model of an ortho with its correction."""
         own, size = map_grid_of(one), (one.scene.width, one.scene.height)
         origin = np.array(size) / 2

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ortho_pipeline.block.stack.components import Components, components_of
+from ortho_pipeline.block.stack.components import ErrorComponents, components_of
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import Motion, motion_of
 from ortho_pipeline.block.stack.network import Closures, Network, accepted_edges, solve
-from ortho_pipeline.block.stack.steps import Step, steps_of
+from ortho_pipeline.block.stack.steps import DateStep, steps_of
 from ortho_pipeline.block.stack.trends import Trends, design_of, trends_of
 from ortho_pipeline.models.base import Array
 
@@ -24,7 +24,7 @@ _CHANCE, _LEAST = 1e-3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class AdjustedStack:
     """An adjusted stack; lengths in px of its grid.
 
     Parameters
@@ -42,11 +42,11 @@ class Adjusted:
     cells: Cells
     edges: Edges
     network: Network
-    components: Components
+    components: ErrorComponents
     trends: Trends
     closures: Closures
     motion: Motion
-    steps: tuple[Step, ...]
+    steps: tuple[DateStep, ...]
     determined: NDArray[np.bool_]
     sloped: NDArray[np.bool_]
 
@@ -73,7 +73,7 @@ class Adjusted:
 
 def adjust(
     cells: Cells, edges: Edges, years: Sequence[float], datum: int | None = None, *, affine: bool = True
-) -> Adjusted:
+) -> AdjustedStack:
     """Adjust a stack.
 
     Parameters
@@ -112,7 +112,7 @@ class _Solved:
 
     edges: Edges
     trends: Trends
-    components: Components
+    components: ErrorComponents
     closures: Closures
     network: Network
 
@@ -153,7 +153,7 @@ def _sloped(edges: Edges, design: Array, place: Array, stable: NDArray[np.bool_]
 
 def _referred(
     cells: Cells, solved: _Solved, motion: Motion, years: Array, datum: int | None, sloped: NDArray[np.bool_]
-) -> Adjusted:
+) -> AdjustedStack:
     """Return a stack with its datum."""
     part, known = solved.network.part, np.isfinite(years)
     if datum is None:
@@ -169,7 +169,7 @@ def _referred(
     order = np.flatnonzero(determined & known)
     shifts = network.covariance[:, 3 * order][:, :, 3 * order]
     steps = tuple(replace(one, date=int(order[one.date])) for one in steps_of(value[order, 0], shifts))
-    return Adjusted(
+    return AdjustedStack(
         cells, solved.edges, network, solved.components, solved.trends, solved.closures, motion, steps, determined,
         sloped if datum is None else sloped | bool(sloped[datum]),
     )  # fmt: skip

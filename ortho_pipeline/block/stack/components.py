@@ -35,7 +35,7 @@ _ROUNDS = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Components:
+class ErrorComponents:
     """Variances of errors, in px².
 
     Parameters
@@ -104,7 +104,7 @@ def _correlations(place: Array) -> Array:
     return np.exp(-distance / np.array(_RANGES)[:, None, None])
 
 
-def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Components:
+def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> ErrorComponents:
     """Return the components of the errors of edges, from the residuals of their trends."""
     good = np.flatnonzero(trends.good)
     size = np.sqrt((trends.residual**2).sum(axis=(1, 2)) / np.maximum(2 * trends.used.sum(axis=1), 1))
@@ -123,7 +123,7 @@ def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Com
     else:
         shared[:], own[:], seen = 0.0, [1.0, 0.0, 0.0, 0.0], np.array([0.0, 1.0])
     scale, factor = _scales(edges, good, (size / typical) ** 2, seen, dates)
-    return Components(shared * typical**2, own * typical**2, scale, factor, np.zeros(2))
+    return ErrorComponents(shared * typical**2, own * typical**2, scale, factor, np.zeros(2))
 
 
 def _scales(edges: Edges, good: NDArray[np.int_], square: Array, seen: Array, dates: int) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2
 
-from ortho_pipeline.block.stack.components import Components
+from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.trends import median_of
 from ortho_pipeline.models.base import Array
@@ -89,7 +89,7 @@ class _Left:
 def motion_of(
     edges: Edges,
     network: Array,
-    components: Components,
+    components: ErrorComponents,
     accepted: NDArray[np.bool_],
     years: Array,
     *,
@@ -136,7 +136,7 @@ def motion_of(
     return Motion(moving, tested, rate, sigma, ratio, form)
 
 
-def _left(edges: Edges, network: Array, components: Components, accepted: NDArray[np.bool_]) -> _Left:
+def _left(edges: Edges, network: Array, components: ErrorComponents, accepted: NDArray[np.bool_]) -> _Left:
     seen = edges.measured & accepted[:, None]
     value = np.where(seen[:, :, None], np.nan_to_num(edges.value) - network, 0.0)
     shared, own = components.at_place(edges)

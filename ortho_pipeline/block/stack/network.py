@@ -22,7 +22,7 @@ from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from scipy.stats import chi2
 
-from ortho_pipeline.block.stack.components import Components
+from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Edges
 from ortho_pipeline.block.stack.trends import Trends
 from ortho_pipeline.models.base import Array
@@ -83,8 +83,8 @@ class Network:
 
 
 def accepted_edges(
-    edges: Edges, trends: Trends, components: Components, place: Array, dates: int
-) -> tuple[Closures, Components]:
+    edges: Edges, trends: Trends, components: ErrorComponents, place: Array, dates: int
+) -> tuple[Closures, ErrorComponents]:
     """Return which edges close loops, and components with the error that only loops show."""
     incidence = edges.incidence(dates)
     value, usable = trends.value[:, 0], trends.good
@@ -190,7 +190,7 @@ def _weighed(total: Array, own: Array) -> Array:
 def solve(
     edges: Edges,
     trends: Trends,
-    components: Components,
+    components: ErrorComponents,
     place: Array,
     accepted: NDArray[np.bool_],
     sloped: NDArray[np.bool_],

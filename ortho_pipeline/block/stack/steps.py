@@ -18,7 +18,7 @@ _WORTH, _CLIP = 0.37, 3.0
 
 
 @dataclass(frozen=True)
-class Step:
+class DateStep:
     """A step: the first date after it, its size (px) along both axes with sigmas, and its chance by accident."""
 
     date: int
@@ -27,7 +27,7 @@ class Step:
     chance: float
 
 
-def steps_of(value: Array, covariance: Array) -> list[Step]:
+def steps_of(value: Array, covariance: Array) -> list[DateStep]:
     """Return the steps of shifts ``(T, 2)`` in order of time, with covariances ``(2, T, T)``.
 
     Shifts scatter from date to date. Their scatter is estimated from differences of neighbours, most of which no step
@@ -37,7 +37,7 @@ def steps_of(value: Array, covariance: Array) -> list[Step]:
         return []
     scatter = (1.4826 * np.median(np.abs(np.diff(value, axis=0)), axis=0)) ** 2 / 2
     freedom = 2 * max(_WORTH * (len(value) - 1), 2.0)
-    found: list[Step] = []
+    found: list[DateStep] = []
     segments = [(0, len(value))]
     while segments:
         low, high = segments.pop()
@@ -51,7 +51,7 @@ def steps_of(value: Array, covariance: Array) -> list[Step]:
     return sorted(found, key=lambda one: one.date)
 
 
-def _at(value: Array, covariance: Array, scatter: Array, low: int, at: int, high: int, freedom: float) -> Step:
+def _at(value: Array, covariance: Array, scatter: Array, low: int, at: int, high: int, freedom: float) -> DateStep:
     """Return the step between the dates before and after a time."""
     before, after = np.arange(max(low, at - _MOST), at), np.arange(at, min(high, at + _MOST))
     contrast = np.zeros(len(value))
@@ -61,7 +61,7 @@ def _at(value: Array, covariance: Array, scatter: Array, low: int, at: int, high
     variance = scatter * (1.0 / len(before) + 1.0 / len(after)) + known
     ratio = float((size**2 / np.maximum(variance, 1e-12)).sum()) / 2
     sigma = np.sqrt(variance)
-    return Step(
+    return DateStep(
         at, (float(size[0]), float(size[1])), (float(sigma[0]), float(sigma[1])), float(fisher.sf(ratio, 2, freedom))
     )
 

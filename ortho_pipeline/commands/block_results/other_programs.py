@@ -15,7 +15,7 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands.block_results.orthos import corrected
 from ortho_pipeline.commands.control.points import no_points
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.exchange.block_export import BlockExport, BlockImage, ImagePair, pairs_of
+from ortho_pipeline.exchange.block_export import BlockExport, ExportedImage, ImagePair, pairs_of
 from ortho_pipeline.exchange.export import Export, check_formats
 from ortho_pipeline.exchange.rpc import write_bare_vrt
 from ortho_pipeline.files import part_of_outputs, write_text
@@ -127,7 +127,7 @@ class AdjustedBlock:
             kind, written = _models(chosen, exports, folder)
             files |= written
             images = {
-                label: BlockImage(
+                label: ExportedImage(
                     pictures[label],
                     written[f"{label} {kind.name}"].name,
                     exports[label].size,

@@ -28,7 +28,7 @@ from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
-from ortho_pipeline.raster.pansharpened import Overlap, Pansharpened, colour_bands
+from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened, colour_bands
 from ortho_pipeline.raster.regridded import Regridded, grid_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
@@ -88,7 +88,7 @@ def sharpen(
     ledger = Ledger(begun=states(path for path in paths if not Location(path).is_far))
     # Half of the memory for caches: windows are read once and in order, and what matches takes the rest.
     output = replace(output, memory=output.memory // 2)
-    pair = Pair.open(pan, colours, scene, output, ratio)
+    pair = OrthoPair.open(pan, colours, scene, output, ratio)
     stage = progress or (lambda name, share: None)
     stage("Weights", 0.0)
     samples = pair.samples()
@@ -114,7 +114,7 @@ def sharpen(
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class OrthoPair:
     """Both orthos, opened and checked.
 
     Parameters
@@ -132,7 +132,7 @@ class Pair:
     grids: tuple[Grid, Grid]
     bands: tuple[int, ...]
     ratio: float
-    overlap: Overlap
+    overlap: CommonExtent
     scene: SceneOptions
     output: OutputOptions
 
@@ -144,7 +144,7 @@ class Pair:
         scene: SceneOptions,
         output: OutputOptions,
         ratio: int | None,
-    ) -> Pair:
+    ) -> OrthoPair:
         """Open both orthos.
 
         Raises
@@ -160,7 +160,7 @@ class Pair:
         grids = grid_of(pan, **scene.access), grid_of(colours, **scene.access)
         sources = RasterSource(pan, bands=own, **access), RasterSource(colours, bands=bands, **access)
         try:
-            overlap = Overlap.of(*grids)
+            overlap = CommonExtent.of(*grids)
         except InputError as error:
             raise InputError(
                 f"{error.message} ({crs_text(grids[0].crs)}, {crs_text(grids[1].crs)})",
@@ -251,7 +251,7 @@ def _ratio_of(grids: tuple[Grid, Grid], pan: RasterSource, colours: RasterSource
     return own
 
 
-def _given_weights(weights: Sequence[float], pair: Pair) -> tuple[float, ...]:
+def _given_weights(weights: Sequence[float], pair: OrthoPair) -> tuple[float, ...]:
     count = len(pair.bands)
     if len(weights) != count:
         raise InputError(
@@ -270,7 +270,7 @@ def _given_weights(weights: Sequence[float], pair: Pair) -> tuple[float, ...]:
 # -- registration ----------------------------------------------------------------------------------------------------
 
 
-def _agreement(pair: Pair, regression: Weights) -> tuple[Agreement | None, list[Notice]]:
+def _agreement(pair: OrthoPair, regression: Weights) -> tuple[Agreement | None, list[Notice]]:
     """Return the displacement of the orthos, and warnings.
 
     Raises
@@ -314,7 +314,7 @@ def _no_gain(quality: Mapping[str, Any] | None) -> list[Notice]:
 # -- pixels ----------------------------------------------------------------------------------------------------------
 
 
-def _write(pair: Pair, weights: Sequence[float], path: Path, stage: Progress) -> int:
+def _write(pair: OrthoPair, weights: Sequence[float], path: Path, stage: Progress) -> int:
     """Write the ortho; return the number of its valid pixels."""
     output, (pan, colours) = pair.output, pair.sources
     profile = Profile.of(colours, output.dtype, output.nodata)
@@ -337,7 +337,7 @@ def _write(pair: Pair, weights: Sequence[float], path: Path, stage: Progress) ->
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def _document(pair: Pair, weights: Sequence[float], regression: Weights, given: bool) -> dict[str, Any]:
+def _document(pair: OrthoPair, weights: Sequence[float], regression: Weights, given: bool) -> dict[str, Any]:
     grid = pair.overlap.grid
     return {
         "schema_version": SCHEMA_VERSION,
