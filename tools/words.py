@@ -178,6 +178,7 @@ def words(text: str) -> int:
 def sentences(text: str) -> list[str]:
     """Return the sentences of a page, each with its inline code as one word."""
     text = re.sub(r"`[^`\n]+`", "code", readable(text))
+    text = re.sub(r"</?(?:table|thead|tbody|tr|th|td|p)\b[^>]*>", "\n\n", text)  # cells of a notebook's tables
     found = [part for block in blocks(text) for part in _END.split(block)]
     return [sentence.strip() for sentence in found if length(sentence) >= 4]
 
