@@ -1,4 +1,4 @@
-"""How soon what is wrong is answered, and what is right is let in: seconds next to the counts that the tests hold.
+"""How soon what is wrong is answered, and what is right is let in: seconds, and the counts that the tests hold.
 
 python benchmarks/answers.py        prints the slowest of each; exit code 1 if one is slower than its bound
 """

@@ -2,7 +2,7 @@
 
     python benchmarks/batch.py [--scenes 200] [--repeat 3] [--quiet SECONDS] [--json FILE]
     python benchmarks/batch.py --dask [--scenes 600] [--repeat 3] [--sample 600] [--workers 1]
-                                        the CPU of dask next to that of the loop over a sample of the scenes, in pairs
+                                        the CPU of dask compared with the loop over a sample of the scenes, in pairs
 
 The scenes are windows of sample_data/scene.tif with the RPC moved along, so that each is a scene of its own. Every way
 starts with an empty output folder; the time is that of the whole call, the start of the processes included. A run that
@@ -258,7 +258,7 @@ def main() -> None:
         print(f"  {way:<11} {seconds:7.2f} s   {1000 * seconds / given.scenes:6.1f} ms a scene")
     print(f"processes beside sequential: {found['processes_speedup']:.2f} times as fast")
     print(f"dask beside processes:       {found['dask_beside_processes']:.2f} of the time")
-    print(f"overhead next to the loop:    {found['overhead_ms_per_scene']:.1f} ms CPU a scene, "
+    print(f"overhead beyond the loop:     {found['overhead_ms_per_scene']:.1f} ms CPU a scene, "
           f"{found['overhead_wall_ms_per_scene']:.1f} ms wall")  # fmt: skip
     print(f"a scene that is there:       {found['unchanged_ms_per_scene']:.2f} ms")
     print(f"killed and resumed:          {found['killed_and_resumed']}")

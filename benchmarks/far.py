@@ -1,4 +1,4 @@
-"""The whole job on files of a store, each of whose answers takes its time, next to that on files of this machine.
+"""The whole job on files of a slow store, compared with the same job on files of this machine.
 
     python benchmarks/far.py --side 12000 --delay 0.05 --pairs 3 --kind s3
 

@@ -220,7 +220,7 @@ def write_dem(path: Path, waves: Array, random: np.random.Generator) -> DemSurfa
     return open_dem(path, "ellipsoid", fill="mask").with_sigma(DEM_SIGMA)
 
 
-# -- the result next to the truth ------------------------------------------------------------------------------------
+# -- the result compared with the truth ------------------------------------------------------------------------------
 
 
 def off_by(flight: Flight, models: Any) -> Array:

@@ -2,7 +2,7 @@
 
 python benchmarks/heights.py              seven chains of six frames at each convergence
 python benchmarks/heights.py --seeds 20   more of them
-python benchmarks/heights.py --bound 20   instead: errors next to the least that any estimate can have
+python benchmarks/heights.py --bound 20   instead: errors compared with the least that any estimate can have
 python benchmarks/heights.py --draws 60   instead: found errors over their sigmas, for several errors of the DEM
 python benchmarks/heights.py --sizes 3    instead: 3 to 60 images of each sensor, without control and with some in one
 python benchmarks/heights.py --blocks 500 instead: blocks of all kinds, pairs that are apart without a warning

@@ -93,7 +93,7 @@ def told(rows: list[dict[str, Any]]) -> str:
 
 
 def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
-    """Return what `ortho stack` finds of one drawn stack, next to the usual way."""
+    """Return what `ortho stack` finds of one drawn stack, and what the usual way finds."""
     rasters = Rasters(
         seed=seed, side=given.side, dates=given.dates, interval=given.interval, error=20.0, seasons=4, clouds=0.3,
         noise=0.02, moving=given.moving, rate=1.0, ground=("country", "woods", "town")[seed % 3],

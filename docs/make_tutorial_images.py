@@ -156,7 +156,7 @@ def matches(path: Path) -> None:
 
 
 def reference_off(path: Path) -> None:
-    """Draw the residuals of surveyed points next to the model that was matched."""
+    """Draw the residuals of surveyed points against the model that was matched."""
     model = op.read_rpc("relative/scene_RPC.TXT")
     points = op.read_points("sample_data/gcps.geojson")
     off = points.image - model.ground_to_image(points.ground)

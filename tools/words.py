@@ -43,7 +43,7 @@ PHRASES = (
     "asked for were",
     "assumed is",
     "begin anew",
-    "next to other programs",
+    "beside other programs",
     "by hand of",
     "by the network",
     "by this indication",

@@ -2,7 +2,7 @@ r"""An error that the ground of many points of a block has in common, as matches
 
 Their known ground is off by one unknown vector in plan, :math:`c \sim N(0, I)` in units of its standard deviation. By
 itself it is seen by nothing: images, ties and matches all move with it. Other control, and prior knowledge of the
-parameters, tell of it. So it is one more pair of unknowns of the block, solved for next to the others: with misfits
+parameters, tell of it. So it is one more pair of unknowns of the block, solved for with the others: with misfits
 :math:`r` (over their sigmas) at a minimum, and :math:`U` what one sigma of it takes off them, a step of all other
 unknowns takes :math:`H U` off and leaves :math:`V = (I - H) U`, and
 

@@ -153,7 +153,7 @@ class BlockFit:
     `object_residuals` ``(N, 3)`` are known minus adjusted ground in metres east, north, up. `ground` is lon, lat, h
     (EPSG:4979), NaN where the rays do not determine it; `ground_covariance` ``(N, 3, 3)`` m², east, north, up.
     `parameters` are (image, name) in the order of `covariance` ``(P, P)``, which `cofactors` has in parts. `sigma0` is
-    the factor of the stated sigmas of measurements (None without redundancy), `variances` has it next to the sigmas of
+    the factor of the stated sigmas of measurements (None without redundancy), `variances` has it with the sigmas of
     ground that states none. Covariances contain that these are uncertain, so that 1.96 sigmas are right 95 times of
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in

@@ -175,7 +175,7 @@ def corrected(head: Headline, notices: Iterable[Mapping[str, Any]]) -> Headline:
 
 
 def unsettled(report: SceneReport) -> str | None:
-    """Say next to the figure that it tells no accuracy yet, and what it is without the points that contradict."""
+    """Return what the headline adds: its figure is no accuracy yet; the figure without contradicting points."""
     for one in report.adjustment.notices:
         if one["code"] == "checks-apart":
             rest = one.get("rest")

@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.errors.texts import Setting, Text
 
-#: Bytes of address space that any command needs next to its windows: libraries, compiled kernels, grids of PROJ.
+#: Bytes of address space that any command needs in addition to its windows: libraries, compiled kernels, grids of PROJ.
 LEAST = 256 << 20
 #: Bytes of address space that a thread takes: its stack and its part of the heap.
 _PER_THREAD = 72 << 20
@@ -102,7 +102,7 @@ def _address_space() -> int | None:
 
 
 def startable_threads(wanted: int) -> int:
-    """Return how many threads can run at once next to those that do, found by starting them.
+    """Return how many more threads can run at once, found by starting them.
 
     At most `wanted`, and `MOST_THREADS`.
 

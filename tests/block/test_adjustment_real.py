@@ -1,4 +1,4 @@
-"""Bundle adjustment and intersection of real Pleiades images, next to the results of other programs."""
+"""Bundle adjustment and intersection of real Pleiades images, compared with the results of other programs."""
 
 from __future__ import annotations
 

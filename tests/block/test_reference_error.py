@@ -179,7 +179,7 @@ def test_few_surveyed_points_are_no_gross_errors_beside_many_matches(rpcs: dict[
     assert said["sigma_m"] == 4.0
     np.testing.assert_allclose(said["estimate_m"], (5.0, 3.0), atol=3.5 * max(said["estimate_sigma_m"]))
     assert max(said["estimate_sigma_m"]) < 0.3
-    # What is left of the matches' ground next to the estimate is nothing of 6 m.
+    # The estimate explains the 6 m, so little is left in the ground of the matches.
     assert found.object_rms("control").plan < 1.5
     plain = adjust(starts(rpcs), replace(points, sigma_common=None))
     assert {"s0", "s1", "s2", "s3", "s4"} <= {one.point for one in plain.rejected}

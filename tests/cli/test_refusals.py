@@ -54,7 +54,7 @@ def test_every_typed_option_names_itself_and_a_remedy():
 
 @pytest.mark.parametrize("command", ["fit", "rectify", "export"])
 def test_texts_and_files_that_are_none(tiny, tmp_path, command):
-    """Options whose values are looked at when the command works, each one bad next to the others that are sound."""
+    """Options whose values are checked when the command runs: one is bad, the others are sound."""
     given = {"--output": str(tmp_path / "out"), "--gcps": str(tiny.gcps), "--points-crs": "EPSG:4979",
              "--points-vertical": "ellipsoid", "--dem": str(tiny.dem), "--dem-vertical": "ellipsoid"}  # fmt: skip
     params = [one for one in cli.get_command(click.Context(cli), command).params if isinstance(one, click.Option)]

@@ -20,7 +20,7 @@ from ortho_pipeline import commands, files
 from ortho_pipeline.errors import TooFewPoints
 from ortho_pipeline.options import PointOptions, SurfaceOptions
 
-# -- checksums next to the work ---------------------------------------------------------------------------------------
+# -- checksums during the work ----------------------------------------------------------------------------------------
 
 
 def test_no_thread_outlives_a_command_that_fails(tiny, tmp_path):

@@ -22,7 +22,7 @@ from ortho_pipeline.runtime.compilation import cache_folders
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
-#: Python runs a module of this name first. Locks of bytes are what Windows has; here `lockf` stands in for them.
+#: Python imports the module `sitecustomize` at start-up. Windows locks bytes of a file; here `lockf` does that.
 WITHOUT = """
 import builtins, errno, os, signal, subprocess, sys, types  # subprocess asks for msvcrt: before there is one
 GONE = {"fcntl", "resource"}

@@ -1,4 +1,4 @@
-"""Predicted accuracy next to the truth of simulated scenes: a small part of benchmarks/accuracy.py, and real points."""
+"""Predicted accuracy compared with the truth of simulated scenes (benchmarks/accuracy.py in small), and real points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real aerial and drone frames: our projection next to the orientations given, and orthos that have to agree."""
+"""Real aerial and drone frames: our projection compared with the given orientations, and orthos that have to agree."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ STATISTICS = ("bias_east", "bias_north", "rmse", "ce90")
 
 
 def trial(seed: int, *, elsewhere: bool) -> dict[str, Any]:
-    """Return what `ortho verify` says of one pair, next to the truth; lengths in px of the coarser image."""
+    """Return what `ortho verify` finds for one pair, compared with the truth; lengths in px of the coarser image."""
     pair: Pair = drawn(seed, elsewhere=elsewhere)
     coarse = max(pair.ortho.gsd, pair.reference.gsd)
     row: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""What is kept of files that lie elsewhere: whole, with its record, whatever ends or stands next to the process."""
+"""The local cache of remote files: each is complete and has its record, even if a process is killed or others run."""
 
 from __future__ import annotations
 

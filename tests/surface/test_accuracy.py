@@ -58,7 +58,7 @@ def opened(made, **options):
 
 
 def test_the_error_of_each_class_of_slope_is_found(made):
-    """A shift of 4 m in plan is 4 m times the tangent of the slope in height, next to the bias of 1.5 m."""
+    """A shift of 4 m in plan is 4 m times the tangent of the slope in height, in addition to the bias of 1.5 m."""
     ground, crs, ids = read_check_heights(made / "heights.csv")
     found = check_dem(opened(made), ground, crs, ids)
     assert found.overall.count == 600

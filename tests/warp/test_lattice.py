@@ -1,4 +1,4 @@
-"""The bound on the warp's error is a bound: every output pixel next to the exact model, with nasty models.
+"""The bound on the warp's error is a bound: every output pixel compared with the exact model, for nasty models.
 
 The source is a ramp whose pixels are their own coordinates, computed as it is read, so that images may be as large as
 real ones. Warped bilinearly it gives the image coordinates that the warp used.
@@ -279,7 +279,7 @@ def test_the_heights_of_a_block_hold_what_a_cubic_dem_makes_between_its_samples(
 
 
 def test_a_block_more_takes_few_calls(tmp_path, calls):
-    """What a tile takes next to its pixels is the interpreter's work most of all."""
+    """What a tile takes in addition to its pixels is mostly the interpreter's work."""
     model, surface = Rising(0.0, 1), mountains(tmp_path)
     grid = Grid(UTM, EAST - 250.3, NORTH + 250.2, 0.5, 0.5, 1024, 1024)
     lattices = Lattices(model, surface, grid, (6000, 6000), tolerance=TOLERANCE, reach=1, averages=False)

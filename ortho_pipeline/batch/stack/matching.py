@@ -20,7 +20,7 @@ from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 
-#: Error that all matches of a pair share (px of the coarser image), as in `ortho verify`.
+#: Error that all matches of a pair share, px of a chip; more than `ortho verify` assumes.
 _ALIKE = 0.0075
 _BYTES = 100_000_000
 

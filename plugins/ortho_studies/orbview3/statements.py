@@ -31,7 +31,7 @@ PAPER_REMOVED = {"471890": {"col_per_col", "col_per_row"}, "443940": {"col_per_r
 
 @dataclass
 class Findings:
-    """Outcome next to the numbers of the tables, over all realisations."""
+    """Outcome compared with the numbers of the tables, over all realisations."""
 
     numbers: dict[str, list[float]] = field(default_factory=dict)
     pruned: dict[str, Counter[str]] = field(default_factory=dict)
@@ -231,7 +231,7 @@ def edges(enhancement: float) -> dict[str, tuple[float, float]]:
     Returns
     -------
     dict
-        ``fwhm`` (full width of the line spread at half its height) and ``blur`` (Gaussian next to the aperture).
+        ``fwhm`` (full width of the line spread at half its height) and ``blur`` (Gaussian in addition to the aperture).
     """
     size, oversampling, angle = 400, 4, np.radians(7.0)
     at = (np.arange(size * oversampling) + 0.5) / oversampling - size / 2
