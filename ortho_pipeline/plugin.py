@@ -120,9 +120,11 @@ if TYPE_CHECKING:
     from ortho_pipeline.options import PointOptions as PointOptions
     from ortho_pipeline.options import SceneOptions as SceneOptions
     from ortho_pipeline.options import SurfaceOptions as SurfaceOptions
+    from ortho_pipeline.options import height_range as height_range
     from ortho_pipeline.options import is_usable as is_usable
     from ortho_pipeline.options import number_of as number_of
     from ortho_pipeline.options import numbers_of as numbers_of
+    from ortho_pipeline.options import pose_sigmas as pose_sigmas
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
     from ortho_pipeline.points import write_points as write_points
@@ -276,9 +278,11 @@ _NAMES = {
         "PointOptions",
         "SceneOptions",
         "SurfaceOptions",
+        "height_range",
         "is_usable",
         "number_of",
         "numbers_of",
+        "pose_sigmas",
     ),
     "errors.texts": (
         "Setting",

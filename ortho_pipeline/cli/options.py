@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import (
+    GROUPS,
     BlockOptions,
     MatchOptions,
     MosaicOptions,
@@ -83,6 +84,16 @@ def click_options(group: str, options: type, *names: str) -> Decorator:
         return command
 
     return decorate
+
+
+def grouped_options(grouped: Mapping[str, Any], *groups: str) -> dict[str, Any]:
+    """Return the values of `click_options` as objects of their groups."""
+    options: dict[str, Any] = {}
+    for group in groups:
+        values = {key.removeprefix(f"{group}_"): value for key, value in grouped.items() if key.startswith(f"{group}_")}
+        # click gives an empty tuple for an option that was not given.
+        options[group] = GROUPS[group](**{key: value for key, value in values.items() if value != ()})
+    return options
 
 
 def _help(option: Option) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +11,7 @@ from ortho_pipeline.cli.machine.browser import open_option, require_page
 from ortho_pipeline.cli.options import (
     click_options,
     folder_option,
+    grouped_options,
     json_option,
     matching_options,
     optional_folder,
@@ -19,7 +19,7 @@ from ortho_pipeline.cli.options import (
 )
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result
-from ortho_pipeline.options import GROUPS, MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.option import RESAMPLING
 
 #: Exit code of `ortho verify` if an ortho does not meet a requirement (--require).
@@ -151,13 +151,3 @@ def align(
         **groups,
     )
     print_result(result, as_json)
-
-
-def grouped_options(grouped: Mapping[str, Any], *groups: str) -> dict[str, Any]:
-    """Return single options as objects of their groups."""
-    options: dict[str, Any] = {}
-    for group in groups:
-        values = {key.removeprefix(f"{group}_"): value for key, value in grouped.items() if key.startswith(f"{group}_")}
-        # click gives an empty tuple for an option that was not given.
-        options[group] = GROUPS[group](**{key: value for key, value in values.items() if value != ()})
-    return options

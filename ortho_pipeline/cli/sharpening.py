@@ -7,10 +7,10 @@ from typing import Any
 
 import click
 
-from ortho_pipeline.cli.options import click_options, folder_option, json_option
+from ortho_pipeline.cli.options import click_options, folder_option, grouped_options, json_option
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, progress
-from ortho_pipeline.options import GROUPS, OutputOptions, SceneOptions
+from ortho_pipeline.options import OutputOptions, SceneOptions
 
 
 def weights_of(ctx: click.Context, _: click.Parameter, text: str | None) -> tuple[float, ...] | None:
@@ -61,11 +61,7 @@ def sharpen(
     """
     from ortho_pipeline.commands.sharpening import sharpen as sharpening
 
-    options: dict[str, Any] = {}
-    for group in ("scene", "output"):
-        values = {key.removeprefix(f"{group}_"): value for key, value in grouped.items() if key.startswith(f"{group}_")}
-        # click gives an empty tuple for an option that was not given.
-        options[group] = GROUPS[group](**{key: value for key, value in values.items() if value != ()})
+    options = grouped_options(grouped, "scene", "output")
     with progress() as advance:
         result = sharpening.sharpen(
             pan, multispectral, folder, weights=weights, ratio=ratio, progress=advance, **options

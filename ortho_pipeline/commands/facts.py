@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import shlex
 import sys
 import traceback
 from collections.abc import Iterator
@@ -28,6 +27,7 @@ from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.files import write_json, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.files.locations import located
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.geodesy.proj_grids import fetch_missing, grids, proj_info
@@ -98,7 +98,7 @@ def sensor_test(
         )
     origin = plugins.provenance(sensor.name)
     require_declared(sensor, options.sensor_options, image)
-    again = f"ortho sensors --test {sensor.name} {shlex.quote(str(image))}"
+    again = f"ortho sensors --test {sensor.name} {typed(image)}"
     remedy = f"correct the plugin, or give an image of its sensor; then test again: `{again}`"
     with _contract_of(sensor, remedy):
         scene = check_sensor(sensor, image, **options.sensor_options)

@@ -280,20 +280,22 @@ class Registry:
 
 def _format_faults(offer: Format | BlockFormat, endings: dict[str, str]) -> Iterator[str]:
     """Yield the faults of an offered format; `endings` are those in use, with the names of their formats."""
-    of_block = isinstance(offer, BlockFormat)
-    ending = offer.file if isinstance(offer, BlockFormat) else offer.ending
+    if isinstance(offer, BlockFormat):
+        ending, pattern, what, action = offer.file, _FILE, "file must be like 'name.json'", "text"
+        named = bool(offer.models) and all(isinstance(one, str) for one in offer.models)
+    else:
+        ending, pattern, what, action = offer.ending, _ENDING, "ending must be like '_name.json'", "write"
+        named = True
     if not isinstance(offer.name, str) or not _TYPED.fullmatch(offer.name):
         yield f"{offer.name!r} is not a valid format name; use lower case, digits and dashes"
     elif not isinstance(offer.title, str) or not offer.title.strip():
         yield f"format {offer.name!r}: the title is empty"
-    elif of_block and not (isinstance(ending, str) and _FILE.fullmatch(ending)):
-        yield f"format {offer.name!r}: the file must be like 'name.json', not {ending!r}"
-    elif not of_block and not (isinstance(ending, str) and _ENDING.fullmatch(ending)):
-        yield f"format {offer.name!r}: the ending must be like '_name.json', not {ending!r}"
-    elif isinstance(offer, BlockFormat) and not (offer.models and all(isinstance(one, str) for one in offer.models)):
+    elif not isinstance(ending, str) or not pattern.fullmatch(ending):
+        yield f"format {offer.name!r}: the {what}, not {ending!r}"
+    elif not named:
         yield f"format {offer.name!r}: models must name formats"
-    elif not callable(offer.text if isinstance(offer, BlockFormat) else offer.write):
-        yield f"format {offer.name!r}: {'text' if of_block else 'write'} must be callable"
+    elif not callable(getattr(offer, action)):
+        yield f"format {offer.name!r}: {action} must be callable"
     elif (other := endings.setdefault(ending.casefold(), offer.name)) != offer.name:
         yield f"format {offer.name!r}: the format {other!r} has the same ending {ending!r}"
 

@@ -26,10 +26,12 @@ from ortho_pipeline.options.option import (
     Kind,
     Option,
     PathLike,
+    height_range,
     is_usable,
     number_of,
     numbers_of,
     options_of,
+    pose_sigmas,
 )
 from ortho_pipeline.options.output import OutputOptions
 
@@ -51,8 +53,10 @@ __all__ = [
     "PointTable",
     "SceneOptions",
     "SurfaceOptions",
+    "height_range",
     "is_usable",
     "number_of",
     "numbers_of",
     "options_of",
+    "pose_sigmas",
 ]

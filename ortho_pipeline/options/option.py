@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, Literal, TypeVar, get_args
 
+from ortho_pipeline.errors import InputError
+
 #: Convention of a points file for the first pixel -> offset to (0, 0) at its outer corner.
 PIXEL_ORIGINS = {
     "corner": 0.0,  # (0, 0) is the outer corner of the first pixel: GDAL, QGIS, this package
@@ -78,6 +80,46 @@ def numbers_of(text: str) -> list[float]:
     [10.0, 12.5]
     """
     return [number_of(part) for part in text.split(",")]
+
+
+def height_range(text: str) -> tuple[float, float]:
+    """Return the lowest and the highest ground (m) that a user states as ``low,high``.
+
+    Raises
+    ------
+    InputError
+        If these are not two rising numbers.
+
+    Examples
+    --------
+    >>> height_range("0,800")
+    (0.0, 800.0)
+    """
+    numbers = numbers_of(text)
+    if len(numbers) != 2 or not numbers[0] < numbers[1]:
+        raise InputError(
+            f"{text!r} is not a height range", field="heights", remedy="give low,high in metres, such as heights=0,800"
+        )
+    return numbers[0], numbers[1]
+
+
+def pose_sigmas(text: str) -> tuple[float, float]:
+    """Return the standard deviations of positions (m) and angles (degrees) that a user states as ``metres,degrees``.
+
+    Raises
+    ------
+    InputError
+        If these are not two positive numbers.
+
+    Examples
+    --------
+    >>> pose_sigmas("0.1,0.02")
+    (0.1, 0.02)
+    """
+    numbers = numbers_of(text)
+    if len(numbers) != 2 or not all(number > 0 for number in numbers):
+        raise InputError(f"{text!r} are not two standard deviations", field="sigmas", remedy="give metres,degrees")
+    return numbers[0], numbers[1]
 
 
 @dataclass(frozen=True)

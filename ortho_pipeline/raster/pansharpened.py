@@ -22,7 +22,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, as_written, keep_off_nodata, value_range
-from ortho_pipeline.raster.regridded import warped_bounds
+from ortho_pipeline.raster.regridded import coarser, part_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource, first_line
 
 #: Part of a panchromatic pixel by which edges of pixels of both grids may differ: rounding of coordinates, no more.
@@ -68,13 +68,13 @@ class CommonExtent:
         upper, lower = max(0, math.ceil(top - _SAME)), min(pan.height, math.floor(bottom + _SAME))
         if not (all(map(math.isfinite, (left, right, top, bottom))) and first < last and upper < lower):
             raise InputError("the panchromatic and the multispectral ortho do not overlap")
-        grid = _part(pan, first, upper, last - first, lower - upper)
+        grid = part_of(pan, first, upper, last - first, lower - upper)
         ratio = _nesting(pan, colours, left, top)
         if not ratio:
             return cls(grid, grid, 0)
         across = _widened(first, last, round(left), round(right), ratio)
         down = _widened(upper, lower, round(top), round(bottom), ratio)
-        return cls(grid, _part(pan, across[0], down[0], across[1] - across[0], down[1] - down[0]), ratio)
+        return cls(grid, part_of(pan, across[0], down[0], across[1] - across[0], down[1] - down[0]), ratio)
 
 
 def _widened(first: int, last: int, begin: int, end: int, ratio: int) -> tuple[int, int]:
@@ -82,11 +82,6 @@ def _widened(first: int, last: int, begin: int, end: int, ratio: int) -> tuple[i
     low = begin + ((first - begin) // ratio - _REACH) * ratio
     high = begin + (-(-(last - begin) // ratio) + _REACH) * ratio
     return max(low, begin), min(high, end)
-
-
-def _part(grid: Grid, left: int, top: int, width: int, height: int) -> Grid:
-    """Return a window of a grid, which may reach outside."""
-    return Grid(grid.crs, grid.left + left * grid.dx, grid.top - top * grid.dy, grid.dx, grid.dy, width, height)
 
 
 def _nesting(pan: Grid, colours: Grid, left: float, top: float) -> int:
@@ -202,15 +197,7 @@ class Pansharpened:
         whole, coarse = self.overlap.whole, self.overlap.whole
         if self.overlap.ratio:
             factor = self.overlap.ratio
-            coarse = Grid(
-                whole.crs,
-                whole.left,
-                whole.top,
-                whole.dx * factor,
-                whole.dy * factor,
-                whole.width // factor,
-                whole.height // factor,
-            )
+            coarse = coarser(whole, factor, whole.width // factor, whole.height // factor)
         pan = self._floating(self._pan, self._grids[0], whole, "near")
         colours = self._floating(self._colours, self._grids[1], coarse, "near" if self.overlap.ratio else "cubic")
         return self._sharpened(pan, colours, repr(_EMPTY))

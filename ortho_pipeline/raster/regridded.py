@@ -179,6 +179,16 @@ class Regridded:
             )
 
 
+def part_of(grid: Grid, left: int, top: int, width: int, height: int) -> Grid:
+    """Return a window of a grid, which may reach outside."""
+    return Grid(grid.crs, grid.left + left * grid.dx, grid.top - top * grid.dy, grid.dx, grid.dy, width, height)
+
+
+def coarser(grid: Grid, factor: int, width: int, height: int) -> Grid:
+    """Return a grid with the corner of another one, each pixel of which is `factor` x `factor` of its pixels."""
+    return Grid(grid.crs, grid.left, grid.top, grid.dx * factor, grid.dy * factor, width, height)
+
+
 def warped_bounds(grid: Grid, crs: pyproj.CRS) -> tuple[float, float, float, float]:
     """Return xmin, ymin, xmax and ymax of a grid in another CRS; infinite if it is nowhere there."""
     if grid.crs == crs:

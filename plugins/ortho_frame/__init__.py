@@ -33,9 +33,10 @@ from ortho_pipeline.plugin import (
     Vertical,
     exterior_sigmas,
     ground_transform,
+    height_range,
     hookimpl,
-    numbers_of,
     place,
+    pose_sigmas,
     priors_at,
 )
 
@@ -293,27 +294,14 @@ def _heights(text: str | None, camera: float) -> tuple[float, float]:
         # Only one thing is known: the ground is below the camera.
         low = min(-100.0, camera - 1000.0)
         return low, min(9000.0, camera - 0.1 * (camera - low))
-    low, high = _pair(text)
-    if not low < high:
-        raise InputError(
-            f"{text!r} is not a height range", field="heights", remedy="give low,high in metres, such as heights=0,800"
-        )
-    return low, high
+    return height_range(text)
 
 
 def _priors(model: FrameCamera, sigmas: str | None) -> dict[str, Prior]:
     if sigmas is None:
         return {}
-    metres, degrees = _pair(sigmas)
-    if not (metres > 0 and degrees > 0):
-        raise InputError(f"{sigmas!r} are not two standard deviations", field="sigmas", remedy="give metres,degrees")
+    metres, degrees = pose_sigmas(sigmas)
     return priors_at(model, exterior_sigmas(metres, math.radians(degrees)))
-
-
-def _pair(text: str) -> tuple[float, float]:
-    """Return two numbers; NaN if there are not two."""
-    numbers = numbers_of(text)
-    return (numbers[0], numbers[1]) if len(numbers) == 2 else (math.nan, math.nan)
 
 
 def _facts(model: FrameCamera, pose: Pose | Shot, heights: str | None) -> dict[str, object]:

@@ -29,8 +29,8 @@ from ortho_pipeline.plugin import (
     Text,
     ground_transform,
     has_rpc,
+    height_range,
     hookimpl,
-    numbers_of,
     open_dataset,
     place,
     priors_at,
@@ -170,14 +170,7 @@ def _plane(dataset: gdal.Dataset, position: Position, source: SourceImage, heigh
 def _heights(text: str | None, position: Position, vendor: RPC | None) -> tuple[float, float]:
     plane = position.reference_height or 0.0
     if text is not None:
-        numbers = numbers_of(text)
-        if len(numbers) != 2 or not numbers[0] < numbers[1]:
-            raise InputError(
-                f"{text!r} is not a height range",
-                field="heights",
-                remedy="give low,high in metres, such as heights=0,800",
-            )
-        low, high = numbers
+        low, high = height_range(text)
     else:
         low, high = vendor.height_range if vendor else (plane - HALF_RANGE, plane + HALF_RANGE)
     return min(low, plane), max(high, plane)

@@ -26,9 +26,10 @@ from ortho_pipeline.plugin import (
     enu_from_ecef,
     exterior_sigmas,
     geocentric,
+    height_range,
     hookimpl,
     number_of,
-    numbers_of,
+    pose_sigmas,
     priors_at,
 )
 
@@ -132,12 +133,7 @@ def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> 
     if text is None:
         low, high = _BELOW if above_takeoff is None else (part * above_takeoff for part in _OF_RELATIVE)
         return altitude - low, altitude - high
-    low, high = _pair(text)
-    if not low < high:
-        raise InputError(
-            f"{text!r} is not a height range", field="heights", remedy="give low,high in metres, such as heights=0,800"
-        )
-    return low, high
+    return height_range(text)
 
 
 def _priors(
@@ -150,12 +146,8 @@ def _priors(
     """
     (plan, height), angle = pose.sigmas, ANGLE
     if sigmas is not None:
-        plan, angle = _pair(sigmas)
+        plan, angle = pose_sigmas(sigmas)
         height = plan
-        if not (plan > 0 and angle > 0):
-            raise InputError(
-                f"{sigmas!r} are not two standard deviations", field="sigmas", remedy="give metres,degrees"
-            )
     known = exterior_sigmas(plan, math.radians(angle))
     height = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
     if height < camera.sigma * above_ground:
@@ -211,9 +203,3 @@ def _width(text: str | None) -> float | None:
             f"{text!r} is not the width of a sensor", field="sensor_width", remedy="give millimetres, such as 13.2"
         )
     return width
-
-
-def _pair(text: str) -> tuple[float, float]:
-    """Return two numbers; NaN if there are not two."""
-    numbers = numbers_of(text)
-    return (numbers[0], numbers[1]) if len(numbers) == 2 else (math.nan, math.nan)

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ortho_windows import SIDE, tapered, windows
 from osgeo import gdal
 from skimage.registration import phase_cross_correlation
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.surface.writing import write_dem
-
-SIDE, STEP = 64, 32
 
 
 def run(*args: str | Path, code: int = 0) -> str:
@@ -25,26 +24,11 @@ def run(*args: str | Path, code: int = 0) -> str:
     return done.stdout
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
-    dataset = gdal.Open(str(path))
-    pixels = np.atleast_3d(dataset.ReadAsArray().astype(float).T).mean(axis=2).T
-    return pixels, dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0, dataset.GetGeoTransform()
-
-
 def shifts(first: Path, second: Path) -> np.ndarray:
     """Return by how much (px, columns and rows) windows of two orthos on one grid are shifted against each other."""
-    (one, shown, place), (other, shown_too, there) = _read(first), _read(second)
-    right, down = round((there[0] - place[0]) / place[1]), round((there[3] - place[3]) / place[5])
-    found, taper = [], np.outer(np.hanning(SIDE), np.hanning(SIDE))
-    rows = range(max(0, down), min(one.shape[0], other.shape[0] + down) - SIDE, STEP)
-    columns = range(max(0, right), min(one.shape[1], other.shape[1] + right) - SIDE, STEP)
-    for row, column in itertools.product(rows, columns):
-        here = np.s_[row : row + SIDE, column : column + SIDE]
-        far = np.s_[row - down : row - down + SIDE, column - right : column - right + SIDE]
-        if not (shown[here].all() and shown_too[far].all()):
-            continue
-        windows = [(part - part.mean()) * taper for part in (one[here], other[far])]
-        shift, error, _ = phase_cross_correlation(*windows, upsample_factor=50, normalization=None)
+    found = []
+    for pair in windows(first, second, step=32):
+        shift, error, _ = phase_cross_correlation(*map(tapered, pair), upsample_factor=50, normalization=None)
         if error < 0.6 and np.abs(shift).max() < SIDE / 4:
             found.append(shift[::-1])
     assert len(found) >= 20

@@ -43,9 +43,9 @@ class Placed:
                     remedy="reproject it to the same CRS, or leave it out",
                 )
         first = models[0]
-        step = np.array(_pixel(first))
-        corners = np.concatenate([_corners(model) for model in models])
-        origin = _corners(first)[:, 0].min(), _corners(first)[:, 1].max()
+        step = np.array(first.pixel)
+        corners = np.concatenate([model.corners for model in models])
+        origin = first.corners[:, 0].min(), first.corners[:, 1].max()
         before = np.ceil((origin[0] - corners[:, 0].min()) / step[0] - 1e-6)
         above = np.ceil((corners[:, 1].max() - origin[1]) / step[1] - 1e-6)
         left, top = origin[0] - before * step[0], origin[1] + above * step[1]
@@ -64,7 +64,7 @@ class Placed:
 
     def covered(self, dates: Sequence[Dated]) -> tuple[Array, Array]:
         """Return the lowest and highest place (px) of the orthos."""
-        places = np.concatenate([self.at(_corners(map_grid_of(one))) for one in dates])
+        places = np.concatenate([self.at(map_grid_of(one).corners[:, :2]) for one in dates])
         return places.min(axis=0), places.max(axis=0)
 
     def corrected(self, one: Dated, stack: AdjustedStack, date: int) -> ImageCorrection:
@@ -102,16 +102,4 @@ def geotransform_of(model: ImageCorrection) -> tuple[float, ...]:
 
 def pixel_of(one: Dated) -> float:
     """Return the size of a pixel of an ortho, in units of its map."""
-    return float(np.sqrt(np.prod(_pixel(map_grid_of(one)))))
-
-
-def _pixel(model: MapGrid) -> tuple[float, float]:
-    _, a, b, _, c, d = model.geotransform
-    return float(np.hypot(a, c)), float(np.hypot(b, d))
-
-
-def _corners(model: MapGrid) -> Array:
-    """Return the map coordinates ``(4, 2)`` of the corners of an image."""
-    width, height = model.size
-    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-    return model.image_to_ground(corners, 0.0)[:, :2]
+    return float(np.sqrt(np.prod(map_grid_of(one).pixel)))

@@ -8,8 +8,7 @@ from typing import Any
 import click
 
 from ortho_pipeline.cli.machine.browser import open_option
-from ortho_pipeline.cli.options import click_options, folder_option, json_option
-from ortho_pipeline.cli.orthos import grouped_options
+from ortho_pipeline.cli.options import click_options, folder_option, grouped_options, json_option
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, progress
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions

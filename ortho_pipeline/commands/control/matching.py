@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ortho_pipeline.commands.control.search import Search, default_search, rotation_of, search_of
+from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
@@ -278,13 +279,7 @@ def open_reference_views(
         raise InputError(
             "matching needs heights",
             field="surface.dem",
-            remedy=Text(
-                "give ",
-                Setting("surface.dem", "FILE"),
-                ", or ",
-                Setting("surface.height", "METRES"),
-                " above the ellipsoid for flat ground",
-            ),
+            remedy=GIVE_HEIGHTS,
         )
     if not scene.models:
         raise InputError(

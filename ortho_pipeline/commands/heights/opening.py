@@ -23,6 +23,14 @@ from ortho_pipeline.surface.dem import DemSurface, open_dem
 from ortho_pipeline.surface.dem_mosaic import matching_files
 from ortho_pipeline.surface.flat import FlatSurface
 
+#: Remedy where heights are missing.
+GIVE_HEIGHTS = Text(
+    "give ",
+    Setting("surface.dem", "FILE"),
+    ", or ",
+    Setting("surface.height", "METRES"),
+    " above the ellipsoid for flat ground",
+)
 #: No height is less certain (m) than that: the Earth has none of that size.
 _LARGEST_SIGMA = 10_000.0
 
@@ -163,13 +171,7 @@ def require_heights(options: SurfaceOptions) -> None:
         raise InputError(
             "no heights given",
             field="surface.dem",
-            remedy=Text(
-                "give ",
-                Setting("surface.dem", "FILE"),
-                ", or ",
-                Setting("surface.height", "METRES"),
-                " above the ellipsoid for flat ground",
-            ),
+            remedy=GIVE_HEIGHTS,
         )
 
 

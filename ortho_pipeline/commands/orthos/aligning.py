@@ -230,7 +230,7 @@ def _output_grid(measured: MeasuredOrtho) -> Grid:
     if skew == other == 0 and dx > 0 > dy:
         return Grid(crs, left, top, dx, -dy, *size)
     low, high = model.corners[:, :2].min(axis=0), model.corners[:, :2].max(axis=0)
-    return Grid.of_extent(crs, (*low, *high), (float(np.hypot(dx, other)), float(np.hypot(skew, dy))))
+    return Grid.of_extent(crs, (*low, *high), model.pixel)
 
 
 def _after(

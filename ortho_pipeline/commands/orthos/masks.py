@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
-from ortho_pipeline.raster.regridded import Regridded, grid_of
-from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.raster.regridded import Regridded, coarser, grid_of
+from ortho_pipeline.raster.source import RasterSource
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Masked(Intensity):
         with self._lock:
             if factor not in self._reduced_masks:
                 size = -(-grid.width // factor), -(-grid.height // factor)
-                coarse = Grid(grid.crs, grid.left, grid.top, grid.dx * factor, grid.dy * factor, *size)
+                coarse = coarser(grid, factor, *size)
                 self._reduced_masks[factor] = [
                     Regridded(mask.path, coarse, resampling="nearest", **self._opened.access) for mask in self._masks
                 ]

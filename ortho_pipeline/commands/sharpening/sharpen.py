@@ -29,7 +29,7 @@ from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, refuse_empty
 from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened, colour_bands
-from ortho_pipeline.raster.regridded import Regridded, grid_of, warped_bounds
+from ortho_pipeline.raster.regridded import Regridded, coarser, grid_of, part_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
 
@@ -181,13 +181,13 @@ class OrthoPair:
         if self.ratio > 1.5 * _own_ratio(self.grids):
             factor = round(self.ratio)
             size = max(1, grid.width // factor), max(1, grid.height // factor)
-            return Grid(grid.crs, grid.left, grid.top, grid.dx * factor, grid.dy * factor, *size)
+            return coarser(grid, factor, *size)
         xmin, ymin, xmax, ymax = warped_bounds(grid, own.crs)
         left, right = math.ceil((xmin - own.left) / own.dx - 1e-6), math.floor((xmax - own.left) / own.dx + 1e-6)
         top, bottom = math.ceil((own.top - ymax) / own.dy - 1e-6), math.floor((own.top - ymin) / own.dy + 1e-6)
         left, top = max(left, 0), max(top, 0)
         size = max(1, min(right, own.width) - left), max(1, min(bottom, own.height) - top)
-        return Grid(own.crs, own.left + left * own.dx, own.top - top * own.dy, own.dx, own.dy, *size)
+        return part_of(own, left, top, *size)
 
     def samples(self) -> list[Sample]:
         """Read windows of both orthos on the coarse grid."""

@@ -74,6 +74,12 @@ class MapGrid(SensorModel):
         return np.array([self.geotransform[0], self.geotransform[3]])
 
     @property
+    def pixel(self) -> tuple[float, float]:
+        """Sizes of a pixel along columns and rows, in units of the map."""
+        _, a, b, _, c, d = self.geotransform
+        return float(np.hypot(a, c)), float(np.hypot(b, d))
+
+    @property
     def _middle_longitude(self) -> float | None:
         """The longitude of the middle of a map in degrees; None of any other map."""
         if not parse_crs(self.map_crs).is_geographic:
