@@ -58,15 +58,6 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
     InputError
         With the option.
     """
-    chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
-    if chosen is not None and points.gcps is None:
-        raise InputError(
-            Text(Setting(f"points.{chosen}"), " selects from ", Setting("points.gcps"), ", which is not given"),
-            field=f"points.{chosen}",
-            remedy="leave it out; one cell in five of the matches is reserved for checking"
-            if match.reference
-            else "give a file of points, or leave it out",
-        )
     if not match.reference:
         _refuse_idle(match)
         if points.gcps is None and points.correction not in (None, "none"):
@@ -76,6 +67,13 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
                 remedy="give a file of points",
             )
         return
+    chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
+    if chosen is not None and points.gcps is None:
+        raise InputError(
+            Text(Setting(f"points.{chosen}"), " selects from ", Setting("points.gcps"), ", which is not given"),
+            field=f"points.{chosen}",
+            remedy="leave it out; one cell in five of the matches is reserved for checking",
+        )
     if chosen is not None and match.gcps_as == "check":
         raise InputError(
             Text(Setting(f"points.{chosen}"), " selects control points, but these points are all check points"),
