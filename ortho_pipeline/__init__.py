@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ortho_pipeline.runtime.lazy_names import lazily
 
 if TYPE_CHECKING:
+    from ortho_pipeline.batch.stack.command import stack as stack
     from ortho_pipeline.block.adjustment import adjust as adjust
     from ortho_pipeline.block.heights.source import DemHeights as DemHeights
     from ortho_pipeline.block.intersection import intersect as intersect
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.options import OutputOptions as OutputOptions
     from ortho_pipeline.options import PointOptions as PointOptions
     from ortho_pipeline.options import SceneOptions as SceneOptions
+    from ortho_pipeline.options import StackOptions as StackOptions
     from ortho_pipeline.options import SurfaceOptions as SurfaceOptions
     from ortho_pipeline.points import Points as Points
     from ortho_pipeline.points import read_points as read_points
@@ -80,6 +82,7 @@ _HOMES = {
     "SceneOptions": "options",
     "Sensor": "hookspecs",
     "SensorModel": "models",
+    "StackOptions": "options",
     "Surface": "surface.base",
     "SurfaceOptions": "options",
     "Vertical": "geodesy.crs",
@@ -103,6 +106,7 @@ _HOMES = {
     "read_spot_heights": "points.heights.spot_heights",
     "rectify": "commands",
     "save_model": "exchange.model_file",
+    "stack": "batch.stack.command",
     "to_geodataframe": "exchange.geodataframe",
     "write_points": "points",
     "write_rpc_txt": "exchange.rpc",

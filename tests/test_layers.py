@@ -17,7 +17,8 @@ from house import House
 
 from ortho_pipeline.estimation.choice import comparison
 from ortho_pipeline.models.correction import FREE
-from ortho_pipeline.options import CORRECTIONS, GROUPS, RESAMPLING, BlockOptions, options_of
+from ortho_pipeline.options import CORRECTIONS, RESAMPLING, BlockOptions, options_of
+from ortho_pipeline.options.flags import FLAGGED
 from ortho_pipeline.warp import job
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -361,13 +362,13 @@ def test_messages_name_options_by_their_fields() -> None:
         typed = re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)
         if where.name != "study.py":  # the switches of a study are its own to name
             assert not typed or COMMAND_LINE.search(text), f"{where}, {typed}: a flag is the command line's"
-        assert not re.search(r"`(scene|points|surface|match|output)\.", text), f"{where}: {text!r}, not a Setting"
+        assert not re.search(r"`(scene|points|surface|match|output|stack)\.", text), f"{where}: {text!r}, not a Setting"
     for where, call in ((path, node) for path in paths for node in nodes(path)):
         if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Setting"):
             continue
         group, _, name = str(getattr(call.args[0], "value", "")).partition(".")
         if name:
-            known = {**options_of(GROUPS[group]), **(options_of(BlockOptions) if group == "points" else {})}
+            known = {**options_of(FLAGGED[group]), **(options_of(BlockOptions) if group == "points" else {})}
             assert name in known, f"{where}: there is no option {group}.{name}"
 
 

@@ -25,6 +25,7 @@ from ortho_pipeline.options import (
     OutputOptions,
     PointOptions,
     SceneOptions,
+    StackOptions,
     SurfaceOptions,
     options_of,
 )
@@ -323,6 +324,7 @@ block_output_options = _grouped(
 )
 #: The suffix of the file sets the format, and seams are always measured.
 mosaic_options = _grouped("mosaic", MosaicOptions, "order", "seamlines", "balance")
+stack_options = _grouped("stack", StackOptions)
 
 dry_run_option = click.option("--dry-run", is_flag=True, help="Check all inputs and show the plan; write nothing.")
 #: The argument IMAGE.

@@ -4,7 +4,8 @@ Each option is stated here, once: its field and default, and an `Option` from wh
 file make their own options. Messages name an option by an `errors.texts.Setting`, as ``group.field``. That is its name
 in Python and in the pipeline file; the command line shows the flag instead.
 
-Imports nothing but `errors`. A new option is a field in `groups`, of a block in `block`, of a mosaic in `mosaic`.
+Imports nothing but `errors`. A new option is a field in `groups`, of a block in `block`, of a mosaic in
+`mosaic`, of a stack in `stack`.
 """
 
 from ortho_pipeline.options.block import BlockOptions
@@ -34,6 +35,7 @@ from ortho_pipeline.options.option import (
     pose_sigmas,
 )
 from ortho_pipeline.options.output import OutputOptions
+from ortho_pipeline.options.stack import StackOptions
 
 __all__ = [
     "CORRECTIONS",
@@ -52,6 +54,7 @@ __all__ = [
     "PointOptions",
     "PointTable",
     "SceneOptions",
+    "StackOptions",
     "SurfaceOptions",
     "height_range",
     "is_usable",

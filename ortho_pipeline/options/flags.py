@@ -9,9 +9,10 @@ from ortho_pipeline.options.block import BlockOptions
 from ortho_pipeline.options.groups import GROUPS
 from ortho_pipeline.options.mosaic import MosaicOptions
 from ortho_pipeline.options.option import options_of
+from ortho_pipeline.options.stack import StackOptions
 
-#: Options of a scene and of a mosaic.
-FLAGGED = {**GROUPS, "mosaic": MosaicOptions}
+#: Options of a scene, of a mosaic and of a stack.
+FLAGGED = {**GROUPS, "mosaic": MosaicOptions, "stack": StackOptions}
 #: Name of an option in messages -> its flag, if a command has it.
 FLAGS = {
     f"{group}.{name}": option.flags.split()[0]

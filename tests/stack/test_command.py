@@ -22,7 +22,7 @@ from ortho_pipeline.batch.stack import matching
 from ortho_pipeline.batch.stack.command import stack
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.errors import CrsError, InputError
-from ortho_pipeline.options import MatchOptions, OutputOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, StackOptions
 from ortho_pipeline.report.stack.records import StackRecord
 
 gdal.UseExceptions()
@@ -32,9 +32,9 @@ RASTERS = Rasters(side=240, dates=4, error=4.0)
 MATCH = MatchOptions(points=120)
 
 
-def run(given: Any, folder: Path, **more: Any) -> Any:
+def run(given: Any, folder: Path, options: StackOptions = StackOptions(), **more: Any) -> Any:
     settings = {"match": MATCH, "output": OutputOptions(resampling="cubic", threads=1, format="GTiff"), **more}
-    return stack(given, folder, **settings)
+    return stack(given, folder, options, **settings)
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +97,23 @@ def test_a_second_run_matches_nothing_and_writes_the_same(made, counted):
     assert contents(made[1]) == before
 
 
+def test_the_cube_is_the_aligned_orthos(made):
+    pytest.importorskip("xarray")
+    result = run([made[0][0].parent], made[1])
+    assert list(result.orthos) == [path.stem for path in made[0]]
+    cube = result.to_xarray(chunks=100)
+    assert cube.dims == ("time", "band", "y", "x")
+    assert [one.time[:10] for one in result.dates] == [str(time)[:10] for time in cube.time.values]
+    np.testing.assert_array_equal(cube.east_m, [one.east_north_m[0] for one in result.dates])
+    part = cube[1:3, :, 90:110].compute()
+    files = [gdal.Open(str(path)) for path in list(result.orthos.values())[1:3]]
+    np.testing.assert_array_equal(part.values[:, 0], [file.ReadAsArray(0, 90, cube.sizes["x"], 20) for file in files])
+    masks = [file.GetRasterBand(1).GetMaskBand().ReadAsArray(0, 90, cube.sizes["x"], 20) > 0 for file in files]
+    np.testing.assert_array_equal(part.valid.values, masks)
+    west, dx, *_ = files[0].GetGeoTransform()
+    assert cube.x.values[0] == west + dx / 2
+
+
 def test_neither_order_nor_threads_change_a_byte(made, tmp_path):
     output = OutputOptions(resampling="cubic", threads=2, format="GTiff")
     run(made[0][::-1], tmp_path / "out", output=output)
@@ -145,20 +162,23 @@ def test_a_killed_run_resumes_to_the_same_result(made, tmp_path):
 
 
 def test_corrections_only_keep_the_pixels(made, tmp_path):
-    result = run(made[0][:2], tmp_path / "out", corrections_only=True, datum="scene_" + f"{RASTERS.days()[0]:%Y%m%d}")
+    options = StackOptions(corrections_only=True, datum=f"scene_{RASTERS.days()[0]:%Y%m%d}")
+    result = run(made[0][:2], tmp_path / "out", options)
     source = gdal.Open(str(made[0][1]))
     moved = gdal.Open(str(tmp_path / "out" / result.document["dates"][1]["output"]))
     np.testing.assert_array_equal(moved.ReadAsArray(), source.ReadAsArray())
     apart = np.subtract(source.GetGeoTransform(), moved.GetGeoTransform())[[0, 3]]
     true = (RASTERS.shifts()[1] - RASTERS.shifts()[0]) * (1, -1)
     np.testing.assert_allclose(apart, true, atol=0.03)
+    with pytest.raises(InputError, match="aligned orthos on one grid"):
+        result.to_xarray()
 
 
 def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
     with pytest.raises(InputError, match="no ortho is of 1999-01-01"):
-        run(made[0], tmp_path / "out", datum="1999-01-01")
+        run(made[0], tmp_path / "out", StackOptions(datum="1999-01-01"))
     with pytest.raises(InputError, match="no reference"):
-        run(made[0], tmp_path / "out", datum="reference")
+        run(made[0], tmp_path / "out", StackOptions(datum="reference"))
     other = tmp_path / "other_20210101.tif"
     gdal.Warp(str(other), str(made[0][0]), dstSRS="EPSG:32734")
     with pytest.raises(CrsError, match="another CRS"):

@@ -54,7 +54,7 @@ def test_an_ortho_without_a_date_is_an_error(tmp_path):
     ortho(tmp_path / "b.tif", TIFFTAG_DATETIME="2022:05:03 10:12:00")
     with pytest.raises(InputError, match="has no date") as error:
         dated_orthos([tmp_path])
-    assert "date_pattern=%Y%m%d" in str(error.value.remedy)
+    assert "stack.date_pattern=%Y%m%d" in str(error.value.remedy)
 
 
 @pytest.mark.parametrize(

@@ -156,7 +156,7 @@ def _date(path: Path, stated: str | None, pattern: str | None, options: SceneOpt
         field="date",
         remedy=Text(
             "give a CSV file with the columns file and date, or the place of the date in the file names: ",
-            Setting("date_pattern", "%Y%m%d"),
+            Setting("stack.date_pattern", "%Y%m%d"),
         ),
     )
 
@@ -221,13 +221,13 @@ def by_pattern(name: str, pattern: str) -> datetime:
     unknown = [code for code in codes if code not in _PARTS]
     if unknown or "%Y" not in codes or len(set(codes)) < len(codes):
         raise InputError(
-            f"{pattern!r} is not a pattern of a date", field="date_pattern", remedy="such as %Y%m%d or %Y-%j"
+            f"{pattern!r} is not a pattern of a date", field="stack.date_pattern", remedy="such as %Y%m%d or %Y-%j"
         )
     found = re.search("".join(_PARTS.get(part, re.escape(part)) for part in parts), name)
     if found is None:
         raise InputError(
             f"the name {name} does not have the date pattern {pattern}",
-            field="date_pattern",
+            field="stack.date_pattern",
             remedy="change the pattern, or give a CSV file with the columns file and date",
         )
     numbers = found.groupdict()
@@ -237,5 +237,5 @@ def by_pattern(name: str, pattern: str) -> datetime:
         return datetime.strptime(whole, code).replace(tzinfo=UTC)
     except ValueError as error:
         raise InputError(
-            f"the name {name} has no valid date", field="date_pattern", remedy="change the pattern"
+            f"the name {name} has no valid date", field="stack.date_pattern", remedy="change the pattern"
         ) from error

@@ -8,41 +8,17 @@ from typing import Any
 import click
 
 from ortho_pipeline.cli.machine.browser import open_option
-from ortho_pipeline.cli.options import click_options, folder_option, grouped_options, json_option
+from ortho_pipeline.cli.options import click_options, folder_option, grouped_options, json_option, stack_options
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, progress
-from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions
 from ortho_pipeline.options.option import RESAMPLING
 
 
 @click.command(cls=Command)
 @click.argument("orthos", metavar="ORTHO|FOLDER|LIST.csv...", nargs=-1, required=True, type=click.Path())
-@click.option(
-    "--datum",
-    default="mean",
-    show_default=True,
-    metavar="mean|DATE|reference",
-    help="What keeps its place: the mean of all dates, one date, or the reference (--reference).",
-)
-@click.option(
-    "--date-pattern",
-    metavar="PATTERN",
-    help="Place of the date in the file names, such as %Y%m%d.  [default: metadata]",
-)
+@stack_options
 @click_options("match", MatchOptions, "reference", "search", "points")
-@click.option(
-    "--neighbours",
-    type=click.IntRange(1, 50),
-    default=3,
-    show_default=True,
-    metavar="N",
-    help="Earlier dates with which each date is matched, besides the same season of earlier years.",
-)
-@click.option("--shift-only", is_flag=True, help="Correct each date by a shift only.")
-@click.option(
-    "--corrections-only", is_flag=True, help="Keep the pixels: write VRTs with a corrected map grid, and models."
-)
-@click.option("--rebuild", is_flag=True, help="Match all pairs again and write all orthos again.")
 @click.option("--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True)
 @folder_option
 @open_option
@@ -51,10 +27,7 @@ from ortho_pipeline.options.option import RESAMPLING
 @json_option
 def stack(
     orthos: tuple[str, ...],
-    datum: str,
-    date_pattern: str | None,
-    neighbours: int,
-    shift_only: bool,
+    stack: StackOptions,
     resampling: str,
     folder: str,
     as_json: bool,
@@ -69,12 +42,8 @@ def stack(
     """
     from ortho_pipeline.batch.stack import command
 
-    only = {name: grouped.pop(name) for name in ("corrections_only", "rebuild")}
     groups = grouped_options(grouped, "match", "scene", "output")
     groups["output"] = replace(groups["output"], resampling=resampling)
     with progress() as shown:
-        result = command.stack(
-            orthos, folder, datum=datum, date_pattern=date_pattern, neighbours=neighbours, affine=not shift_only,
-            progress=shown, **only, **groups,
-        )  # fmt: skip
+        result = command.stack(orthos, folder, stack, progress=shown, **groups)
     print_result(result, as_json)

@@ -7,7 +7,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +119,14 @@ def _tile_maker_of(output: OutputOptions) -> Callable[[WarpJob], TileMaker]:
     return make
 
 
+class LazyTiles(Protocol):
+    """What makes blocks of an ortho: pixels ``(bands, h, w)``, and which of them ``(h, w)`` are valid."""
+
+    profile: Profile
+
+    def __call__(self, top: int, left: int, height: int, width: int) -> tuple[NDArray[Any], NDArray[np.bool_]]: ...
+
+
 class Tiles:
     """What makes tiles of an ortho; it may be sent to other processes, where it opens its files again."""
 
@@ -167,18 +175,39 @@ class Tiles:
 
 
 def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
+    _, xarray = libraries("ortho_array")
+    pixels, valid = blocks_of(tiles, placed.grid, side)
+    coordinates = coordinates_of(placed.grid, tiles.profile)
+    if tiles.profile.validity == "mask":
+        coordinates["valid"] = (("y", "x"), valid)
+    return xarray.DataArray(pixels, coordinates, ("band", "y", "x"), "ortho", attributes_of(tiles.profile))
+
+
+def libraries(field: str) -> tuple[Any, Any]:
+    """Return dask and xarray, which are optional.
+
+    Raises
+    ------
+    InputError
+        If one of them is not installed; it names `field`.
+    """
     try:
         import dask
-        import dask.array as da
+        import dask.array
         import xarray
     except ImportError as error:
         raise InputError(
             f"lazy arrays need {error.name}, which is not installed",
-            field="ortho_array",
+            field=field,
             remedy="run pip install '.[xarray]' in the checkout of ortho-pipeline",
         ) from error
-    grid, profile = placed.grid, tiles.profile
-    maker = dask.delayed(tiles, traverse=False)
+    return dask, xarray
+
+
+def blocks_of(tiles: LazyTiles, grid: Grid, side: int) -> tuple[Any, Any]:
+    """Return dask arrays of pixels ``(bands, h, w)`` and of which are valid ``(h, w)``, in blocks of a side (px)."""
+    dask, _ = libraries("chunks")
+    maker, profile = dask.delayed(tiles, traverse=False), tiles.profile
     pixels: list[list[Any]] = []
     valid: list[list[Any]] = []
     for top in range(0, grid.height, side):
@@ -187,19 +216,25 @@ def _array(placed: Placement, tiles: Tiles, side: int) -> xarray.DataArray:
         for left in range(0, grid.width, side):
             shape = min(side, grid.height - top), min(side, grid.width - left)
             tile = maker(top, left, *shape)
-            pixels[-1].append(da.from_delayed(tile[0], (profile.count, *shape), dtype=profile.dtype))
-            valid[-1].append(da.from_delayed(tile[1], shape, dtype=bool))
-    coordinates: dict[str, Any] = {
+            pixels[-1].append(dask.array.from_delayed(tile[0], (profile.count, *shape), dtype=profile.dtype))
+            valid[-1].append(dask.array.from_delayed(tile[1], shape, dtype=bool))
+    return dask.array.block(pixels), dask.array.block(valid)
+
+
+def coordinates_of(grid: Grid, profile: Profile) -> dict[str, Any]:
+    """Return bands, pixel centres and the CF grid mapping of an ortho."""
+    return {
         "band": np.arange(1, profile.count + 1),
         "y": grid.top - grid.dy * (np.arange(grid.height) + 0.5),
         "x": grid.left + grid.dx * (np.arange(grid.width) + 0.5),
         "spatial_ref": ((), 0, _reference(grid)),
     }
-    if profile.validity == "mask":
-        coordinates["valid"] = (("y", "x"), da.block(valid))
+
+
+def attributes_of(profile: Profile) -> dict[str, Any]:
+    """Return the attributes of the array of an ortho."""
     nodata = {} if profile.nodata is None else {"_FillValue": profile.dtype.type(profile.nodata)}
-    attributes = {**nodata, "grid_mapping": "spatial_ref", "long_name": _names(profile.descriptions)}
-    return xarray.DataArray(da.block(pixels), coordinates, ("band", "y", "x"), "ortho", attributes)
+    return {**nodata, "grid_mapping": "spatial_ref", "long_name": _names(profile.descriptions)}
 
 
 def _reference(grid: Grid) -> dict[str, Any]:
