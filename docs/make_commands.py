@@ -205,6 +205,7 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
         "output": "The results go to object storage.",
         "root": "The pipeline file names files outside its own folder, and you trust it.",
     },
+    "stack": {"dem": "Some dates are raw scenes.", "height": "Some dates are raw scenes of flat ground."},
     "ties": {
         "dem": "Almost always: with it, matching finds ties in hilly ground.",
         "dem-sigma": "The DEM may be more than 10 m off: the search for ties must then go further.",

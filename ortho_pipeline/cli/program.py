@@ -51,7 +51,7 @@ GROUPS = {
         "report": ("scene.rectifying", "Write the plots of a report as pictures."),
     },
     "Many scenes": {
-        "stack": ("scene.stacking", "Make finished ORTHOs of many dates agree with each other."),
+        "stack": ("scene.stacking", "Make finished orthos and raw scenes of many dates agree with each other."),
         "init": ("survey.first_use", "Write a pipeline file for the scenes of FOLDER."),
         "run": ("batch", "Make the orthos of all scenes in PIPELINE.yaml."),
     },

@@ -257,7 +257,7 @@ def make_ortho(resolved: Resolved, files: dict[str, Path], job: OrthoJob) -> Sce
         source = open_rasters(placed.scene, request)
         budget, notes = layers.budget_of(placed)
         path = layers.ortho_of(placed, files, other_of(placed, source))
-        warped = _warp(placed, exported, source, path, job.stage)
+        warped = warp_placed(placed, exported, source, path, job.stage)
         job.stage("Layers and report", 0.0)
         accuracy = layers.write_layers(placed, budget, warped, files)
         angles = write_angles(placed, sun, files)
@@ -322,7 +322,7 @@ def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
     return exported, list(exported.warnings)
 
 
-def _warp(
+def warp_placed(
     placed: Placement,
     exported: rpc.RpcExport | None,
     source: raster.RasterSource,

@@ -36,14 +36,14 @@ def test_an_image_that_changes_meanwhile_is_refused_and_the_old_outputs_stay(tin
     out = tmp_path / "out"
     rectify(tiny, out)
     before = contents(out)
-    warp = rectification._warp
+    warp = rectification.warp_placed
 
     def meddling(*given):
         found = warp(*given)
         os.utime(tiny.dem, ns=(1, 1))
         return found
 
-    monkeypatch.setattr(rectification, "_warp", meddling)
+    monkeypatch.setattr(rectification, "warp_placed", meddling)
     with pytest.raises(InputError, match="changed during the run"):
         rectify(tiny, out)
     assert contents(out) == before
@@ -163,12 +163,12 @@ def test_a_signal_ends_the_command_and_leaves_nothing(tiny, tmp_path, number):
 import sys, time
 from ortho_pipeline.cli import program as cli
 from ortho_pipeline.commands import rectification
-warp = rectification._warp
+warp = rectification.warp_placed
 def slow(*given):
     found = warp(*given)
     print("ready", flush=True)
     time.sleep(60)
-rectification._warp = slow
+rectification.warp_placed = slow
 cli.main()
 """
     command = [sys.executable, "-c", code, "rectify", str(tiny.image), "--dem", str(tiny.dem), "--dem-vertical",

@@ -14,6 +14,7 @@ from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, time_of
 from ortho_pipeline.batch.stack.document import record_of
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, pixel_of
+from ortho_pipeline.batch.stack.raw import Rectifier
 from ortho_pipeline.batch.stack.result import StackResult, summary
 from ortho_pipeline.batch.stack.writing import Told, Writer
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
@@ -23,13 +24,13 @@ from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import together, write_json
-from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.report.stack.page import write_page
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.stores.delivery import address_of
 
-_EDGES, _ALIGNED = "pairs", "aligned"
+_EDGES, _ALIGNED, _RAW = "pairs", "aligned", "raw"
 _DAYS_A_YEAR = 365.25
 
 
@@ -41,20 +42,23 @@ def stack(
     options: StackOptions = StackOptions(),
     *,
     match: MatchOptions = MatchOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
     scene: SceneOptions = SceneOptions(),
     output: OutputOptions | None = None,
     progress: Told | None = None,
 ) -> StackResult:
-    """Make finished orthos of many dates agree with each other.
+    """Make finished orthos and raw scenes of many dates agree with each other.
 
     A second run with the same folder matches only new pairs and writes only changed orthos.
 
     Parameters
     ----------
     orthos : sequence of path
-        Orthos, folders of them, patterns of names, and CSV lists with the columns file and date.
+        Images, folders of them, patterns of names, and CSV lists with the columns file and date.
     folder : path
         Folder of all outputs.
+    surface : SurfaceOptions
+        Heights for raw scenes.
     output : OutputOptions, optional
         Of the aligned orthos. Default: cubic resampling.
     progress : callable, optional
@@ -69,7 +73,7 @@ def stack(
     Raises
     ------
     InputError
-        If an ortho has no date, the CRS differ, or no pair can be matched.
+        If an image has no date, a raw scene no heights, the CRS differ, or no pair can be matched.
 
     Examples
     --------
@@ -82,11 +86,13 @@ def stack(
             "a stack is written to a folder on this machine", file=str(folder), field="folder", remedy="give a folder"
         )
     output = OutputOptions(resampling="cubic") if output is None else output
-    dates = dated_orthos(orthos, options.date_pattern, scene)
+    dates = dated_orthos(orthos, options.date_pattern, scene, surface)
     nodes, fixed = _with_datum(dates, options.datum, match, scene)
-    placed, folder = Placed.of(nodes[: len(dates)]), Path(folder)
-    told = progress or (lambda what, share: None)
+    told, folder = progress or (lambda what, share: None), Path(folder)
     with locked(folder / _EDGES / ".lock", owner="ortho stack"):
+        rectifier = Rectifier(folder / _RAW, surface, scene, output, options.rebuild)
+        dates = rectifier.orthos(dates, told)
+        nodes, placed = [*dates, *nodes[len(dates) :]], Placed.of(dates)
         matcher = Matcher(folder / _EDGES, replace(match, reference=()), scene, output, options.rebuild)
         wanted = pairs_of([one.days for one in dates], options.neighbours)
         if len(nodes) > len(dates):

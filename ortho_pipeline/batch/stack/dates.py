@@ -1,4 +1,4 @@
-"""The orthos of a stack and their dates: from a list, a pattern of file names, STAC items, reports or metadata."""
+"""The images of a stack and their dates: from a list, a pattern of file names, STAC items, reports or metadata."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.batch.records import FileState
+from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has_surface
+from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.orthos.verifying import RASTERS
+from ortho_pipeline.commands.placement import Placement, place_scene
+from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import decoded, read_bounded, read_json
 from ortho_pipeline.hookspecs import Scene
-from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
 
 #: A list and a JSON document next to an ortho are no larger.
@@ -38,14 +42,46 @@ _PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "
 
 
 @dataclass(frozen=True, eq=False)
+class RawScene:
+    """A raw scene with its delivered model, on its heights.
+
+    Parameters
+    ----------
+    resolved : Resolved
+        Its request, with CRS and pixel size of its ortho, scene and heights.
+    inputs : tuple of FileState
+        The files that it was read from.
+    """
+
+    resolved: Resolved
+    inputs: tuple[FileState, ...]
+
+    def placed(self) -> Placement:
+        """Return the scene with its delivered model on its heights, and the grid of its ortho."""
+        return place_scene(self.resolved)
+
+
+@dataclass(frozen=True, eq=False)
 class Dated:
-    """An ortho with its date, and where the date is from."""
+    """An ortho with its date, and where the date is from.
+
+    Parameters
+    ----------
+    raw : RawScene, optional
+        The raw scene of which the ortho was made for matching.
+    """
 
     name: str
     path: Path
     time: datetime
     source: str
     scene: Scene
+    raw: RawScene | None = None
+
+    @property
+    def image(self) -> Path:
+        """The file that was given."""
+        return self.path if self.raw is None else Path(self.raw.resolved.scene.path)
 
     @property
     def days(self) -> float:
@@ -54,31 +90,49 @@ class Dated:
 
 
 def dated_orthos(
-    given: Sequence[str | os.PathLike[str]], pattern: str | None = None, options: SceneOptions = SceneOptions()
+    given: Sequence[str | os.PathLike[str]],
+    pattern: str | None = None,
+    options: SceneOptions = SceneOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
 ) -> list[Dated]:
-    """Return the orthos of folders, lists and patterns of names, in order of time and name.
+    """Return the images of folders, lists and patterns of names, in order of time and name.
+
+    Parameters
+    ----------
+    surface : SurfaceOptions
+        Heights, with which raw scenes are allowed. A DEM in a folder of images is none of them.
 
     Raises
     ------
     InputError
-        If an ortho has no date, two have one name, or one is no ortho.
+        If an image has no date, two have one name, or one is raw and there are no heights.
     """
     found: dict[str, tuple[Path, str | None]] = {}
+    heights, skipped = has_surface(surface), {os.path.realpath(path) for path in dem_files(surface)}
     for path, stated in _files(given):
+        if os.path.realpath(path) in skipped:
+            continue
         name = path.stem
         if name in found and os.path.realpath(found[name][0]) != os.path.realpath(path):
-            raise InputError(f"two orthos are called {name}", file=path, field="orthos", remedy="rename one of them")
+            raise InputError(f"two images are called {name}", file=path, field="orthos", remedy="rename one of them")
         found[name] = path, stated
     if len(found) < 2:
         raise InputError(
-            f"a stack needs at least two orthos, not {len(found)}",
+            f"a stack needs at least two images, not {len(found)}",
             field="orthos",
             remedy=f"give a folder with orthos ({', '.join(RASTERS)})",
         )
     dated = []
     for name, (path, stated) in found.items():
-        scene = open_ortho(path, options)
-        time, source = _date(path, stated, pattern, options)
+        scene = open_ortho(path, options, only=False)
+        if scene.sensor != ORTHO and not heights:
+            raise InputError(
+                f"{path.name} is not a finished ortho: the sensor {scene.sensor!r} opens it as a raw scene",
+                file=path,
+                field="surface.dem",
+                remedy=Text(GIVE_HEIGHTS, "; if it is an ortho, delete the old RPC or metadata files"),
+            )
+        time, source = _date(path, stated, pattern, options, scene)
         dated.append(Dated(name, path, time, source, scene))
     return sorted(dated, key=lambda one: (one.time, one.name))
 
@@ -135,7 +189,9 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[Path, str | None]]:
     return found
 
 
-def _date(path: Path, stated: str | None, pattern: str | None, options: SceneOptions) -> tuple[datetime, str]:
+def _date(
+    path: Path, stated: str | None, pattern: str | None, options: SceneOptions, scene: Scene
+) -> tuple[datetime, str]:
     """Return the date of an ortho, and where it is from."""
     if stated is not None:
         return time_of(stated, path), "list"
@@ -145,13 +201,16 @@ def _date(path: Path, stated: str | None, pattern: str | None, options: SceneOpt
         text = _stated_in(document)
         if text is not None:
             return time_of(text, path), name
+    acquired = scene.facts.get("acquired")
+    if scene.sensor != ORTHO and isinstance(acquired, str):
+        return time_of(acquired, path), "metadata"
     dataset = open_dataset(path, **options.access)
     for domain, item in _ITEMS:
         text = (dataset.GetMetadata(domain) or {}).get(item)
         if text:
             return time_of(text, path), item
     raise InputError(
-        "this ortho has no date: no STAC item and no report are next to it, and its metadata state none",
+        "this image has no date: no STAC item and no report are next to it, and its metadata state none",
         file=path,
         field="date",
         remedy=Text(

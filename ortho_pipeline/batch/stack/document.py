@@ -96,7 +96,7 @@ def _date(
     largest = float(np.hypot(*stack.at(corners)[0][number].T).max())
     return DateRecord(
         name=one.name,
-        path=str(one.path),
+        path=str(one.image),
         time=one.time.isoformat(),
         time_from=one.source,
         correction=("affine" if stack.sloped[number] else "shift") if known else None,

@@ -9,18 +9,35 @@ from typing import Any
 
 from ortho_pipeline.batch.freshness import DIGESTS
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of
-from ortho_pipeline.batch.stack.dates import Dated
+from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, geotransform_of
+from ortho_pipeline.batch.stack.raw import corrected_model, write_placed
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.orthos.resampling import write_resampled
+from ortho_pipeline.commands.placement import Placement
 from ortho_pipeline.commands.resolved.ledger import versions
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import write_moved
+from ortho_pipeline.exchange.rpc import export_rpc, write_vrt
 from ortho_pipeline.files import clear_up
+from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.source import open_dataset
 
 Told = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """How the files of a date are made: from which files, with which model, and how its image is written."""
+
+    inputs: tuple[FileState, ...]
+    saved: SavedModel
+    endings: tuple[str, ...]
+    write: Callable[[Path], None]
+    surface: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +47,8 @@ class Writer:
     Parameters
     ----------
     corrections_only : bool
-        Keep the pixels, and write VRTs with a corrected map grid.
+        Keep the pixels, and write VRTs with a corrected map grid; of raw scenes with an RPC, if one represents the
+        corrected model.
     rebuild : bool
         Write also what is as recorded.
     """
@@ -53,36 +71,68 @@ class Writer:
         return found
 
     def _one(self, one: Dated, solved: AdjustedStack, number: int) -> str:
-        model = self.placed.corrected(one, solved, number)
-        name = f"{one.name}_aligned{'.vrt' if self.corrections_only else '.tif'}"
-        path, place = self.folder / name, self.folder / f"{one.name}.record.json"
-        files = [path, path.with_name(f"{one.name}_model.json")]
+        part = self._part(one, solved, number)
+        place = self.folder / f"{one.name}.record.json"
+        files = [self.folder / f"{one.name}{ending}" for ending in (*part.endings, "_model.json")]
         for file in (*files, place):
             clear_up(file)
-        inputs = (FileState.of("ortho", one.path.absolute(), DIGESTS),)
-        key = key_of(inputs, self._configuration(model.to_dict()), self.software)
+        key = key_of(part.inputs, self._configuration(part), self.software)
         record = None if self.rebuild else RunRecord.at(place)
         if record is None or record.key != key or not record.intact(self.folder):
-            self._written(one, model, path)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if part.endings:
+                part.write(files[0])
+            write_model_file(part.saved, files[-1])
             outputs = tuple(FileState.of(file.suffix[1:], file, name=file.name) for file in files)
-            RunRecord(name=one.name, key=key, status="done", inputs=inputs, outputs=outputs).write(place)
-        return f"{self.folder.name}/{name}"
+            RunRecord(name=one.name, key=key, status="done", inputs=part.inputs, outputs=outputs).write(place)
+        return f"{self.folder.name}/{files[0].name}"
 
-    def _configuration(self, model: dict[str, Any]) -> dict[str, Any]:
+    def _part(self, one: Dated, solved: AdjustedStack, number: int) -> _Part:
+        """Return how the files of a date are made."""
+        if one.raw is None:
+            return self._finished(one, self.placed.corrected(one, solved, number))
+        placement = one.raw.placed()
+        return self._raw(one.raw, placement, corrected_model(placement, self.placed, solved, number))
+
+    def _finished(self, one: Dated, model: ImageCorrection) -> _Part:
+        scene = one.scene
+
+        def write(path: Path) -> None:
+            if self.corrections_only:
+                write_moved(open_dataset(one.path, **self.scene.access), geotransform_of(model), path)
+            else:
+                write_resampled(scene, model, self.placed.grid, path, self.output, self.scene)
+
+        saved = SavedModel(model, scene.sensor, str(one.path), (scene.width, scene.height), {})
+        inputs = (FileState.of("ortho", one.path.absolute(), DIGESTS),)
+        return _Part(inputs, saved, ("_aligned.vrt" if self.corrections_only else "_aligned.tif",), write)
+
+    def _raw(self, raw: RawScene, placement: Placement, model: ImageCorrection) -> _Part:
+        scene = placement.scene
+        saved = SavedModel(model, scene.sensor, scene.model_source, (scene.width, scene.height), {})
+        if not self.corrections_only:
+
+            def write(path: Path) -> None:
+                write_placed(placement._replace(model=model, grid=self.placed.grid), path)
+
+            return _Part(raw.inputs, saved, ("_aligned.tif",), write, json_value(placement.surface.provenance))
+        try:
+            exported = export_rpc(model).rpc
+        except InputError:
+            # No RPC represents it: the model file is the only output.
+            return _Part(raw.inputs, saved, (), lambda path: None)
+
+        def write_rpc(path: Path) -> None:
+            write_vrt(open_dataset(scene.path, **self.scene.access), exported, path)
+
+        return _Part(raw.inputs, saved, ("_aligned.vrt",), write_rpc)
+
+    def _configuration(self, part: _Part) -> dict[str, Any]:
         output = self.output
         return {
-            "model": model,
+            "surface": part.surface,
+            "model": part.saved.model.to_dict(),
             "grid": [*self.placed.grid.geotransform, self.placed.grid.width, self.placed.grid.height],
             "corrections_only": self.corrections_only,
             "output": [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)],
         }
-
-    def _written(self, one: Dated, model: Any, path: Path) -> None:
-        if self.corrections_only:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_moved(open_dataset(one.path, **self.scene.access), geotransform_of(model), path)
-        else:
-            write_resampled(one.scene, model, self.placed.grid, path, self.output, self.scene)
-        size = one.scene.width, one.scene.height
-        saved = SavedModel(model, one.scene.sensor, str(one.path), size, {})
-        write_model_file(saved, path.with_name(f"{one.name}_model.json"))

@@ -1,4 +1,4 @@
-"""The command `ortho stack`: finished orthos of many dates."""
+"""The command `ortho stack`: finished orthos and raw scenes of many dates."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from ortho_pipeline.cli.machine.browser import open_option
 from ortho_pipeline.cli.options import click_options, folder_option, grouped_options, json_option, stack_options
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, progress
-from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.options.option import RESAMPLING
 
 
 @click.command(cls=Command)
-@click.argument("orthos", metavar="ORTHO|FOLDER|LIST.csv...", nargs=-1, required=True, type=click.Path())
+@click.argument("orthos", metavar="IMAGE|FOLDER|LIST.csv...", nargs=-1, required=True, type=click.Path())
 @stack_options
 @click_options("match", MatchOptions, "reference", "search", "points")
+@click_options("surface", SurfaceOptions, "dem", "vertical", "override_vertical", "fill", "height", "source")
 @click.option("--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True)
 @folder_option
 @open_option
 @click_options("output", OutputOptions, "nodata", "creation_options", "memory", "threads")
-@click_options("scene", SceneOptions, "roots")
+@click_options("scene", SceneOptions, "allow_network", "roots")
 @json_option
 def stack(
     orthos: tuple[str, ...],
@@ -33,16 +34,16 @@ def stack(
     as_json: bool,
     **grouped: Any,
 ) -> None:
-    """Make finished ORTHOs of many dates agree with each other.
+    """Make finished orthos and raw scenes of many dates agree with each other.
 
     Each date is matched with earlier dates and with the same season of earlier years. One network of all pairs gives
     the smallest correction of each date that the matches justify. Wrong pairs and moving ground are found and left out.
-    A second run matches only new pairs. Dates come from a list with the columns file and date, file names, STAC items,
-    reports or metadata.
+    Raw scenes need heights; their pixels are resampled once, with the corrected model. A second run matches only new
+    pairs. Dates come from a list with the columns file and date, file names, STAC items, reports or metadata.
     """
     from ortho_pipeline.batch.stack import command
 
-    groups = grouped_options(grouped, "match", "scene", "output")
+    groups = grouped_options(grouped, "match", "surface", "scene", "output")
     groups["output"] = replace(groups["output"], resampling=resampling)
     with progress() as shown:
         result = command.stack(orthos, folder, stack, progress=shown, **groups)

@@ -1,0 +1,178 @@
+"""Raw scenes of a stack: an ortho of each with its delivered model, for matching; corrections as those of that model.
+
+The aligned ortho is resampled once, from the raw image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ortho_pipeline.batch.freshness import DIGESTS
+from ortho_pipeline.batch.records import FileState, RunRecord, key_of
+from ortho_pipeline.batch.stack.dates import Dated, RawScene
+from ortho_pipeline.batch.stack.placing import Placed, map_grid_of
+from ortho_pipeline.block.stack.adjustment import AdjustedStack
+from ortho_pipeline.commands.block_results.orthos import on_one_grid
+from ortho_pipeline.commands.control.points import no_points
+from ortho_pipeline.commands.heights.opening import has_surface, open_surface
+from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
+from ortho_pipeline.commands.placement import Placement, open_rasters
+from ortho_pipeline.commands.rectification import warp_placed
+from ortho_pipeline.commands.resolved.ledger import Ledger, versions
+from ortho_pipeline.commands.resolved.opening import on_surface
+from ortho_pipeline.commands.resolved.request import Request
+from ortho_pipeline.commands.resolved.resolved import Resolved
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import clear_up
+from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.surface.footprint import image_grid
+from ortho_pipeline.surface.rays import meet_surface
+
+#: Places per side of the image at which a correction is transferred to the model, and rounds of its inversion.
+_SIDE, _ROUNDS = 17, 3
+
+
+def write_placed(placed: Placement, path: Path) -> None:
+    """Write the ortho of a placed scene.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or written.
+    """
+    warp_placed(placed, None, open_rasters(placed.scene, placed.request), path, lambda stage, share: None)
+
+
+def corrected_model(placement: Placement, placed: Placed, stack: AdjustedStack, date: int) -> ImageCorrection:
+    """Return the delivered model of a raw scene with the correction of its date.
+
+    Its ortho shows ground displaced by the correction. At places all over the scene, the pixel that shows the ground
+    is compared with the pixel that the delivered model gives for the same ground: their difference, as a shift or
+    affine transformation of the image, is the error of the model.
+    """
+    model, surface = placement.model, placement.surface
+    size = placement.scene.width, placement.scene.height
+    seen = image_grid(*size, _SIDE)
+    ground = meet_surface(model, seen, surface)
+    known = np.isfinite(ground).all(axis=1)
+    seen, crs = seen[known], placed.model.crs
+    shown = placed.at(ground_transform(model.crs, crs)(ground[known])[:, :2])
+    true = shown
+    for _ in range(_ROUNDS):
+        true = shown - _at_each(stack, true, date)
+    plan = placed.model.image_to_ground(true, 0.0)[:, :2]
+    there = np.column_stack([plan, surface.heights(plan, crs)])
+    predicted = model.ground_to_image(ground_transform(crs, model.crs)(there))
+    used = np.isfinite(predicted).all(axis=1)
+    if used.sum() < 3:
+        raise InputError(
+            "this scene has no heights where its correction is applied",
+            file=placement.scene.path,
+            field="surface.dem",
+            remedy="give a DEM that covers the whole scene",
+        )
+    kind, origin = "affine" if stack.sloped[date] else "shift", np.array(size) / 2
+    design = np.column_stack([np.ones(int(used.sum())), predicted[used] - origin])[:, : 3 if kind == "affine" else 1]
+    terms = np.zeros((3, 2))
+    terms[: design.shape[1]] = np.linalg.lstsq(design, seen[used] - predicted[used], rcond=None)[0]
+    return ImageCorrection(
+        model, kind, (float(origin[0]), float(origin[1])), np.concatenate([terms[:, 0], terms[:, 1]])
+    )
+
+
+def _at_each(stack: AdjustedStack, place: Any, date: int) -> Any:
+    """Return the corrections (px) of a date at places ``(n, 2)``."""
+    return stack.at(place)[0][date]
+
+
+@dataclass(frozen=True, eq=False)
+class Rectifier:
+    """Makes an ortho of each raw scene with its delivered model; one whose inputs are as recorded is kept.
+
+    Parameters
+    ----------
+    rebuild : bool
+        Write also what is as recorded.
+    """
+
+    folder: Path
+    surface: SurfaceOptions
+    scene: SceneOptions
+    output: OutputOptions
+    rebuild: bool = False
+    software: dict[str, Any] = field(default_factory=versions)
+
+    def orthos(self, dates: Sequence[Dated], told: Callable[[str, float], None]) -> list[Dated]:
+        """Return the dates with orthos in place of raw scenes: in the CRS and pixel size of the first finished ortho.
+
+        Without any, they have the UTM zone of the first scene and the smallest pixel.
+
+        Raises
+        ------
+        InputError
+            If heights are given and no scene is raw, or they do not cover a scene.
+        """
+        raw = [one for one in dates if one.scene.sensor != ORTHO]
+        if not raw:
+            if has_surface(self.surface):
+                raise InputError(
+                    "heights are for raw scenes, and all of these are finished orthos",
+                    field="surface.dem" if self.surface.dem is not None else "surface.height",
+                    remedy="leave them out",
+                )
+            return list(dates)
+        heights = open_surface(self.surface, self.scene, self.output.memory, [one.scene for one in raw])
+        scenes = {one.name: on_surface(one.scene, heights) for one in raw}
+        finished = next((one for one in dates if one.scene.sensor == ORTHO), None)
+        if finished is None:
+            output = on_one_grid(scenes, heights, self.output)
+        else:
+            grid = map_grid_of(finished)
+            output = replace(self.output, crs=grid.crs, resolution=grid.pixel)
+        access = SceneOptions(allow_network=self.scene.allow_network, roots=self.scene.roots)
+        found = []
+        for number, one in enumerate(dates):
+            if one.name in scenes:
+                scene = scenes[one.name]
+                request = Request(scene, access, surface=self.surface, output=output)
+                ledger = Ledger.of(request, scene, heights)
+                found.append(self._rectified(one, Resolved(request, scene, heights, no_points(), None, ledger)))
+            else:
+                found.append(one)
+            told("rectifying", (number + 1) / len(dates))
+        return found
+
+    def _rectified(self, one: Dated, resolved: Resolved) -> Dated:
+        path, place = self.folder / f"{one.name}_ortho.tif", self.folder / f"{one.name}.record.json"
+        clear_up(path)
+        clear_up(place)
+        record = None if self.rebuild else RunRecord.at(place)
+        if record is not None:
+            DIGESTS.learn(record.inputs)
+        files = resolved.ledger.roles.items()
+        raw = RawScene(resolved, tuple(FileState.of(role, file.absolute(), DIGESTS) for file, role in files))
+        placed = raw.placed()
+        key = key_of(raw.inputs, self._configuration(placed), self.software)
+        if record is None or record.key != key or not record.intact(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_placed(placed, path)
+            outputs = (FileState.of("ortho", path, name=path.name),)
+            RunRecord(name=one.name, key=key, status="done", inputs=raw.inputs, outputs=outputs).write(place)
+        return replace(one, path=path, scene=open_ortho(path, SceneOptions()), raw=raw)
+
+    def _configuration(self, placed: Placement) -> dict[str, Any]:
+        output, grid = placed.request.output, placed.grid
+        return {
+            "model": placed.model.to_dict(),
+            "grid": [grid.crs.to_wkt(), *grid.geotransform, grid.width, grid.height],
+            "surface": json_value(placed.surface.provenance),
+            "output": [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)],
+        }
