@@ -49,6 +49,19 @@ def test_a_list_and_a_pattern_count_more_than_metadata(tmp_path):
     assert {one.source for one in found} == {"list"}
 
 
+def test_clouds_and_sun_come_from_documents_and_metadata(tmp_path):
+    ortho(tmp_path / "a_20200101.tif", CLOUD_COVERAGE_ASSESSMENT="12.5")
+    ortho(tmp_path / "b_20200102.tif", CLOUD_COVER="999")
+    ortho(tmp_path / "c_20200103.tif")
+    properties = {"eo:cloud_cover": 80, "view:sun_elevation": 31.5}
+    (tmp_path / "c_20200103.json").write_text(json.dumps({"properties": properties}))
+    ortho(tmp_path / "d_20200104.tif")
+    facts = {"cloud_cover": 0.25, "sun_elevation_deg": "40"}
+    (tmp_path / "d_20200104_report.json").write_text(json.dumps({"scene": {"facts": facts}}))
+    found = [one.conditions.stated() for one in dated_orthos([tmp_path], "_%Y%m%d")]
+    assert found == [{"eo:cloud_cover": 12.5}, {}, properties, {"eo:cloud_cover": 25.0, "view:sun_elevation": 40.0}]
+
+
 def test_an_ortho_without_a_date_is_an_error(tmp_path):
     ortho(tmp_path / "a.tif")
     ortho(tmp_path / "b.tif", TIFFTAG_DATETIME="2022:05:03 10:12:00")

@@ -114,10 +114,15 @@ def test_a_step_is_found_and_scatter_is_none():
 
 def test_a_date_that_is_added_makes_pairs_only_with_itself():
     days = np.sort(np.random.default_rng(0).uniform(0, 2000, 60))
-    before = {(days[one], days[other]) for one, other in pairs_of(days.tolist())}
+    cloud = {day: 1e4 * day % 100 for day in (*days.tolist(), -5.0, 777.7, 2005.0)}
+
+    def pairs(days):
+        return pairs_of(days, clouds=[cloud[day] for day in days], suns=[20 + cloud[day] / 2 for day in days])
+
+    before = {(days[one], days[other]) for one, other in pairs(days.tolist())}
     for new in (-5.0, 777.7, 2005.0):
         longer = np.sort([*days, new])
-        after = {(longer[one], longer[other]) for one, other in pairs_of(longer.tolist())}
+        after = {(longer[one], longer[other]) for one, other in pairs(longer.tolist())}
         assert all(new in pair for pair in after - before)
         assert any(new in pair for pair in after)
 
@@ -129,3 +134,16 @@ def test_pairs_connect_all_dates_and_seasons():
     apart = np.array([days[one] - days[other] for one, other in pairs])
     assert (np.abs(apart - 365.25) < 20).sum() > 50
     assert len(pairs) < 7 * len(days)
+
+
+def test_clear_dates_are_preferred_and_all_stay_connected():
+    days, random = np.arange(0.0, 1500.0, 16.0), np.random.default_rng(3)
+    clouds = np.where(random.random(len(days)) < 0.4, 95.0, 5.0)
+    clouds[0] = 95.0
+    pairs = pairs_of(days, clouds=clouds)
+    assert {one for one, _ in pairs} == set(range(1, len(days)))
+    plain = pairs_of(days)
+    partly = [np.mean([clouds[other] > 50 for _, other in some]) for some in (pairs, plain)]
+    assert partly[0] < 0.1
+    assert partly[1] > 0.3
+    np.testing.assert_array_equal(pairs_of(days, clouds=np.full(len(days), np.nan)), plain)

@@ -68,7 +68,8 @@ def stack(
     -------
     StackResult
         `dates` has the corrections (m to east and north, and px) with their standard deviations, `orthos` the aligned
-        orthos, `files` the folder of these, stack.json and the page. `to_xarray()` is a lazy ``(time, band, y, x)``.
+        orthos, `files` the folder of these, stack.json and the page.
+        `to_xarray()` is a lazy ``(time, band, y, x)``.
 
     Raises
     ------
@@ -94,7 +95,11 @@ def stack(
         dates = rectifier.orthos(dates, told)
         nodes, placed = [*dates, *nodes[len(dates) :]], Placed.of(dates)
         matcher = Matcher(folder / _EDGES, replace(match, reference=()), scene, output, options.rebuild)
-        wanted = pairs_of([one.days for one in dates], options.neighbours)
+        seen = [one.conditions for one in dates]
+        wanted = pairs_of(
+            [one.days for one in dates], options.neighbours, [one.cloud_percent for one in seen],
+            [one.sun_elevation_deg for one in seen],
+        )  # fmt: skip
         if len(nodes) > len(dates):
             wanted += [(date, len(dates)) for date in range(len(dates))]
         pairs = matcher.pairs(nodes, wanted, lambda done, of: told("matching", done / of))

@@ -8,12 +8,13 @@ import io
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.records import FileState
+from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
 from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has_surface
 from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.orthos.verifying import RASTERS
@@ -77,6 +78,7 @@ class Dated:
     source: str
     scene: Scene
     raw: RawScene | None = None
+    conditions: Conditions = field(default_factory=Conditions)
 
     @property
     def image(self) -> Path:
@@ -133,7 +135,9 @@ def dated_orthos(
                 remedy=Text(GIVE_HEIGHTS, "; if it is an ortho, delete the old RPC or metadata files"),
             )
         time, source = _date(path, stated, pattern, options, scene)
-        dated.append(Dated(name, path, time, source, scene))
+        facts = [*(_facts_of(document) for document, _ in _documents(path)), scene.facts]
+        conditions = conditions_of(facts, open_dataset(path, **options.access))
+        dated.append(Dated(name, path, time, source, scene, conditions=conditions))
     return sorted(dated, key=lambda one: (one.time, one.name))
 
 
@@ -233,14 +237,19 @@ def _documents(path: Path) -> list[tuple[Any, str]]:
 
 def _stated_in(document: Any) -> str | None:
     """Return the date that a STAC item or a report states."""
-    if not isinstance(document, dict):
-        return None
-    for member in (document.get("properties"), document.get("scene")):
-        facts = member.get("facts", member) if isinstance(member, dict) else {}
-        for name in ("datetime", "start_datetime", "acquired"):
-            if isinstance(facts, dict) and isinstance(facts.get(name), str):
-                return str(facts[name])
-    return None
+    facts = _facts_of(document)
+    names = ("datetime", "start_datetime", "acquired")
+    return next((str(facts[name]) for name in names if isinstance(facts.get(name), str)), None)
+
+
+def _facts_of(document: Any) -> dict[str, Any]:
+    """Return the properties of a STAC item, or the facts of the scene of a report; empty if it is neither."""
+    found: dict[str, Any] = {}
+    for name in ("scene", "properties"):
+        member = document.get(name) if isinstance(document, dict) else None
+        facts = member.get("facts", member) if isinstance(member, dict) else None
+        found |= facts if isinstance(facts, dict) else {}
+    return found
 
 
 def time_of(text: str, file: str | os.PathLike[str] | None = None) -> datetime:

@@ -107,7 +107,13 @@ def _date(
         sigma_m=float(np.sqrt(np.trace(metres @ np.diag(sigma**2) @ metres.T) / 2)) if known else None,
         pairs=count,
         output=outputs.get(one.name),
+        cloud_percent=_known(one.conditions.cloud_percent),
+        sun_elevation_deg=_known(one.conditions.sun_elevation_deg),
     )
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else value
 
 
 def _pairs(dates: Sequence[Dated], pairs: Sequence[DatePair], stack: AdjustedStack) -> list[PairRecord]:

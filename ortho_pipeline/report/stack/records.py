@@ -25,6 +25,8 @@ class DateRecord(Record):
     sigma_m: float | None
     pairs: Count
     output: str | None
+    cloud_percent: float | None = None
+    sun_elevation_deg: float | None = None
 
 
 class PairRecord(Record):
