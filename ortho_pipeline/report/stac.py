@@ -1,7 +1,7 @@
 """A STAC item for an orthoimage: where and when it is, how it was seen, how accurate it is, and a checksum.
 
-Extensions: projection 2.0, raster 1.1, view 1.0, file 2.1, accuracy 1.0 beta 1 (its only published version). Accuracy
-comes from check points, or from leave-one-out residuals; control points only tell of the fit, and are left out.
+Extensions: projection 2.0, raster 1.1, eo 1.1, view 1.0, file 2.1, accuracy 1.0 beta 1 (its only published version).
+Accuracy comes from check points or leave-one-out residuals; control points only tell of the fit, and are left out.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ _EXTENSIONS = "https://stac-extensions.github.io"
 _URIS = {
     "proj": f"{_EXTENSIONS}/projection/v2.0.0/schema.json",
     "raster": f"{_EXTENSIONS}/raster/v1.1.0/schema.json",
+    "eo": f"{_EXTENSIONS}/eo/v1.1.0/schema.json",
     "view": f"{_EXTENSIONS}/view/v1.0.0/schema.json",
     "file": f"{_EXTENSIONS}/file/v2.1.0/schema.json",
     "accuracy": f"{_EXTENSIONS}/accuracy/v1.0.0-beta.1/schema.json",
@@ -113,6 +114,30 @@ def write_item(path: Path, report: SceneReport, files: Mapping[str, Path], acqui
     InputError
         If the ortho has no valid pixel, and therefore no place.
     """
+    properties = {**_view(report.scene.view), **_accuracy(report), **_filled(report)}
+    facts = report.scene.facts
+    if isinstance(facts.get("satellite"), str):
+        properties["platform"] = facts["satellite"].lower()
+    pixel = report.scene.ground_pixel_m
+    if pixel is not None:
+        properties["gsd"] = round(float(np.mean(pixel)), 4)
+    for key, side in _PICTURES.items():
+        if key in files:
+            with whole_or_nothing(files[key]) as temporary:
+                temporary.write_bytes(preview_png(staged(files["ortho"]), side=side))
+    write_ortho_item(path, files, acquired, name, properties)
+
+
+def write_ortho_item(
+    path: Path, files: Mapping[str, Path], acquired: datetime, name: str, properties: Mapping[str, Any]
+) -> None:
+    """Write the STAC item of an ortho with given properties, and with its projection, outline and checksum.
+
+    Raises
+    ------
+    InputError
+        If the ortho has no valid pixel, and therefore no place.
+    """
     import pystac
 
     ortho = staged(files["ortho"])
@@ -120,23 +145,12 @@ def write_item(path: Path, report: SceneReport, files: Mapping[str, Path], acqui
     if outline.is_empty:
         raise InputError("no pixel of the ortho is valid: it has no place", file=files["ortho"])
     geometry, box = to_geojson(outline, grid.crs)
-    properties = {**_projection(grid, outline), **_view(report.scene.view), **_accuracy(report)}
-    properties |= _filled(report)
+    properties = {**_projection(grid, outline), **properties}
     prefixes = {"file", "raster", *(name.partition(":")[0] for name in properties)}
-    facts = report.scene.facts
-    if isinstance(facts.get("satellite"), str):
-        properties["platform"] = facts["satellite"].lower()
-    pixel = report.scene.ground_pixel_m
-    if pixel is not None:
-        properties["gsd"] = round(float(np.mean(pixel)), 4)
     item = pystac.Item(
         name, geometry, box, acquired, properties, stac_extensions=[_URIS[key] for key in _URIS if key in prefixes]
     )
-    item.add_asset("ortho", _ortho_asset(files["ortho"], report, path.parent))
-    for key, side in _PICTURES.items():
-        if key in files:
-            with whole_or_nothing(files[key]) as temporary:
-                temporary.write_bytes(preview_png(ortho, side=side))
+    item.add_asset("ortho", _ortho_asset(files["ortho"], path.parent))
     for key, title, media, roles in _ASSETS:
         if key in files and staged(files[key]).is_file():
             item.add_asset(key, pystac.Asset(_href(files[key], path.parent), title, media_type=media, roles=roles))
@@ -163,7 +177,7 @@ def _href(path: Path, folder: Path) -> str:
     return f"./{path.relative_to(folder).as_posix()}"
 
 
-def _ortho_asset(path: Path, report: SceneReport, folder: Path) -> Any:
+def _ortho_asset(path: Path, folder: Path) -> Any:
     import pystac
 
     content = staged(path)

@@ -114,6 +114,23 @@ def test_the_cube_is_the_aligned_orthos(made):
     assert cube.x.values[0] == west + dx / 2
 
 
+def test_each_date_has_an_item_with_its_sigma(made):
+    output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
+    result = run([made[0][0].parent], made[1], output=output)
+    catalog = json.loads(result.files["stac"].read_text())
+    links = [link["href"] for link in catalog["links"] if link["rel"] == "item"]
+    assert links == [f"./{path.stem}_stac.json" for path in made[0]]
+    for link, one in zip(links, result.dates, strict=True):
+        item = json.loads((made[1] / "aligned" / link).read_text())
+        assert item["properties"]["ortho:stack_sigma"] == pytest.approx(one.sigma_m, abs=1e-4)
+        assert item["properties"]["datetime"][:10] == one.time[:10]
+        assert (made[1] / "aligned" / item["assets"]["ortho"]["href"]).samefile(result.orthos[one.name])
+    with pytest.raises(InputError, match="items need aligned orthos"):
+        run([made[0][0].parent], made[1], StackOptions(corrections_only=True), output=output)
+    run([made[0][0].parent], made[1])
+    assert list(made[1].rglob("*_stac.json")) == []
+
+
 def test_neither_order_nor_threads_change_a_byte(made, tmp_path):
     output = OutputOptions(resampling="cubic", threads=2, format="GTiff")
     run(made[0][::-1], tmp_path / "out", output=output)

@@ -12,6 +12,7 @@ import numpy as np
 from ortho_pipeline.batch.records import locked
 from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, time_of
 from ortho_pipeline.batch.stack.document import record_of
+from ortho_pipeline.batch.stack.items import items_of, write_items
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, pixel_of
 from ortho_pipeline.batch.stack.raw import Rectifier
@@ -23,7 +24,7 @@ from ortho_pipeline.block.stack.graph import pairs_of
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.files import together, write_json
+from ortho_pipeline.files import retire, together, write_json
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.report.stack.page import write_page
@@ -68,7 +69,7 @@ def stack(
     -------
     StackResult
         `dates` has the corrections (m to east and north, and px) with their standard deviations, `orthos` the aligned
-        orthos, `files` the folder of these, stack.json and the page.
+        orthos, `files` the folder of these, stack.json, the page, and with `output.stac` the catalog of items.
         `to_xarray()` is a lazy ``(time, band, y, x)``.
 
     Raises
@@ -87,6 +88,12 @@ def stack(
             "a stack is written to a folder on this machine", file=str(folder), field="folder", remedy="give a folder"
         )
     output = OutputOptions(resampling="cubic") if output is None else output
+    if output.stac and options.corrections_only:
+        raise InputError(
+            "STAC items need aligned orthos, and only corrections are written",
+            field="output.stac",
+            remedy=Text("leave out ", Setting("output.stac"), " or ", Setting("stack.corrections_only")),
+        )
     dates = dated_orthos(orthos, options.date_pattern, scene, surface)
     nodes, fixed = _with_datum(dates, options.datum, match, scene)
     told, folder = progress or (lambda what, share: None), Path(folder)
@@ -109,6 +116,11 @@ def stack(
         outputs = writer.write(dates, solved, told)
         record = record_of(dates, placed, pairs, solved, outputs, options.datum)
         files = {"aligned": aligned, "json": folder / "stack.json", "html": folder / "stack.html"}
+        with together(aligned, "items of a stack"):
+            # Items of an earlier run would state its sigmas.
+            retire(items_of(aligned, dates))
+            if output.stac:
+                files["stac"] = write_items(aligned, dates, record)
         with together(folder, "stack"):
             write_json(files["json"], record.to_json())
             write_page(record, files["html"])

@@ -23,7 +23,7 @@ from ortho_pipeline.options.option import RESAMPLING
 @click.option("--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True)
 @folder_option
 @open_option
-@click_options("output", OutputOptions, "nodata", "creation_options", "memory", "threads")
+@click_options("output", OutputOptions, "stac", "nodata", "creation_options", "memory", "threads")
 @click_options("scene", SceneOptions, "allow_network", "roots")
 @json_option
 def stack(
