@@ -40,6 +40,8 @@ KINDS: dict[str, dict[str, Any]] = {
     "hard": {"moving": 0.4, "wrong": 0.05, "hidden": 0.3},
     "rough": {"length": 0.05, "of_date": 0.1, "of_edge": 0.1},
     "long": {"length": 0.3, "of_date": 0.1, "of_edge": 0.1},
+    "sharp": {"sharp": True},
+    "sharp and rough": {"sharp": True, "length": 0.05, "of_date": 0.1, "of_edge": 0.1},
     "sloped": {"sloped": 5},
     "step": {"scatter": 0.5, "step": 2.0},
 }

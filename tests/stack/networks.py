@@ -5,10 +5,12 @@ Nothing here knows of the adjustment. Fields are smoothed white noise on a finer
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import spatial
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from ortho_pipeline.block.stack.edges import Cells, Edges
@@ -31,6 +33,8 @@ class Truth:
         Sigma (px) of smooth errors that all edges of a date share, and of an edge.
     length : float
         Of smooth errors, in parts of the area.
+    sharp : bool
+        Whether the correlation of these errors is exponential; else it is Gaussian.
     moving : float
         Part of the places that move, at up to `rate` px a year.
     wrong : float
@@ -52,6 +56,7 @@ class Truth:
     of_date: float = 0.05
     of_edge: float = 0.05
     length: float = 0.12
+    sharp: bool = False
     moving: float = 0.0
     rate: float = 1.0
     wrong: float = 0.0
@@ -90,6 +95,12 @@ class Truth:
         edges = Edges(pairs[:, 0], pairs[:, 1], value, np.full(value.shape[:2], self.noise**2), np.zeros(len(pairs)))
         return Made(self, edges, days / 365.25, shift, slopes, np.hypot(*rate.T) > 0, rate, bad)
 
+    @functools.cached_property
+    def _root(self) -> Array:
+        """Root of exponential correlations that fall to 1/e where the Gaussian ones do."""
+        distance = spatial.distance.cdist(self.cells.place, self.cells.place)
+        return np.asarray(np.linalg.cholesky(np.exp(-distance / (4.0 * self.length)) + 1e-9 * np.eye(len(distance))))
+
     def _motion(self, random: np.random.Generator) -> Array:
         """Return rates ``(K, 2)`` of a connected part of the places."""
         place = self.cells.place
@@ -102,6 +113,8 @@ class Truth:
         return rate
 
     def _field(self, random: np.random.Generator) -> Array:
+        if self.sharp:
+            return np.asarray(self._root @ random.standard_normal((len(self.cells.place), 2)))
         size = 96
         found = []
         where = (self.cells.place + 1) / 2 * 47 + 24

@@ -30,7 +30,9 @@ def spread(stacks: list[tuple[Made, AdjustedStack]]) -> float:
 
 
 def test_sigmas_hold_and_dates_agree():
-    stacks = [solved(seed=seed, dates=16) for seed in range(20, 25)]
+    rough = {"length": 0.05, "of_date": 0.1, "of_edge": 0.1}
+    kinds: list[dict[str, Any]] = [{}, {"sharp": True}, rough, {"sharp": True, **rough}, {"sloped": 3}]
+    stacks = [solved(seed=seed, dates=16, **kind) for seed, kind in enumerate(kinds, 20)]
     assert 0.85 < spread(stacks) < 1.15
     misfit = np.concatenate(
         [np.hypot(*(e - e[:, None])[np.triu_indices(16, 1)].T) for e in (errors(*s) for s in stacks)]

@@ -2,9 +2,10 @@ r"""Errors of the values of edges: which part belongs to a date, which to an edg
 
 The error of the edge from date b to date a at place k is :math:`s_a(k) - s_b(k) + u(k)`. The field :math:`s` of a date
 is the same in all of its edges: noise of its pixels, shadows, bending. The field :math:`u` belongs to the edge. Each is
-a sum of noise of single places and of exponential correlations with some ranges. Their variances follow from moments:
-products of residuals of places at similar distances, within edges and between edges with a common date. What the trend
-takes from the residuals is part of the expected products. Variances are not negative.
+a sum of noise of single places and of correlations with some ranges. These are exponential and Gaussian: with one of
+both alone, errors of the other form would have too long or too short a tail, and sigmas would be wrong. Their variances
+follow from moments: products of residuals of places at similar distances, within edges and between edges with a common
+date. What the trend takes from the residuals is part of the expected products. Variances are not negative.
 
 The mean size of the residuals gives each date a scale of :math:`s`, and each edge one of :math:`u`.
 
@@ -26,6 +27,7 @@ from ortho_pipeline.models.base import Array
 
 #: Ranges of correlations, in halves of the longer side, and upper limits of the classes of distances.
 _RANGES = 0.2, 0.45, 1.0
+_TERMS = 1 + 2 * len(_RANGES)
 _CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
 #: Edges and pairs of edges whose products are taken, at most.
 _EDGES, _PAIRS = 120, 180
@@ -40,8 +42,9 @@ class ErrorComponents:
 
     Parameters
     ----------
-    shared, own : (2, 4)
-        Of a date and of an edge, along both axes: noise of single places, and correlations of three ranges.
+    shared, own : (2, 7)
+        Of a date and of an edge, along both axes: noise of single places, and exponential and Gaussian correlations of
+        three ranges.
     scale : (T,)
         Of the variances of each date.
     factor : (E,)
@@ -99,9 +102,9 @@ class ErrorComponents:
 
 
 def _correlations(place: Array) -> Array:
-    """Return the correlations ``(ranges, K, K)`` of places."""
-    distance = spatial.distance.cdist(place, place)
-    return np.exp(-distance / np.array(_RANGES)[:, None, None])
+    """Return the correlations ``(2 ranges, K, K)`` of places: exponential, and Gaussian."""
+    distance = spatial.distance.cdist(place, place) / np.array(_RANGES)[:, None, None]
+    return np.concatenate([np.exp(-distance), np.exp(-(distance**2))])
 
 
 def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> ErrorComponents:
@@ -112,7 +115,7 @@ def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Err
     typical = max(typical, 1e-6)
     left = trends.residual / np.maximum(size, 1e-9)[:, None, None]
     shapes = _Shapes(edges, trends, place, left)
-    shared, own = np.empty((2, 1 + len(_RANGES))), np.empty((2, 1 + len(_RANGES)))
+    shared, own = np.empty((2, _TERMS)), np.empty((2, _TERMS))
     seen = np.zeros(2)
     for axis, (of_date, of_edge, parts) in enumerate(shapes.variances()):
         shared[axis], own[axis] = of_date, of_edge
@@ -121,7 +124,7 @@ def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> Err
     if whole > 0:
         shared, own, seen = shared / whole, own / whole, seen / whole
     else:
-        shared[:], own[:], seen = 0.0, [1.0, 0.0, 0.0, 0.0], np.array([0.0, 1.0])
+        shared[:], own[:], seen = 0.0, np.eye(_TERMS)[0], np.array([0.0, 1.0])
     scale, factor = _scales(edges, good, (size / typical) ** 2, seen, dates)
     return ErrorComponents(shared * typical**2, own * typical**2, scale, factor, np.zeros(2))
 
@@ -156,7 +159,7 @@ class _Shapes:
         self.pairs = _spread(_with_common_date(edges, good), _PAIRS)
 
     def variances(self) -> list[tuple[Array, Array, Array]]:
-        """Return variances of a date and of an edge ``(4,)``, and their parts ``(2,)`` of a residual, of both axes."""
+        """Return variances of a date and of an edge ``(7,)``, and their parts ``(2,)`` of a residual, of both axes."""
         same, seen, number = self._sums(self.single)
         between, cross, many = self._sums(self.pairs)
         design = np.vstack([np.hstack([2 * same, same]), np.hstack([between, np.zeros_like(between)])])
@@ -172,8 +175,8 @@ class _Shapes:
         return result
 
     def _sums(self, pairs: list[tuple[int, int, float]]) -> tuple[Array, Array, Array]:
-        """Return expected sums ``(classes, 4)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
-        classes, terms = len(_CLASSES) + 1, 1 + len(_RANGES)
+        """Return expected sums ``(classes, 7)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
+        classes, terms = len(_CLASSES) + 1, _TERMS
         expected, seen, number = np.zeros((classes, terms)), np.zeros((classes, 2)), np.zeros(classes)
         design, relative = self.trends.design, np.sqrt(self.edges.relative)
         for one, other, sign in pairs:
@@ -184,12 +187,12 @@ class _Shapes:
             for axis in (0, 1):
                 product = sign * np.outer(self.left[one, rows, axis], self.left[other, columns, axis])
                 seen[:, axis] += np.bincount(place, product.ravel(), classes)
-            before = design[rows] @ self.trends.weights[one, rows].T
-            behind = design[columns] @ self.trends.weights[other, columns].T
+            before, behind = self.trends.weights[one, rows], self.trends.weights[other, columns]
             noise = (rows[:, None] == columns) * np.outer(relative[one, rows], relative[other, columns])
             for term, kernel in enumerate([noise, *self.correlations[:, block[0], block[1]]]):
-                left = kernel - before @ kernel
-                left = left - left @ behind.T
+                # From the left, and from the right: a trend has few terms, so no square matrices are multiplied.
+                left = kernel - design[rows] @ (before.T @ kernel)
+                left = left - (left @ behind) @ design[columns].T
                 expected[:, term] += np.bincount(place, left.ravel(), classes)
         return expected, seen, number
 
