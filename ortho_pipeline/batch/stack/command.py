@@ -15,7 +15,7 @@ from ortho_pipeline.batch.stack.document import record_of
 from ortho_pipeline.batch.stack.items import items_of, write_items
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, pixel_of
-from ortho_pipeline.batch.stack.raw import Rectifier
+from ortho_pipeline.batch.stack.raw import Levelled, Rectifier
 from ortho_pipeline.batch.stack.result import StackResult, summary
 from ortho_pipeline.batch.stack.writing import Told, Writer
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
@@ -167,21 +167,35 @@ def _adjusted(
             remedy=Text("check that the orthos show one place, or search farther with ", Setting("match.search")),
         )
     cells = Cells.over(*placed.covered(dates))
+    years = [one.days / _DAYS_A_YEAR for one in nodes]
+    years = [year if number < len(dates) else np.nan for number, year in enumerate(years)]
+    solved = adjust(cells, _edges(nodes, placed, cells, matched), years, datum, affine=affine)
+    if any(one.raw is not None for one in dates):
+        # Where an ortho shows the ground displaced, it was made with the height of another place.
+        edges = _edges(nodes, placed, cells, matched, Levelled.of(dates, placed, solved))
+        solved = adjust(cells, edges, years, datum, affine=affine)
+    return solved
+
+
+def _edges(
+    nodes: Sequence[Dated], placed: Placed, cells: Cells, matched: Sequence[DatePair], levelled: Levelled | None = None
+) -> Edges:
+    """Return the edges of matched pairs."""
     step = float(np.sqrt(placed.grid.dx * placed.grid.dy))
     value, variance, alike = [], [], []
     for pair in matched:
         assert pair.matches is not None
         place, shown, sigma = pair.matches.arrays
         own = pixel_of(nodes[pair.first]) / step
-        at = placed.at(place)
-        mean, spread = cells.sampled(at, placed.at(shown) - at, sigma * own)
+        at, seen = placed.at(place), placed.at(shown)
+        if levelled is not None:
+            at, seen = levelled.pair(pair.first, pair.second, at, seen)
+        known = np.isfinite(at).all(axis=1) & np.isfinite(seen).all(axis=1)
+        mean, spread = cells.sampled(at[known], (seen - at)[known], sigma[known] * own)
         value.append(mean)
         variance.append(spread)
         alike.append(pair.matches.alike_px * own)
-    edges = Edges(
+    return Edges(
         np.array([pair.first for pair in matched]), np.array([pair.second for pair in matched]), np.array(value),
         np.array(variance), np.array(alike),
     )  # fmt: skip
-    years = [one.days / _DAYS_A_YEAR for one in nodes]
-    years = [year if number < len(dates) else np.nan for number, year in enumerate(years)]
-    return adjust(cells, edges, years, datum, affine=affine)

@@ -15,6 +15,7 @@ from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.models import ImageCorrection, MapGrid
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface.base import Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,12 @@ class Placed:
     def at(self, plan: Array) -> Array:
         """Return places ``(n, 2)`` px of map coordinates ``(n, 2)``."""
         return self.model.ground_to_image(np.column_stack([plan, np.zeros(len(plan))]))
+
+    def on(self, surface: Surface, place: Array) -> Array:
+        """Return the ground ``(n, 3)`` in map coordinates at places ``(n, 2)`` px on a surface."""
+        ground = self.model.image_to_ground(place, 0.0)
+        ground[:, 2] = surface.heights(ground[:, :2], self.model.crs)
+        return ground
 
     def covered(self, dates: Sequence[Dated]) -> tuple[Array, Array]:
         """Return the lowest and highest place (px) of the orthos."""

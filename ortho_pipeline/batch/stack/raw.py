@@ -5,7 +5,7 @@ The aligned ortho is resampled once, from the raw image.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,13 @@ from ortho_pipeline.files import clear_up
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.surface.footprint import image_grid
 from ortho_pipeline.surface.rays import meet_surface
 
-#: Places per side of the image at which a correction is transferred to the model, and rounds of its inversion.
-_SIDE, _ROUNDS = 17, 3
+#: Places per side of the image at which a correction is transferred to the model, and how many need heights.
+_SIDE, _FEWEST = 17, 3
 
 
 def write_placed(placed: Placement, path: Path) -> None:
@@ -51,28 +52,66 @@ def write_placed(placed: Placement, path: Path) -> None:
     warp_placed(placed, None, open_rasters(placed.scene, placed.request), path, lambda stage, share: None)
 
 
+@dataclass(frozen=True, eq=False)
+class Levelled:
+    """Positions in orthos of raw scenes, as if they were made with the heights of the places that they show.
+
+    An ortho that shows ground displaced was made with the heights next to it. On slopes this adds to the displacement.
+    Here rays end at the height of the true place, so that an error of the model is the same on all slopes.
+
+    Parameters
+    ----------
+    placements : mapping of int to Placement
+        Raw scenes by the numbers of their dates.
+    stack : AdjustedStack
+        From the positions in the orthos; it says where the true places are.
+    """
+
+    placements: Mapping[int, Placement]
+    placed: Placed
+    stack: AdjustedStack
+
+    @classmethod
+    def of(cls, dates: Sequence[Dated], placed: Placed, stack: AdjustedStack) -> Levelled:
+        """Return the positions of a stack."""
+        raw = {number: one.raw.placed() for number, one in enumerate(dates) if one.raw is not None}
+        return cls(raw, placed, stack)
+
+    def pair(self, first: int, second: int, at: Array, seen: Array) -> tuple[Array, Array]:
+        """Return positions ``(n, 2)`` px of matches in the earlier ortho (`second`) and in the later one.
+
+        NaN where heights are unknown.
+        """
+        true = at - self.stack.at(at)[0][second]
+        return self._one(second, at, true), self._one(first, seen, true)
+
+    def _one(self, date: int, shown: Array, true: Array) -> Array:
+        placement = self.placements.get(date)
+        if placement is None:
+            return shown
+        model, crs = placement.model, self.placed.model.crs
+        seen = model.ground_to_image(ground_transform(crs, model.crs)(self.placed.on(placement.surface, shown)))
+        level = model.image_to_ground(seen, self.placed.on(placement.surface, true)[:, 2])
+        return self.placed.at(ground_transform(model.crs, crs)(level)[:, :2])
+
+
 def corrected_model(placement: Placement, placed: Placed, stack: AdjustedStack, date: int) -> ImageCorrection:
     """Return the delivered model of a raw scene with the correction of its date.
 
-    Its ortho shows ground displaced by the correction. At places all over the scene, the pixel that shows the ground
-    is compared with the pixel that the delivered model gives for the same ground: their difference, as a shift or
-    affine transformation of the image, is the error of the model.
+    The correction displaces the ground at its own height. At places all over the scene, the pixel of the displaced
+    place is compared with that of the place: their difference, as a shift or affine transformation of the image, is the
+    error of the model.
     """
-    model, surface = placement.model, placement.surface
+    model, crs = placement.model, placed.model.crs
     size = placement.scene.width, placement.scene.height
-    seen = image_grid(*size, _SIDE)
-    ground = meet_surface(model, seen, surface)
-    known = np.isfinite(ground).all(axis=1)
-    seen, crs = seen[known], placed.model.crs
-    shown = placed.at(ground_transform(model.crs, crs)(ground[known])[:, :2])
-    true = shown
-    for _ in range(_ROUNDS):
-        true = shown - _at_each(stack, true, date)
-    plan = placed.model.image_to_ground(true, 0.0)[:, :2]
-    there = np.column_stack([plan, surface.heights(plan, crs)])
-    predicted = model.ground_to_image(ground_transform(crs, model.crs)(there))
-    used = np.isfinite(predicted).all(axis=1)
-    if used.sum() < 3:
+    ground = ground_transform(model.crs, crs)(meet_surface(model, image_grid(*size, _SIDE), placement.surface))
+    there = ground[np.isfinite(ground).all(axis=1)]
+    place = placed.at(there[:, :2])
+    moved = placed.model.image_to_ground(place + stack.at(place)[0][date], there[:, 2])
+    to_model = ground_transform(crs, model.crs)
+    predicted, seen = model.ground_to_image(to_model(there)), model.ground_to_image(to_model(moved))
+    used = np.isfinite(predicted).all(axis=1) & np.isfinite(seen).all(axis=1)
+    if used.sum() < _FEWEST:
         raise InputError(
             "this scene has no heights where its correction is applied",
             file=placement.scene.path,
@@ -86,11 +125,6 @@ def corrected_model(placement: Placement, placed: Placed, stack: AdjustedStack, 
     return ImageCorrection(
         model, kind, (float(origin[0]), float(origin[1])), np.concatenate([terms[:, 0], terms[:, 1]])
     )
-
-
-def _at_each(stack: AdjustedStack, place: Any, date: int) -> Any:
-    """Return the corrections (px) of a date at places ``(n, 2)``."""
-    return stack.at(place)[0][date]
 
 
 @dataclass(frozen=True, eq=False)
