@@ -106,6 +106,13 @@ class Linear:
         )
 
     @property
+    def lost(self) -> Mask:
+        """Points ``(N,)`` that take part, but are outside of a model that shows them."""
+        found = np.zeros(len(self.problem.points), dtype=bool)
+        found[self.problem.points.point[~np.isfinite(self.misfits.rays).all(axis=1)]] = True
+        return found
+
+    @property
     def pseudo_design(self) -> Array:
         """Rows ``(k, P)`` of the pseudo-observations."""
         size, pseudo = self.problem.size, self.pseudo

@@ -165,11 +165,13 @@ class Heights:
         """
         heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
-            judged, state = heights._under(solved.problem, solved.state.local)._judged(solved, number), solved.state
+            state = solved.state
+            judged = heights._under(solved.problem, state.local)._with_shared_errors(solved, number)
             if judged.common.value is not heights.common.value:
                 # Points and images follow the shared errors, so that the DEM is read where they will be.
                 state = judged.common.followed(heights.common, solved)
                 judged = judged._following(solved, state.local)
+            judged = judged._judged(solved, state.local, number)
             problem = judged.applied(solved.problem)
             if _same_errors(judged, heights) and _stable(solved, problem):
                 return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
@@ -179,20 +181,25 @@ class Heights:
             solved, heights = again, judged
         return solved, heights
 
-    def _judged(self, solved: Solved, number: int) -> Heights:
-        """Return them with sigma, shared errors and wrong heights by a solution."""
+    def _with_shared_errors(self, solved: Solved, number: int) -> Heights:
+        """Return them with the errors that they share by a solution."""
         slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
         if self.spots is not None:
             common, slope = self.spots.told(common, self.sigma, slope)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
-            common = replace(common, value=common.value + step)
+            # The DEM is rougher than its planes, so whole steps of its shift would swing about the best without end.
+            common = replace(common, value=common.value + (0.5 * step if number else step))
+        return replace(self, common=common)
+
+    def _judged(self, solved: Solved, local: Array, number: int) -> Heights:
+        """Return them with sigma and wrong heights by a solution whose points follow the shared errors to `local`."""
         # Otherwise heights at the limit may be left out and return without end.
         settled = number > _SEARCHED
-        spots = self.spots if self.spots is None or settled else self.spots.judged(common, self.sigma)
-        judged = replace(self, common=common, spots=spots)
-        residuals, variances, used = judged._residuals(solved)
+        spots = self.spots if self.spots is None or settled else self.spots.judged(self.common, self.sigma)
+        judged = replace(self, spots=spots)
+        residuals, variances, used = judged._residuals(solved, local)
         if self.stated is None:
             judged = judged._estimated(residuals, variances, used)
         elif number:
@@ -221,12 +228,12 @@ class Heights:
         far = np.abs(moved).max() > _MOVED * self.source.surface.sample_size
         return replace(heights, broken=heights._breaking(solved)) if far else heights
 
-    def _residuals(self, solved: Solved) -> tuple[Array, Array, Mask]:
-        """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
+    def _residuals(self, solved: Solved, local: Array) -> tuple[Array, Array, Mask]:
+        """Return how far heights are above points at `local` ``(N,)`` m, the variances of that, and which take part.
 
         The residual of a height that takes part varies less than the height, that of another one more.
         """
-        problem, local = solved.problem, solved.state.local
+        problem = solved.problem
         planes = self._planes(problem, self.of)
         rows = np.zeros(len(local), dtype=bool)
         rows[solved.linear.ordering.numbers] = True
