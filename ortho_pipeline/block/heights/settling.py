@@ -165,9 +165,10 @@ class Heights:
         """
         heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
-            state = solved.state
-            judged = heights._under(solved.problem, state.local)._with_shared_errors(solved, number)
-            if judged.common.value is not heights.common.value:
+            judged, state = heights._with_shared_errors(solved, number), solved.state
+            if judged.common.value is heights.common.value:
+                judged = judged._under(solved.problem, state.local)
+            else:
                 # Points and images follow the shared errors, so that the DEM is read where they will be.
                 state = judged.common.followed(heights.common, solved)
                 judged = judged._following(solved, state.local)
