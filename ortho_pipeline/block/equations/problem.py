@@ -238,7 +238,7 @@ class BlockProblem:
         return Misfits(self.ray_misfits(predicted, weights), ground, self.pseudo_equations(state).misfit)
 
     def ray_misfits(self, predicted: Array, weights: Selection) -> Array:
-        """Return the misfits ``(M, 2)`` of image points `predicted` ``(M, 2)``, of what takes no part those measured."""
+        """Return the misfits ``(M, 2)`` of image points `predicted`; of what takes no part, those measured."""
         points = self.points
         scale = np.sqrt(weights.ray_weights) / points.sigma_image
         return points.whitened((points.measured - predicted) * scale[:, None], slice(None))

@@ -210,7 +210,7 @@ class Heights:
         sigmas = np.sqrt(np.maximum(variances, (0.2 * judged.sigmas) ** 2))
         with np.errstate(invalid="ignore"):
             wrong = np.abs(residuals) > np.where(self.wrong, _RIGHT, _WRONG) * sigmas
-        broken = judged.broken if number else judged._breaking(solved)
+        broken = judged.broken if number else _breaking(judged, solved)
         return replace(judged, wrong=np.asarray(judged.of & wrong), broken=broken)
 
     def _following(self, solved: Solved, local: Array) -> Heights:
@@ -227,7 +227,7 @@ class Heights:
         heights = replace(self, source=source, common=common, terrain=terrain, spots=spots)
         heights = heights._under(solved.problem, local)
         far = np.abs(moved).max() > _MOVED * self.source.surface.sample_size
-        return replace(heights, broken=heights._breaking(solved)) if far else heights
+        return replace(heights, broken=_breaking(heights, solved)) if far else heights
 
     def _residuals(self, solved: Solved, local: Array) -> tuple[Array, Array, Mask]:
         """Return how far heights are above points at `local` ``(N,)`` m, the variances of that, and which take part.
@@ -287,24 +287,25 @@ class Heights:
             return self
         return replace(self, scale=scale, spots=None if self.spots is None else replace(self.spots, scale=scale))
 
-    def _breaking(self, solved: Solved) -> Mask:
-        """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
-        covariance = solved.ground_covariance(solved.cofactors, 1.0)
-        plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
-        rows = np.flatnonzero(self.of & np.isfinite(plan))
-        ground, slopes, found = self.terrain.ground, np.nan_to_num(self.terrain.slopes), self.broken.copy()
-        # The uncertainty is larger while the images are still displaced.
-        far = self.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], self.source.surface.sample_size))
-        with np.errstate(invalid="ignore"):
-            found[rows] = far > _BREAKS * self.sigmas[rows]
-        return found
-
     @property
     def sigma_is(self) -> Literal["stated", "enlarged", "estimated", "assumed"]:
         """The source of the sigmas."""
         if self.stated is not None:
             return "enlarged" if self.scale > 1.0 else "stated"
         return "estimated" if self.estimated else "assumed"
+
+
+def _breaking(heights: Heights, solved: Solved) -> Mask:
+    """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
+    covariance = solved.ground_covariance(solved.cofactors, 1.0)
+    plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
+    rows = np.flatnonzero(heights.of & np.isfinite(plan))
+    ground, slopes, found = heights.terrain.ground, np.nan_to_num(heights.terrain.slopes), heights.broken.copy()
+    # The uncertainty is larger while the images are still displaced.
+    far = heights.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], heights.source.surface.sample_size))
+    with np.errstate(invalid="ignore"):
+        found[rows] = far > _BREAKS * heights.sigmas[rows]
+    return found
 
 
 def _same_errors(one: Heights, other: Heights) -> bool:
