@@ -331,7 +331,7 @@ def main(arguments: list[str]) -> int:
         "--keep", type=Path, help="folder for the results; what it holds is not run again (-n 0: shown)"
     )
     parser.add_argument("-j", type=int, default=2, help="processes")
-    parser.add_argument("--real", action="store_true", help="of the real files in ../shared/data, one after the other")
+    parser.add_argument("--real", action="store_true", help="of the real files, one after the other")
     chosen = parser.parse_args(arguments)
     names = chosen.reader or [reader.name for reader in READERS]
     if chosen.show is not None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
-#: Next to the checkout, as for the tests marked `realdata`.
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+# `fuzz.py` runs without the paths of pytest, too.
+sys.path.append(str(Path(__file__).resolve().parents[2] / "tools"))
+
+from real_data import data_folder
+
+REAL = data_folder()
 #: Reader -> real files that it reads, below `REAL`.
 FILES: dict[str, tuple[str, ...]] = {
     "rpc-text": ("gdal/gcore/data/test_rpc.txt", "gdal/gcore/data/md_ov_rpc.txt",
