@@ -32,6 +32,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+# As a script it runs without the paths of pytest.
+sys.path += [str(Path(__file__).resolve().parents[1] / "sensors"), str(Path(__file__).resolve().parents[2] / "tools")]
+
 from mutate import mutant
 from osgeo import gdal
 from readers import BY_NAME, READERS, Reader, numbers

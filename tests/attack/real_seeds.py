@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-
-# `fuzz.py` runs without the paths of pytest, too.
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tools"))
 
 from real_data import data_folder
 
