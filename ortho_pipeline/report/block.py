@@ -216,12 +216,18 @@ def summary_text(report: BlockReport) -> str:
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
-    lines += [*height_lines(adjustment.heights), *sigma_lines(report)]
+    lines += height_lines(adjustment.heights)
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     said, errors = _signals_of(report), errors_of_block(report)
-    first = [*accuracy_lines(report, errors), *_notes(head, said), *error_lines(errors), *signal_lines(said)]
+    first = [
+        *accuracy_lines(report, errors),
+        *sigma_lines(report),
+        *_notes(head, said),
+        *error_lines(errors),
+        *signal_lines(said),
+    ]
     return Text.joined("\n", [*first, *lines])
 
 
@@ -263,12 +269,12 @@ def sigma_lines(report: BlockReport) -> list[str]:
     found = []
     if (ground := report.absolute) is not None:
         found.append(
-            f"Absolute accuracy: sigma {ground.east_m:.2g} m east, {ground.north_m:.2g} m north, "
+            f"Expected absolute accuracy: sigma {ground.east_m:.2g} m east, {ground.north_m:.2g} m north, "
             f"{ground.height_m:.2g} m in height (median of {counted(ground.points, 'point')})"
         )
     if (pairs := report.relative) is not None:
         found.append(
-            f"Relative position of {counted(pairs.pairs, 'pair')} of images: sigma {pairs.median_px:.2g} px "
+            f"Expected relative position of {counted(pairs.pairs, 'pair')} of images: sigma {pairs.median_px:.2g} px "
             f"(median), {pairs.worst_px:.2g} px (worst)"
         )
     return found
