@@ -3,6 +3,8 @@
 #   make demo     set up, orthorectify the sample scene, say where the ortho and the report are
 #   make test     set up, run the tests (under ten minutes on two cores)
 #   make test-all the same with those marked slow
+#   make real-data  fetch the real images of the tests marked `realdata` into out/real-data (51 MB from public
+#                 repositories); they may be used for tests and are not part of this package
 #   make faults   commands limited, killed, cut off: no broken or mixed outputs (N=400 write limits, 3/4 as many kills)
 #   make check    formatting, lint, types (make lint), tests
 #   make test-with  the tests with the oldest packages that pyproject.toml allows, or RESOLUTION=highest: the newest
@@ -46,7 +48,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-with faults mutants lint check dist page-types fuzz bench peers packages docs images constraints pin-image clean
+.PHONY: help setup demo test test-all test-with real-data faults mutants lint check dist page-types fuzz bench peers packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -73,6 +75,10 @@ test: setup
 
 test-all: setup
 	@$(PYTEST)
+
+# Needs Python alone.
+real-data:
+	@$(PYTHON) tools/real_data.py
 
 faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup

@@ -309,7 +309,7 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
     on_map = dataset.GetProjection() and dataset.GetGeoTransform(can_return_null=True) is not None
     finished = Text("")
     if on_map:
-        use = "For a finished ortho use `ortho verify` or `ortho align`, or add "
+        use = "For a finished ortho use the commands verify or align, or add "
         finished = Text(". ", use, Setting("scene.ortho"))
     return InputError(
         "no sensor recognises this image: it has no RPC, and no metadata of a known product are next to it",

@@ -152,7 +152,8 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False, pixel: floa
         return said(UNKNOWN, _NO_CHECKS)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
     if sizes:
-        agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {counted(len(sizes), 'ray')})."
+        of = counted(len(sizes), "image measurement")
+        agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {of})."
         notes.insert(0, f"{agree} This tests neither positions nor heights.")
     return said(UNKNOWN, _NO_CHECKS)
 
@@ -216,15 +217,16 @@ def summary_text(report: BlockReport) -> str:
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
-    lines += height_lines(adjustment.heights)
+    expected, unknown = sigma_lines(report), head.figure == UNKNOWN
+    lines += [*height_lines(adjustment.heights), *([] if unknown else expected)]
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     said, errors = _signals_of(report), errors_of_block(report)
     first = [
         *accuracy_lines(report, errors),
-        *sigma_lines(report),
         *_notes(head, said),
+        *(expected if unknown else []),
         *error_lines(errors),
         *signal_lines(said),
     ]
@@ -356,7 +358,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         marks=_marks(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         ground_sigmas=variance_lines(adjustment.variances),
-        sigmas=sigma_lines(report),
+        expected=sigma_lines(report),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(
             zip(adjustment.points, report.network.largest_deg, strict=True), key=lambda one: ROLES.index(one[0].role)

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from ortho_pipeline.commands.control.matching import Matched, match_scene
 from ortho_pipeline.commands.orthos.masks import ClassMask
-from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
@@ -30,6 +30,8 @@ from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.flat import FlatSurface
 
+#: Cells per side in which an ortho is looked at.
+CELLS = 16
 #: Default search radius: metres, pixels, and part of the shorter side.
 _METRES, _PIXELS, _PART = 100.0, 30.0, 0.25
 #: Matchings after the first, at most, and how far (px, and chip px) they search.
@@ -98,6 +100,11 @@ class MeasuredOrtho:
     def chip(self) -> float:
         """Side (px) of a chip: matches share noise up to that distance."""
         return float(SIDE * self.matched.matches.factor)
+
+    @functools.cached_property
+    def filled(self) -> Array:
+        """Shares ``(CELLS, CELLS)`` of pixels that have a value, in cells along rows and columns."""
+        return filled_of(self.scene, self.opened, CELLS)
 
     @functools.cached_property
     def field(self) -> DisplacementField:
