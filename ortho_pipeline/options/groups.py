@@ -145,7 +145,7 @@ class PointOptions:
             "--correction",
             "What to adjust: image coordinates (shift, shift-drift, affine), or the parameters of the model "
             "(model), such as the exterior orientation of a frame.",
-            unset="shift if there are control points",
+            unset="a shift; with a reference, what the matches justify",
             choices=CORRECTIONS,
         ),
     ] = None
@@ -294,7 +294,7 @@ class MatchOptions:
             "M",
             kind="number",
             above=0,
-            unset="three times the accuracy that the metadata state, else 100",
+            unset="three times the stated accuracy, else 100, or a quarter of a smaller image",
         ),
     ] = None
     search_rotation: Annotated[

@@ -131,7 +131,7 @@ def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
     """By ties alone the sigma covers the misfit, and it is warned of; with heights neither is there."""
     block = fly(Chain(), 4)
     alone = adjust(block.start, block.points)
-    weak = weak_joins(joins_of(alone), 0.5, with_heights=False)
+    weak = weak_joins(joins_of(alone), 0.5)
     assert len(weak) == 1
     assert weak[0].fields["pairs"] == 5
     claims = np.array([one[1] for one in _claims(block, alone)])
@@ -139,7 +139,7 @@ def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
     assert (misfits(block, alone) < 3 * claims).all()
     heights = dem(block, tmp_path / "dem.tif", 4, white=2.0).with_sigma(2.0)
     fit = adjust(block.start, block.points, heights=heights)
-    assert not weak_joins(joins_of(fit), 0.5, with_heights=True)
+    assert not weak_joins(joins_of(fit), 0.5)
     assert max(one[1] for one in _claims(block, fit)) < 0.2
 
 

@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 SLOW = ("match", "stack", "ties", "--reference", "edge", "register", "sharpen")
 #: What has to be there before.
 BEFORE = {
+    "verify": ["ortho rectify scene.tif --gcps gcps.geojson --dem dem.tif -o out"],
     "stack": [
         "ortho rectify scene.tif --dem dem.tif -tr 5 5 -o raw",
         "ortho rectify scene.tif --gcps gcps.geojson --dem dem.tif -tr 5 5 -o fitted",

@@ -135,6 +135,14 @@ def test_files_belong_to_the_scene_that_they_are_named_after_or_lie_beside(folde
     assert (left.image, left.surface.dem) == ("two: [*]/left.tif", "two: [*]/dem.tif")
 
 
+def test_the_only_dem_belongs_to_all_scenes_wherever_it_lies(folder):
+    (folder / "heights").mkdir()
+    shutil.move(folder / "dem.tif", folder / "heights" / "dem.tif")
+    assert survey(folder).beside("scene.tif", "dem") == ["heights/dem.tif"]
+    shutil.copy(folder / "heights" / "dem.tif", folder / "heights" / "other.tif")
+    assert survey(folder).beside("scene.tif", "dem") == []
+
+
 @pytest.mark.parametrize(
     ("words", "meant"),
     [

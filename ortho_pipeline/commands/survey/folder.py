@@ -74,7 +74,7 @@ class FolderSurvey:
         """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
 
         What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
-        if it has some.
+        if it has some. The only DEM of the delivery, in a folder without scenes, belongs to all.
         """
         mine, others = Path(scene).stem, {Path(name).stem for name in self.of("scene")} - {Path(scene).stem}
         for folder in Path(scene).parents:
@@ -85,7 +85,9 @@ class FolderSurvey:
                 return named
             if free := [name for name in here if not any(Path(name).stem.startswith(other) for other in others)]:
                 return free
-        return []
+        only = self.of(kind) if kind == "dem" else []
+        alone = len(only) == 1 and not any(Path(name).parent == Path(only[0]).parent for name in self.of("scene"))
+        return only if alone else []
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho info FOLDER --json``."""

@@ -32,7 +32,7 @@ from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_per_pixel
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
-from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models import ImageCorrection, MapGrid
 from ortho_pipeline.models.base import Array
 
 #: Left, top, right and bottom, px.
@@ -337,6 +337,24 @@ def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
     return shifts
 
 
+def _remedy(correction: ImageCorrection, target: Target) -> Text:
+    """Return what to do if no position stands out; heights have no effect on a finished ortho."""
+    raw: tuple[str | Setting, ...] = (
+        " Flat ground in mountains causes this: give a DEM, and its accuracy if it is coarse (",
+        Setting("surface.sigma", "20"),
+        ").",
+    )
+    return Text(
+        f"check that {target.called} shows this place.",
+        *(() if isinstance(correction.model, MapGrid) else raw),
+        " If the image may be farther off, search farther (",
+        Setting("match.search"),
+        "); if it may be rotated, add ",
+        Setting("match.search_rotation", "5"),
+        ". On uniform or repetitive ground, measure points by hand",
+    )
+
+
 def _standing_out(
     compared: Sequence[_Shown],
     corrections: Sequence[ImageCorrection],
@@ -381,19 +399,11 @@ def _standing_out(
             )
         raise InputError(
             f"cannot match the scene with {targets[0].called}: no clear best position within {reach:.0f} px "
-            f"(mean correlation of {counted(len(common), 'chip')}: {means[best]:.2f} and {means[other]:.2f})",
+            f"(mean correlation of {counted(len(common), 'chip')}: best {means[best]:.2f}, second best "
+            f"{means[other]:.2f})",
             file=targets[0].path,
             field=targets[0].field,
-            remedy=Text(
-                f"check that {targets[0].called} shows this place. Flat ground in mountains causes this: give a DEM, "
-                "and its accuracy if it is coarse (",
-                Setting("surface.sigma", "20"),
-                "). If the model may be farther off, search farther (",
-                Setting("match.search"),
-                "); if it may be rotated, add ",
-                Setting("match.search_rotation", "5"),
-                ". On uniform or repetitive ground, measure points by hand",
-            ),
+            remedy=_remedy(corrections[best], targets[0]),
         )
     return best
 
