@@ -22,6 +22,7 @@ from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching.chip_search import SIDE
+from ortho_pipeline.imaging.matching.least_squares import RIM
 from ortho_pipeline.models import ImageCorrection, SensorModel, SmoothField
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.models.orthos.smooth_field import bending_of
@@ -98,8 +99,8 @@ class MeasuredOrtho:
 
     @property
     def chip(self) -> float:
-        """Side (px) of a chip: matches share noise up to that distance."""
-        return float(SIDE * self.matched.matches.factor)
+        """Side (px) of the part of a chip that is compared: matches share noise up to that distance."""
+        return float((SIDE - 2 * RIM) * self.matched.matches.factor)
 
     @functools.cached_property
     def filled(self) -> Array:
