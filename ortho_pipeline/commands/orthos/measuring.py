@@ -107,6 +107,11 @@ class MeasuredOrtho:
         """Shares ``(CELLS, CELLS)`` of pixels that have a value, in cells along rows and columns."""
         return filled_of(self.scene, self.opened, CELLS)
 
+    @property
+    def shown(self) -> Array:
+        """Which cells ``(CELLS, CELLS)`` show ground: half of their pixels have a value, or as many as in any cell."""
+        return np.asarray(self.filled >= min(0.5, self.filled.max()))
+
     @functools.cached_property
     def field(self) -> DisplacementField:
         """The field of the displacement (m) over the image (px)."""

@@ -25,8 +25,8 @@ from ortho_pipeline.estimation.spatial.displacement_field import DisplacementFie
 from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
 from ortho_pipeline.models.base import Array
 
-#: A cell is tested if a match is nearer than so many spacings of tried places, and half of it has values.
-_REACH, _FILLED = 2.0, 0.5
+#: A cell is tested if a match is nearer than so many spacings of tried places.
+_REACH = 2.0
 _LEVELS = 0.025, 0.975
 #: Minimum number of points for a covariance.
 FEWEST_POINTS = 4
@@ -150,7 +150,7 @@ class Verified:
         bands = max(float(matches.points.sigma_alike.max(initial=0.0)), MATCHED_ALIKE * matches.factor)
         alike = np.hypot(bands * measured.pixel, _ALIKE * field.noise)
         common = np.random.default_rng([seed, 1]).normal(0.0, alike, (len(draws), 1, 2))
-        return cls(measured, field, cells, draws + common, len(cells) / max(int((measured.filled >= _FILLED).sum()), 1))
+        return cls(measured, field, cells, draws + common, len(cells) / measured.shown.sum())
 
     @property
     def mean(self) -> Array:
@@ -176,7 +176,7 @@ def tested_cells(measured: MeasuredOrtho) -> Array:
     tried = max(len(measured.searched.matches.image), 1)
     reach = _REACH * max(float(np.sqrt(size.prod() / tried)), float(size.max()) / CELLS)
     near, _ = spatial.cKDTree(measured.image).query(cells)
-    return np.asarray(cells[(near <= reach) & (measured.filled.ravel() >= _FILLED)])
+    return np.asarray(cells[(near <= reach) & measured.shown.ravel()])
 
 
 def slopes_of(verified: Verified) -> tuple[Array, Array]:
