@@ -3,6 +3,8 @@
 #   make demo     set up, orthorectify the sample scene, say where the ortho and the report are
 #   make test     set up, run the tests (under ten minutes on two cores)
 #   make test-all the same with those marked slow
+#   make real-data  fetch the real images of the tests marked `realdata` into out/real-data (51 MB from public
+#                 repositories); they may be used for tests and are not part of this package
 #   make faults   commands limited, killed, cut off: no broken or mixed outputs (N=400 write limits, 3/4 as many kills)
 #   make check    formatting, lint, types (make lint), tests
 #   make test-with  the tests with the oldest packages that pyproject.toml allows, or RESOLUTION=highest: the newest
@@ -11,6 +13,8 @@
 #   make mutants  small deliberate errors, and which of them no test catches (COUNT=300 of them, drawn by SEED=1); a run
 #                 that was stopped goes on where it was
 #   make bench    speed and memory against gdalwarp, of adjustments, of many scenes: docs/performance.json (an hour)
+#   make peers    the same jobs by GDAL, OTB, rasterio, orthority and AROSICS, where they can be had: time, memory, errors,
+#                 and what they do with faults; the tables of docs/comparison.md (half an hour)
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make dist     build sdist and wheel in out/dist
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
@@ -44,7 +48,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-with faults mutants lint check dist page-types fuzz bench packages docs images constraints pin-image clean
+.PHONY: help setup demo test test-all test-with real-data faults mutants lint check dist page-types fuzz bench peers packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -71,6 +75,10 @@ test: setup
 
 test-all: setup
 	@$(PYTEST)
+
+# Needs Python alone.
+real-data:
+	@$(PYTHON) tools/real_data.py
 
 faults: N := $(if $(filter file,$(origin N)),400,$(N))
 faults: setup
@@ -112,6 +120,21 @@ fuzz: setup
 
 bench: setup
 	@$(BIN)/python benchmarks/collect.py
+
+# Each program of others in an environment of its own; one that cannot be installed is left out.
+peers: setup
+	@mkdir -p out/peers
+	given=()
+	for name in rasterio orthority arosics; do
+	    if [ ! -x out/peers/$$name/bin/python ]; then $(PYTHON) -m venv out/peers/$$name; fi
+	    if out/peers/$$name/bin/python -m pip install --quiet $$name; then given+=(--$$name out/peers/$$name/bin/python)
+	    else echo "Skipped: $$name cannot be installed"; fi
+	done
+	$(BIN)/python benchmarks/peers_warp.py "$${given[@]}" --out out/peers/warp.json
+	$(BIN)/python benchmarks/peers_warp.py --read out/peers/warp.json
+	if [[ "$${given[*]}" == *--arosics* ]]; then
+	    $(BIN)/python benchmarks/peers.py orthos --arosics out/peers/arosics/bin/python --seeds 6000:6008
+	fi
 
 # Which interpreters, each with the system's GDAL or the extra `wheel`.
 PYTHONS ?= $(PYTHON)=system

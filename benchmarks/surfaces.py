@@ -4,8 +4,8 @@
     python benchmarks/surfaces.py --pleiades
 
 The town is simulated: boxes seen by parallel rays, drawn by NumPy alone. The Pleiades triplet and the DSM that s2p made
-of it are in ../shared/data. Displacements are measured by normalised correlation in NumPy, which shares no code with
-the matching of this package.
+of it are fetched by `make real-data`. Displacements are measured by normalised correlation in NumPy, which shares no
+code with the matching of this package.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from osgeo import gdal
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 ROOT = Path(__file__).resolve().parent.parent
-REAL = ROOT.parent / "shared" / "data" / "s2p"
-sys.path += [str(ROOT / "tests" / "layers"), str(ROOT / "tests" / "warp")]
+sys.path += [str(ROOT / "tests" / "layers"), str(ROOT / "tests" / "warp"), str(ROOT / "tools")]
 
 import orthos  # noqa: E402
 from blocks import FLOOR, NORTH, WEST, ZONE, City, Parallel, towards  # noqa: E402
+from real_data import data_folder  # noqa: E402
 
 from ortho_pipeline import commands  # noqa: E402
 from ortho_pipeline.options import OutputOptions, SurfaceOptions  # noqa: E402
@@ -36,6 +36,7 @@ from ortho_pipeline.surface.dem import open_dem  # noqa: E402
 from ortho_pipeline.surface.flat import FlatSurface  # noqa: E402
 from ortho_pipeline.surface.writing import write_dem  # noqa: E402
 
+REAL = data_folder() / "s2p"
 #: The stereo surface of the issue: NMAD (m), share of holes; and the cell (m) of a common DEM.
 NMAD, HOLES, COARSE = 0.4, 0.05, 30.0
 HEIGHTS, ANGLES = (0.0, 3.0, 6.0, 12.0, 24.0), (5.0, 10.0, 20.0)

@@ -286,7 +286,8 @@ def otb(job: Job, out: Path) -> list[str] | None:
     xmin, ymin, xmax, ymax = job.extent
     return [
         "otbcli_OrthoRectification", "-io.in", f"{job.image}?&geom={geom}",
-        "-io.out", f"{out}?&gdal:co:TILED=YES", "uint16", "-map", "epsg", "-map.epsg.code", str(UTM),
+        "-io.out", f"{out}?&gdal:co:TILED=YES", "float" if job.kind == "ramp" else "uint16",
+        "-map", "epsg", "-map.epsg.code", str(UTM),
         "-elev.dem", str(dem), "-outputs.ulx", str(xmin), "-outputs.uly", str(ymax), "-outputs.spacingx", str(GSD),
         "-outputs.spacingy", str(-GSD), "-outputs.sizex", str(round((xmax - xmin) / GSD)),
         "-outputs.sizey", str(round((ymax - ymin) / GSD)), "-interpolator", "linear", "-opt.ram", "512",
@@ -522,28 +523,48 @@ def accuracy(folder: Path, side: int) -> dict[str, float]:
     """Warp a ramp; compare every output pixel with pyproj, a DEM interpolated here, and the RPC in plain NumPy."""
     job = Job(folder, side, kind="ramp").make()
     measure(ours(job, folder / "ramp"))
-    ortho = gdal.Open(str(folder / "ramp" / f"{job.image.stem}_ortho.tif"))
-    dem = gdal.Open(str(job.dem))
-    heights, (left, step, _, top, _, _) = dem.ReadAsArray().astype(float), dem.GetGeoTransform()
-    xmin, _, _, ymax = job.extent
+    found = errors(job, folder / "ramp" / f"{job.image.stem}_ortho.tif")
+    result = {
+        "pixels": found.size,
+        "max_px": float(found.max(initial=0.0)),
+        "rms_px": float(np.sqrt(np.mean(found.astype(float) ** 2))),
+    }
+    print(
+        f"{found.size / 1e6:.1f} Mpx: at most {result['max_px']:.5f} px, "
+        f"RMS {result['rms_px']:.5f} px from the exact geometry"
+    )
+    return result
+
+
+def errors(job: Job, path: Path, *, filled: bool = False) -> np.ndarray:
+    """Return how far (px, of the image) each pixel of an ortho of the ramp is from its exact place.
+
+    `filled`: only of pixels that have a value, else of all that the image shows. Pixels within 2 px of its border do
+    not count.
+    """
+    ortho, dem = gdal.Open(str(path)), gdal.Open(str(job.dem))
+    heights, (left, step, _, top, _, down) = dem.ReadAsArray().astype(float), dem.GetGeoTransform()
+    west, right, _, north, _, lower_by = ortho.GetGeoTransform()
     model, to_lonlat = job.model(), pyproj.Transformer.from_crs(UTM, 4326, always_xy=True)
-    worst, squares, count, margin = 0.0, 0.0, 0, 2.0
-    x = xmin + (np.arange(ortho.RasterXSize) + 0.5) * GSD
+    to_dem = pyproj.Transformer.from_crs(UTM, job.dem_crs, always_xy=True)
+    x, margin, parts = west + (np.arange(ortho.RasterXSize) + 0.5) * right, 2.0, [np.empty(0, dtype=np.float32)]
     for row in range(ortho.RasterYSize):
-        found = ortho.ReadAsArray(0, row, ortho.RasterXSize, 1)[:, 0].astype(float)
-        y = np.full(x.size, ymax - (row + 0.5) * GSD)
-        u, v = (x - left) / step - 0.5, (top - y) / step - 0.5
+        found = ortho.ReadAsArray(0, row, ortho.RasterXSize, 1)[:2, 0].astype(float)
+        y = np.full(x.size, north + (row + 0.5) * lower_by)
+        across, along = to_dem.transform(x, y)
+        u, v = (across - left) / step - 0.5, (along - top) / down - 0.5
         i, j = np.floor(u).astype(int), np.floor(v).astype(int)
+        inside = (i >= 0) & (j >= 0) & (i < heights.shape[1] - 1) & (j < heights.shape[0] - 1)
+        i, j = np.where(inside, i, 0), np.where(inside, j, 0)
         upper = heights[j, i] * (1 - u + i) + heights[j, i + 1] * (u - i)
         lower = heights[j + 1, i] * (1 - u + i) + heights[j + 1, i + 1] * (u - i)
         lon, lat = to_lonlat.transform(x, y)
         exact = model.ground_to_image(np.stack([lon, lat, upper * (1 - v + j) + lower * (v - j)], axis=1)).T
-        use = ((exact > margin) & (exact < side - margin)).all(axis=0)
-        error = np.abs(found - exact).max(axis=0)[use]
-        worst, squares, count = max(worst, error.max(initial=0.0)), squares + (error**2).sum(), count + error.size
-    result = {"pixels": count, "max_px": worst, "rms_px": (squares / count) ** 0.5}
-    print(f"{count / 1e6:.1f} Mpx: at most {worst:.5f} px, RMS {result['rms_px']:.5f} px from the exact geometry")
-    return result
+        use = inside & ((exact > margin) & (exact < job.side - margin)).all(axis=0)
+        if filled:
+            use &= (found > 0).all(axis=0) & np.isfinite(found).all(axis=0)
+        parts.append(np.abs(found - exact).max(axis=0)[use].astype(np.float32))
+    return np.concatenate(parts)
 
 
 def machine() -> dict[str, str]:

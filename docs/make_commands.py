@@ -169,6 +169,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
 _SAVED = "You want to keep the result and its plots."
 _NAMED = "The default name does not suit you."
 _GROUND = "The ground coordinates are in another file than the image points."
+_FAR = "The ortho may be displaced farther."
 _CHOSEN = "The images have several models or none, and you choose one by name."
 #: By command: the options that are for something else there than `NEEDS` says.
 OTHERWISE: Mapping[str, Mapping[str, str]] = {
@@ -199,6 +200,13 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
     "rectify": {
         "dem": "You make an ortho of anything but flat ground. `auto` downloads the Copernicus DEM.",
         "dem-sigma": "The reported accuracy must include the DEM error.",
+    },
+    "align": {"search": _FAR},
+    "stack": {"search": _FAR, "reference": "All dates must agree with an orthoimage that you trust."},
+    "verify": {
+        "search": _FAR,
+        "output": "You want the report and the displacements in files.",
+        "gcps": "You have surveyed points, which test the absolute accuracy.",
     },
     "register": {"reference": "Another image than the first one must stay in place."},
     "run": {

@@ -14,6 +14,7 @@ import hypothesis
 import numpy as np
 import pytest
 from osgeo import gdal, osr
+from real_data import data_folder
 
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC
@@ -30,7 +31,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).resolve().parent.parent
-REAL = ROOT.parent / "shared" / "data"
+REAL = data_folder()
 SAMPLE = ROOT / "sample_data"
 
 # The same few examples in every run. To search for more: `pytest --hypothesis-profile=search -k round_trip`.
@@ -55,7 +56,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.skip(reason=f"this GDAL was built without {mark.args[0]}"))
     if REAL.is_dir():
         return
-    skip = pytest.mark.skip(reason="the real scenes (../shared/data next to the checkout) are not on this machine")
+    skip = pytest.mark.skip(reason=f"the real scenes are not here: there is no {REAL} (`make real-data` fetches them)")
     for item in items:
         if "realdata" in item.keywords:
             item.add_marker(skip)

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from entered import FOLDER, HOST, Entered, inside, is_recorded
+from real_data import data_folder
 
 ROOMS = ("geodesy", "models", "estimation", "block", "surface", "warp", "exchange", "raster", "points", "files")
 ROOT = Path(__file__).resolve().parent.parent
@@ -143,7 +144,7 @@ def _changed(node: Any) -> Iterator[Any]:
 
 
 class Copy:
-    """A copy of the checkout in a temporary folder, next to the same real scenes."""
+    """A copy of the checkout in a temporary folder, with the same real scenes."""
 
     def __init__(self, above: str) -> None:
         self.root, self._listed = Path(above, "checkout"), Path(above, "tests.txt")
@@ -152,13 +153,13 @@ class Copy:
             if (ROOT / name).is_file():
                 (self.root / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, self.root / name)
-        Path(above, "shared").symlink_to(ROOT.parent / "shared")
 
     def pytest(self, tests: list[str], timeout: float, *words: str, **more: str) -> tuple[str, str]:
         """Run tests; return how they ended (passed, failed, too long) and what they printed."""
         self._listed.write_text("\n".join(tests))
         path = os.pathsep.join(str(self.root / name) for name in (".", "plugins", "tools"))
         env = {**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **more}
+        env |= {"ORTHO_REAL_DATA": str(data_folder())}
         line = [sys.executable, "-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", *words]
         process = subprocess.Popen(
             [*line, f"@{self._listed}"], cwd=self.root, env=env, text=True, start_new_session=True,

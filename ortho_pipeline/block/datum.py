@@ -70,7 +70,8 @@ def with_datum(
     # Fictitious constraints hold the shape of an orbit together, not where it is.
     known = bool(problem.pseudo) or any((~model.constraints().fictitious).any() for model in state.models)
     if hold is None and known and step_of(linear).condition <= CONDITION_LIMIT:
-        return problem, "no control points: position and height come from the priors and constraints of the models"
+        dem = "" if problem.heights is None else ", the height also from the DEM"
+        return problem, f"no control points: position and height come from the models and their stated accuracy{dem}"
     missed = 0.0 if control else _missed(linear)
     stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
     trusted = np.asarray(stated >= missed / _CONTRADICTED)

@@ -307,7 +307,10 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
     general = ", ".join(item.name for item in sensors if item.fallback)
     hint = f" (general ones: {general})" if general else ""
     on_map = dataset.GetProjection() and dataset.GetGeoTransform(can_return_null=True) is not None
-    finished = Text("; for a finished ortho add ", Setting("scene.ortho")) if on_map else Text("")
+    finished = Text("")
+    if on_map:
+        use = "For a finished ortho use the commands verify or align, or add "
+        finished = Text(". ", use, Setting("scene.ortho"))
     return InputError(
         "no sensor recognises this image: it has no RPC, and no metadata of a known product are next to it",
         file=path,
@@ -315,8 +318,8 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
             "copy the other files of the delivery next to it, or give an RPC file with ",
             Setting("scene.rpc", "FILE"),
             finished,
-            ". With ",
+            ". To see what a sensor lacks, repeat with ",
             Setting("scene.sensor", "NAME"),
-            f"{hint} the error message says what is missing",
+            hint,
         ),
     )

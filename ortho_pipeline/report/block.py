@@ -14,7 +14,7 @@ from ortho_pipeline.block.network import NetworkRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
-from ortho_pipeline.display.numbers import flat, metres, px
+from ortho_pipeline.display.numbers import flat, metres, px, size_m
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
@@ -84,7 +84,8 @@ def build_report(
     """Collect everything that the report says (docs/engineering/formats.md)."""
     places = placed(fit, starts)
     network, of_network = found_network(fit, join_limit)
-    suffices = suffices_for(fit)
+    pixel = max((max(place["ground_pixel_m"] or (0.0,)) for place in places.values()), default=0.0) or None
+    suffices = suffices_for(fit, pixel)
     images = {}
     for label, start in starts.items():
         found = exported.get(label)
@@ -106,7 +107,7 @@ def build_report(
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=_corrected(
-            headline(adjustment, relative=any(one.code == RELATIVE for one in warnings)), noted["notices"]
+            headline(adjustment, relative=any(one.code == RELATIVE for one in warnings), pixel=pixel), noted["notices"]
         ),
         network=network,
         absolute=_absolute(fit),
@@ -118,11 +119,12 @@ def build_report(
 # -- words -----------------------------------------------------------------------------------------------------------
 
 
-def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHeadline:
+def headline(adjustment: BlockAdjustment, *, relative: bool = False, pixel: float | None = None) -> BlockHeadline:
     """Say how accurate the block is from the best evidence that there is: check points.
 
     Neither the fit of control points nor how well ties agree is evidence. Matches are `relative` to their reference;
-    they are seen in one image each, and measured check points in two or more come first.
+    they are seen in one image each, and measured check points in two or more come first. `pixel` is the largest on the
+    ground, m.
     """
     to = ", relative to the reference" if relative else ""
     notes = [f"{adjustment.gauge[0].upper()}{adjustment.gauge[1:]}."]
@@ -133,7 +135,8 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
     if known := adjustment.object_rms.check:
         if known.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
-        what = f"RMSE in plan and height at {counted(known.n, 'check point')}, {KEPT_OUT}; {TIED}"
+        part = "" if pixel is None else f" ({px(known.plan / pixel)} of {size_m(pixel)})"
+        what = f"RMSE in plan{part} and height at {counted(known.n, 'check point')}, {KEPT_OUT}; {TIED}"
         return said(metres(known.plan), what, metres(known.h))
     # The ground of control is held by its sigma: how well it fits is to be seen in the images.
     seen = [image.rms.back_projected for image in adjustment.images.values()]
@@ -149,7 +152,8 @@ def headline(adjustment: BlockAdjustment, *, relative: bool = False) -> BlockHea
         return said(UNKNOWN, _NO_CHECKS)
     sizes = [math.hypot(*ray.residual) for ray in adjustment.rays if ray.used and is_known(ray.residual)]
     if sizes:
-        agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {counted(len(sizes), 'ray')})."
+        of = counted(len(sizes), "image measurement")
+        agree = f"The images agree to {px(float(np.median(sizes)))} (median residual of {of})."
         notes.insert(0, f"{agree} This tests neither positions nor heights.")
     return said(UNKNOWN, _NO_CHECKS)
 
@@ -213,12 +217,19 @@ def summary_text(report: BlockReport) -> str:
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
-    lines += [*height_lines(adjustment.heights), *sigma_lines(report)]
+    expected, unknown = sigma_lines(report), head.figure == UNKNOWN
+    lines += [*height_lines(adjustment.heights), *([] if unknown else expected)]
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
     said, errors = _signals_of(report), errors_of_block(report)
-    first = [*accuracy_lines(report, errors), *_notes(head, said), *error_lines(errors), *signal_lines(said)]
+    first = [
+        *accuracy_lines(report, errors),
+        *_notes(head, said),
+        *(expected if unknown else []),
+        *error_lines(errors),
+        *signal_lines(said),
+    ]
     return Text.joined("\n", [*first, *lines])
 
 
@@ -260,12 +271,12 @@ def sigma_lines(report: BlockReport) -> list[str]:
     found = []
     if (ground := report.absolute) is not None:
         found.append(
-            f"Absolute accuracy: sigma {ground.east_m:.2g} m east, {ground.north_m:.2g} m north, "
+            f"Expected absolute accuracy: sigma {ground.east_m:.2g} m east, {ground.north_m:.2g} m north, "
             f"{ground.height_m:.2g} m in height (median of {counted(ground.points, 'point')})"
         )
     if (pairs := report.relative) is not None:
         found.append(
-            f"Relative accuracy of {counted(pairs.pairs, 'pair')} of images: sigma {pairs.median_px:.2g} px "
+            f"Expected relative position of {counted(pairs.pairs, 'pair')} of images: sigma {pairs.median_px:.2g} px "
             f"(median), {pairs.worst_px:.2g} px (worst)"
         )
     return found
@@ -347,7 +358,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         marks=_marks(report),
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         ground_sigmas=variance_lines(adjustment.variances),
-        sigmas=sigma_lines(report),
+        expected=sigma_lines(report),
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(
             zip(adjustment.points, report.network.largest_deg, strict=True), key=lambda one: ROLES.index(one[0].role)

@@ -19,8 +19,9 @@ class BlockImage(Record):
     """An image of the block, and the model that was adjusted.
 
     Where it lies is at the middle height of the points: `outline` has the longitudes and latitudes of its corners, from
-    the first pixel along the first row. `view` is the angle of the line of sight from the vertical and the azimuth in
-    which the sensor stands, degrees. `covered` is the share (0 to 1) that its points speak for: their hull and half the
+    the first pixel along the first row. `ground_pixel_m` is the pixel there, along the row and along the column.
+    `incidence_deg` is the angle of the line of sight from the vertical, `sensor_azimuth_deg` the azimuth in which the
+    sensor stands. `covered` is the share (0 to 1) that its points speak for: their hull and half the
     distance between them.
     """
 
@@ -32,6 +33,7 @@ class BlockImage(Record):
     facts: dict[str, str]
     rpc: RpcRecord | None
     outline: tuple[Pair, ...] | None
+    ground_pixel_m: Pair | None = None
     incidence_deg: float | None
     sensor_azimuth_deg: float | None
     covered: float

@@ -13,7 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import area_km2, metres, plain_size, px, share, short, signed, size_text
+from ortho_pipeline.display.numbers import (
+    area_km2,
+    metres,
+    plain_size,
+    px,
+    share,
+    short,
+    signed,
+    size_m,
+    size_text,
+)
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Bias, Parameter, Point, is_known
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
@@ -149,11 +159,13 @@ def about_block(report: BlockReport) -> dict[str, str]:
     images = report.images.values()
     outlines = [np.array(image.outline) for image in images if image.outline]
     middle = np.concatenate(outlines).mean(axis=0) if outlines else None
+    pixels = [max(image.ground_pixel_m) for image in images if image.ground_pixel_m]
     texts = {
         "Acquired": acquired(image.facts.get("acquired") for image in images) or "unknown",
         "Processed": processed(),
         "Area": area_km2(_area_of(outlines)) if outlines else None,
         "Place": None if middle is None else place_text(middle.tolist()),
+        "Pixel": " to ".join(dict.fromkeys(map(size_m, (min(pixels), max(pixels))))) if pixels else None,
         "Sensor": sensors_text((image.sensor for image in images), (image.facts for image in images)),
     }
     return {key: text for key, text in texts.items() if text}

@@ -40,6 +40,8 @@ TILE = 64
 _TILES_SHARE = 8
 #: Samples around those of a cubic kernel's window that are read with it, before and after.
 _BEFORE, _AFTER = 2, 5
+#: Steps to the samples around a position.
+_NEXT = np.array([0, 1])
 #: Samples per side that are looked through at once.
 _LOOK = 1024
 
@@ -473,14 +475,9 @@ def _by_tile(u: Array, v: Array, index: NDArray[np.intp], across: int) -> Iterat
 
 def _bilinear(heights: Array, u: Array, v: Array) -> Array:
     """Interpolate; a void counts only where its weight is not zero."""
-    i, j = np.floor(u).astype(int), np.floor(v).astype(int)
-    fu, fv = u - i, v - j
-    out = np.zeros(len(u))
-    for down, across, weight in (
-        (0, 0, (1 - fu) * (1 - fv)),
-        (0, 1, fu * (1 - fv)),
-        (1, 0, (1 - fu) * fv),
-        (1, 1, fu * fv),
-    ):
-        out += np.where(weight > 0, heights[j + down, i + across] * weight, 0.0)
-    return out
+    i, j = np.floor(u), np.floor(v)
+    right, below = u - i, v - j
+    corners = heights[j.astype(int) + _NEXT[:, None, None], i.astype(int) + _NEXT[:, None]]
+    weights = np.stack([1 - below, below])[:, None] * np.stack([1 - right, right])
+    above, under = np.where(weights > 0, corners * weights, 0.0)
+    return np.asarray(above[0] + above[1] + under[0] + under[1])

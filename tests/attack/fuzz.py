@@ -32,6 +32,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+# As a script it runs without the paths of pytest.
+sys.path += [str(Path(__file__).resolve().parents[1] / "sensors"), str(Path(__file__).resolve().parents[2] / "tools")]
+
 from mutate import mutant
 from osgeo import gdal
 from readers import BY_NAME, READERS, Reader, numbers
@@ -331,7 +335,7 @@ def main(arguments: list[str]) -> int:
         "--keep", type=Path, help="folder for the results; what it holds is not run again (-n 0: shown)"
     )
     parser.add_argument("-j", type=int, default=2, help="processes")
-    parser.add_argument("--real", action="store_true", help="of the real files in ../shared/data, one after the other")
+    parser.add_argument("--real", action="store_true", help="of the real files, one after the other")
     chosen = parser.parse_args(arguments)
     names = chosen.reader or [reader.name for reader in READERS]
     if chosen.show is not None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-#: Next to the checkout, as for the tests marked `realdata`.
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+from real_data import data_folder
+
+REAL = data_folder()
 #: Reader -> real files that it reads, below `REAL`.
 FILES: dict[str, tuple[str, ...]] = {
     "rpc-text": ("gdal/gcore/data/test_rpc.txt", "gdal/gcore/data/md_ov_rpc.txt",

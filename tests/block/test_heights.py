@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from chains import Block, Chain, apart, dem, fly, misfits, neighbours, with_control
 
-from ortho_pipeline.block.adjustment import adjust
+from ortho_pipeline.block.adjustment import _prepared, adjust
+from ortho_pipeline.block.datum import with_datum
+from ortho_pipeline.block.equations.solver import attempt
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.heights.terrain import expected_slopes
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
@@ -131,7 +134,7 @@ def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
     """By ties alone the sigma covers the misfit, and it is warned of; with heights neither is there."""
     block = fly(Chain(), 4)
     alone = adjust(block.start, block.points)
-    weak = weak_joins(joins_of(alone), 0.5, with_heights=False)
+    weak = weak_joins(joins_of(alone), 0.5)
     assert len(weak) == 1
     assert weak[0].fields["pairs"] == 5
     claims = np.array([one[1] for one in _claims(block, alone)])
@@ -139,7 +142,7 @@ def test_a_join_says_how_far_neighbours_may_be_apart(tmp_path: Path) -> None:
     assert (misfits(block, alone) < 3 * claims).all()
     heights = dem(block, tmp_path / "dem.tif", 4, white=2.0).with_sigma(2.0)
     fit = adjust(block.start, block.points, heights=heights)
-    assert not weak_joins(joins_of(fit), 0.5, with_heights=True)
+    assert not weak_joins(joins_of(fit), 0.5)
     assert max(one[1] for one in _claims(block, fit)) < 0.2
 
 
@@ -222,3 +225,27 @@ def test_claims_are_kept(tmp_path: Path, made: dict[str, float], sigma: float, t
 
 def apart_of(block: Block, fit: BlockFit, pair: tuple[str, str]) -> np.ndarray:
     return apart(block, fit, *pair)
+
+
+def test_a_bias_makes_no_height_wrong(tmp_path: Path) -> None:
+    """Points and images follow the bias that a solution finds before heights are compared with them."""
+    block = fly(Chain(convergence_deg=20.0, ties=80), 2)
+    source = DemHeights(dem(block, tmp_path / "dem.tif", 2, white=1.0, bias=15.0).with_sigma(1.0), bias=5.0)
+    problem, state, selection = _prepared(tuple(block.start.values()), block.points, {}, (), source)
+    heights = Heights.under(source, problem, state.local)
+    problem, _ = with_datum(heights.applied(problem), state, selection, 5.0)
+    _, found = heights.settled(attempt(problem, state, selection), selection, rounds=1)
+    assert found.common.bias[0] == pytest.approx(15.0, abs=4.0)
+    assert found.wrong.sum() <= 2
+
+
+def test_a_point_outside_of_its_models_at_the_start_takes_part_later(tmp_path: Path) -> None:
+    block = fly(Chain(images=3, convergence_deg=20.0, ties=40), 2)
+    problem, state, selection = _prepared(tuple(block.start.values()), block.points, {}, ())
+    problem, _ = with_datum(problem, state, selection, 5.0)
+    right = attempt(problem, state, selection)
+    state.local[3, 2] += 1e6
+    found = attempt(problem, state, selection)
+    assert found.converged
+    assert found.astray is None
+    np.testing.assert_allclose(found.state.params, right.state.params, atol=1e-6)

@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 import pytest
 from osgeo import gdal
+from real_data import data_folder
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.exchange.rpc import (
@@ -31,7 +32,7 @@ from ortho_pipeline.models.base import SensorModel, as_ground
 
 gdal.UseExceptions()
 
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+REAL = data_folder()
 QUICKBIRD = "orthority/rpc/qb2_basic1b.tif"
 CORRECTIONS = {
     "shift": (3.0, 0.0, 0.0, -2.1, 0.0, 0.0),

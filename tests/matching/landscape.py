@@ -7,6 +7,7 @@ an image shows at a place is the same function of the place in every image, what
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -16,6 +17,11 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+# Benchmarks run without the paths of pytest.
+sys.path.append(str(Path(__file__).resolve().parents[2] / "tools"))
+
+from real_data import data_folder
+
 Array = NDArray[np.float64]
 Texture = NDArray[np.float32]
 
@@ -23,7 +29,7 @@ Texture = NDArray[np.float32]
 SIZE, CELL = 2048, 8
 #: Different parcels, each of which has a life of its own through the seasons.
 PARCELS = 16
-REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+REAL = data_folder()
 STRIPS = ("05_0182", "05_0184", "06_0251", "06_0253")
 #: Real images whose pixels become texels, with the band (from 0) of the tone and of the other band.
 PICTURES = (

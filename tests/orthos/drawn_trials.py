@@ -24,7 +24,8 @@ def trial(seed: int, *, elsewhere: bool) -> dict[str, Any]:
     row: dict[str, Any] = {
         "seed": seed, "ground": pair.ground, "ratio": pair.ortho.gsd / pair.reference.gsd, "bend": pair.bend / coarse,
         "clouds": pair.ortho.clouds, "season": pair.ortho.season, "shift": float(np.hypot(*pair.shift)) / coarse,
-        "pixels": pair.pixels,
+        "pixels": pair.pixels, "band": pair.ortho.band, "haze": pair.ortho.haze, "length": pair.length,
+        "slopes": pair.slopes != ((0.0, 0.0), (0.0, 0.0)),
     }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         ortho, reference = pair.write(Path(folder))
@@ -48,16 +49,24 @@ def trial(seed: int, *, elsewhere: bool) -> dict[str, Any]:
     for name, value in truth.items():
         one = relative[f"{name}_m"]
         row[name] = {
+            "truth": float(value) / coarse,
             "error": (one["value"] - value) / coarse,
             "half": (one["high"] - one["low"]) / 2 / coarse,
             "covers": bool(one["low"] <= value <= one["high"]),
         }
     row["field_error"] = float(np.median(np.hypot(*(found - true).T))) / coarse
-    row["kept"], row["tested"] = document["matches"]["kept"], document["matches"]["tested_share"]
+    matches = document["matches"]
+    row["kept"], row["local"], row["tested"] = (matches[name] for name in ("kept", "local", "tested_share"))
+    row["noise"] = [one * pair.ortho.gsd / coarse for one in matches["noise_px"]]
     # 1 % of results may lie outside of a 99 % interval; half a pixel beyond it is wrong.
     wide = 2.576 / 1.96
     row["wrong"] = any(abs(row[name]["error"]) > wide * row[name]["half"] + 0.5 for name in truth)
     return row
+
+
+def same_content(row: dict[str, Any]) -> bool:
+    """Whether ortho and reference show the ground in the same season and band."""
+    return not row["season"] and row["band"] == "a"
 
 
 def told(rows: list[dict[str, Any]]) -> str:
@@ -73,5 +82,9 @@ def told(rows: list[dict[str, Any]]) -> str:
                 f"{name}: median error {np.median(errors):.4f} px, 90th percentile {np.quantile(errors, 0.9):.4f} px, "
                 f"covered {covers:.3f}"
             )
+        for alike, text in ((True, "same"), (False, "another")):
+            some = [row for row in done if same_content(row) == alike]
+            parts = [f"{name} {np.mean([row[name]['covers'] for row in some]):.3f}" for name in STATISTICS if some]
+            lines.append(f"covered in {len(some)} pairs of {text} season and band: {', '.join(parts)}")
         lines.append(f"seconds: median {np.median([row['seconds'] for row in done]):.1f}")
     return "\n".join(lines)

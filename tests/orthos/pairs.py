@@ -63,7 +63,7 @@ class Pair:
     patch : (float, float)
         Metres to east and north by which a patch of 1/16 of the ortho is displaced besides.
     elsewhere : bool
-        The reference shows another place.
+        The reference shows another ground of the same kind; real images have only one.
     """
 
     ground: str = "country"
@@ -134,8 +134,6 @@ class Pair:
         steps = np.arange(count) + 0.5
         columns, rows = np.meshgrid(steps * gsd - margin, margin - steps * gsd)
         places = np.column_stack([columns.ravel(), rows.ravel()])
-        if self.elsewhere:
-            places = places + 0.45 * SIZE * texel
         other = self._seen(self.reference, places, texel, 1).reshape(count, count)
         return (
             _write(folder / "ortho.tif", pixels, self.ortho.gsd, (0.0, 0.0)),
@@ -145,7 +143,9 @@ class Pair:
     def _seen(self, look: Look, places: Array, texel: float, number: int) -> NDArray[np.float32]:
         random = np.random.default_rng([self.seed, 6 + number])
         box = max(1.0, look.gsd / texel)
-        seen = land(self.ground, self.seed % 3).seen(look.band, look.season, box, 0.35 * box)
+        # The ground repeats itself and is hardly larger than a pair: another part of it would overlap.
+        which = self.seed % 3 + (3 if self.elsewhere and number else 0)
+        seen = land(self.ground, which).seen(look.band, look.season, box, 0.35 * box)
         start = np.random.default_rng([self.seed, 8]).uniform(0, SIZE, 2)
         u, v = places[:, 0] / texel + start[0], -places[:, 1] / texel + start[1]
         found = sample(seen, u, v).astype(np.float32)

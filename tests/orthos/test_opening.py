@@ -15,7 +15,7 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.inputs import open_scene
-from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.models import MapGrid, model_from_dict
 from ortho_pipeline.options import SceneOptions
@@ -155,3 +155,15 @@ def test_info_shows_an_ortho_as_a_scene_where_that_is_asked_for():
     assert document["models"] == {"map_grid": "map_grid"}
     np.testing.assert_allclose(document["gsd_m"], 5.0, rtol=1e-3)
     assert "ortho verify" in CliRunner().invoke(cli, ["info", str(SAMPLE / "reference.tif")]).output
+
+
+def test_cells_without_values_are_known(tmp_path):
+    """Of an ortho whose eastern half has no values, and of one without nodata."""
+    path = raster(tmp_path / "half.tif", *GRIDS["metres"])
+    assert (filled_of(open_ortho(path, SceneOptions()), SceneOptions(), 4) == 1).all()
+    written = gdal.Open(str(path), gdal.GA_Update)
+    written.GetRasterBand(1).SetNoDataValue(0)
+    written.WriteArray(np.repeat(np.arange(60) < 30, 40).reshape(60, 40).T.astype(np.uint8))
+    written.FlushCache()
+    shares = filled_of(open_ortho(path, SceneOptions()), SceneOptions(), 4)
+    np.testing.assert_allclose(shares, np.repeat([[1.0, 1.0, 0.0, 0.0]], 4, axis=0))

@@ -46,9 +46,8 @@ class Linear:
         by_point = points.whitened(seen.by_point, slice(None))
         by_params = points.whitened(seen.by_params, slice(None))
         pseudo = problem.pseudo_equations(state)
-        misfits = problem.misfits_of(seen.image, state.local, pseudo, ordering, weights)
-        ground_by_point, rows = np.zeros((len(points), 3, 3)), ordering.grounded
-        ground_by_point[rows] = problem.on_points(state.local, rows).partials(weights.ground_weights[rows])
+        ground, ground_by_point = problem.ground_equations(state.local, ordering, weights)
+        misfits = Misfits(problem.ray_misfits(seen.image, weights), ground, pseudo.misfit)
         return cls(problem, state, ordering, weights, misfits, by_params, by_point, ground_by_point, pseudo)
 
     def _handed_over(self) -> tuple[Array, Array, Array]:
@@ -73,12 +72,11 @@ class Linear:
         root = np.sqrt(self.weights.ray_weights[used]) / points.sigma_image[used]
         places, widest = problem.frame.places(local[numbers]), problem.columns.widest
         seen = linearised(places, self.state.models, of_images, place[points.point[used]], root, widest)
-        rays, (by_params, by_point, ground_by_point) = self.misfits.rays.copy(), self._handed_over()
+        rays, (by_params, by_point, _) = self.misfits.rays.copy(), self._handed_over()
         rays[used] = points.whitened((points.measured[used] - seen.image) * root[:, None], used)
         by_point[used] = points.whitened(seen.by_point, used)
         by_params[used] = points.whitened(seen.by_params, used)
-        ground, grounded = problem.ground_misfits(local, self.ordering, self.weights), self.ordering.grounded
-        ground_by_point[grounded] = problem.on_points(local, grounded).partials(self.weights.ground_weights[grounded])
+        ground, ground_by_point = problem.ground_equations(local, self.ordering, self.weights)
         return replace(
             self,
             state=replace(self.state, local=local),
@@ -104,6 +102,13 @@ class Linear:
             ground_by_point=ground_by_point,
             misfits=replace(misfits, rays=misfits.rays * of_rays[:, None], ground=misfits.ground * of_ground[:, None]),
         )
+
+    @property
+    def lost(self) -> Mask:
+        """Points ``(N,)`` that take part, but are outside of a model that shows them."""
+        found = np.zeros(len(self.problem.points), dtype=bool)
+        found[self.problem.points.point[~np.isfinite(self.misfits.rays).all(axis=1)]] = True
+        return found
 
     @property
     def pseudo_design(self) -> Array:

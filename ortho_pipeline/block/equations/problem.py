@@ -234,25 +234,23 @@ class BlockProblem:
         predicted = self.points.measured.copy()
         for model, used in zip(state.models, ordering.rays_of_image, strict=True):
             predicted[used] = places.project(model, self.points.point[used])
-        return self.misfits_of(predicted, state.local, self.pseudo_equations(state), ordering, weights)
+        ground = self.ground_equations(state.local, ordering, weights)[0]
+        return Misfits(self.ray_misfits(predicted, weights), ground, self.pseudo_equations(state).misfit)
 
-    def misfits_of(
-        self, predicted: Array, local: Array, pseudo: PseudoEquations, ordering: Ordering, weights: Selection
-    ) -> Misfits:
-        """Return the misfits of everything that takes part.
-
-        `predicted` ``(M, 2)`` are image points of points `local` ``(N, 3)``, of what takes no part those measured.
-        """
+    def ray_misfits(self, predicted: Array, weights: Selection) -> Array:
+        """Return the misfits ``(M, 2)`` of image points `predicted`; of what takes no part, those measured."""
         points = self.points
         scale = np.sqrt(weights.ray_weights) / points.sigma_image
-        rays = points.whitened((points.measured - predicted) * scale[:, None], slice(None))
-        return Misfits(rays, self.ground_misfits(local, ordering, weights), pseudo.misfit)
+        return points.whitened((points.measured - predicted) * scale[:, None], slice(None))
 
-    def ground_misfits(self, local: Array, ordering: Ordering, weights: Selection) -> Array:
-        """Return the misfits ``(N, 3)`` of known ground with points at `local` ``(N, 3)``."""
-        ground, rows = np.zeros((len(self.points), 3)), ordering.grounded
-        ground[rows] = self.on_points(local, rows).misfits(weights.ground_weights[rows])
-        return ground
+    def ground_equations(self, local: Array, ordering: Ordering, weights: Selection) -> tuple[Array, Array]:
+        """Return misfits ``(N, 3)`` and partials ``(N, 3, 3)`` of known ground with points at `local` ``(N, 3)``."""
+        count, rows = len(self.points), ordering.grounded
+        misfits, partials, observed = np.zeros((count, 3)), np.zeros((count, 3, 3)), self.on_points(local, rows)
+        misfits[rows], partials[rows] = (
+            part(weights.ground_weights[rows]) for part in (observed.misfits, observed.partials)
+        )
+        return misfits, partials
 
     def on_points(self, local: Array, rows: Index) -> OnPoints:
         """Return what is observed of the places of points `rows` ``(n,)`` by themselves, with points at `local`."""

@@ -206,23 +206,33 @@ def _met(found: Solved, gone: Mask, selection: Selection) -> Array:
 
 
 def _inside(problem: BlockProblem, start: State, selection: Selection, tolerance: float) -> Solved:
-    """Return the minimum without points that have no place at the start, or were led out of their models since."""
+    """Return the minimum without points that have no place in their models at the start, or were led out since.
+
+    Raises
+    ------
+    NotConverged
+        If that is most of them at the start, or nothing can be computed there.
+    """
     outside, iterations = problem.active(selection) & ~np.isfinite(start.local).all(axis=1), 0
     while True:
-        found = _descended(problem, start, selection.without(outside, problem.points.point), tolerance)
+        linear = Linear.at(problem, start, selection.without(outside, problem.points.point))
+        lost = linear.lost
+        if lost.sum() > _FEW * linear.ordering.points or not (lost.any() or math.isfinite(linear.misfits.square)):
+            raise NotConverged("the start values put points outside of the models", remedy="give better start values")
+        if lost.any():
+            outside = outside | lost
+            continue
+        found = _descended(linear, tolerance)
         iterations += found.iterations
         if found.astray is None:
             return replace(found, iterations=iterations, astray=outside if outside.any() else None)
         outside, start = outside | found.astray, found.state
 
 
-def _descended(problem: BlockProblem, start: State, selection: Selection, tolerance: float) -> Solved:
+def _descended(linear: Linear, tolerance: float) -> Solved:
     """Return the minimum by Gauss-Newton, damped where that does not descend, or where a step leads points `astray`."""
-    ordering = problem.ordering(selection)
+    ordering, square = linear.ordering, linear.misfits.square
     damping, steps = 0.0, Steps()
-    linear = Linear.at(problem, start, selection, ordering)
-    if not math.isfinite(square := linear.misfits.square):
-        raise NotConverged("the start values put points outside of the models", remedy="give better start values")
     for iteration in range(1, _STEPS + 1):
         step = step_of(linear, damping)
         if not step.finite or (iteration == 1 and step.condition > CONDITION_LIMIT):
@@ -313,9 +323,5 @@ def _moved(linear: Linear, move: Array) -> _Ahead | None:
         made = Linear.at(problem, state, linear.weights, linear.ordering)
     except InputError:
         return None
-    lost = ~np.isfinite(made.misfits.rays).all(axis=1)
-    if not lost.any():
-        return _Ahead(made, move, None)
-    astray = np.zeros(len(problem.points), dtype=bool)
-    astray[problem.points.point[lost]] = True
-    return _Ahead(made, move, astray)
+    astray = made.lost
+    return _Ahead(made, move, astray if astray.any() else None)

@@ -165,11 +165,14 @@ class Heights:
         """
         heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
-            judged, state = heights._under(solved.problem, solved.state.local)._judged(solved, number), solved.state
-            if judged.common.value is not heights.common.value:
+            judged, state = heights._with_shared_errors(solved, number), solved.state
+            if judged.common.value is heights.common.value:
+                judged = judged._under(solved.problem, state.local)
+            else:
                 # Points and images follow the shared errors, so that the DEM is read where they will be.
                 state = judged.common.followed(heights.common, solved)
                 judged = judged._following(solved, state.local)
+            judged = judged._judged(solved, state.local, number)
             problem = judged.applied(solved.problem)
             if _same_errors(judged, heights) and _stable(solved, problem):
                 return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
@@ -179,20 +182,25 @@ class Heights:
             solved, heights = again, judged
         return solved, heights
 
-    def _judged(self, solved: Solved, number: int) -> Heights:
-        """Return them with sigma, shared errors and wrong heights by a solution."""
+    def _with_shared_errors(self, solved: Solved, number: int) -> Heights:
+        """Return them with the errors that they share by a solution."""
         slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
         if self.spots is not None:
             common, slope = self.spots.told(common, self.sigma, slope)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
-            common = replace(common, value=common.value + step)
+            # The DEM is rougher than its planes, so whole steps of its shift would swing about the best without end.
+            common = replace(common, value=common.value + (0.5 * step if number else step))
+        return replace(self, common=common)
+
+    def _judged(self, solved: Solved, local: Array, number: int) -> Heights:
+        """Return them with sigma and wrong heights by a solution whose points follow the shared errors to `local`."""
         # Otherwise heights at the limit may be left out and return without end.
         settled = number > _SEARCHED
-        spots = self.spots if self.spots is None or settled else self.spots.judged(common, self.sigma)
-        judged = replace(self, common=common, spots=spots)
-        residuals, variances, used = judged._residuals(solved)
+        spots = self.spots if self.spots is None or settled else self.spots.judged(self.common, self.sigma)
+        judged = replace(self, spots=spots)
+        residuals, variances, used = judged._residuals(solved, local)
         if self.stated is None:
             judged = judged._estimated(residuals, variances, used)
         elif number:
@@ -202,7 +210,7 @@ class Heights:
         sigmas = np.sqrt(np.maximum(variances, (0.2 * judged.sigmas) ** 2))
         with np.errstate(invalid="ignore"):
             wrong = np.abs(residuals) > np.where(self.wrong, _RIGHT, _WRONG) * sigmas
-        broken = judged.broken if number else judged._breaking(solved)
+        broken = judged.broken if number else _breaking(judged, solved)
         return replace(judged, wrong=np.asarray(judged.of & wrong), broken=broken)
 
     def _following(self, solved: Solved, local: Array) -> Heights:
@@ -219,14 +227,14 @@ class Heights:
         heights = replace(self, source=source, common=common, terrain=terrain, spots=spots)
         heights = heights._under(solved.problem, local)
         far = np.abs(moved).max() > _MOVED * self.source.surface.sample_size
-        return replace(heights, broken=heights._breaking(solved)) if far else heights
+        return replace(heights, broken=_breaking(heights, solved)) if far else heights
 
-    def _residuals(self, solved: Solved) -> tuple[Array, Array, Mask]:
-        """Return how far heights are above their points ``(N,)`` m, the variances of that, and which take part.
+    def _residuals(self, solved: Solved, local: Array) -> tuple[Array, Array, Mask]:
+        """Return how far heights are above points at `local` ``(N,)`` m, the variances of that, and which take part.
 
         The residual of a height that takes part varies less than the height, that of another one more.
         """
-        problem, local = solved.problem, solved.state.local
+        problem = solved.problem
         planes = self._planes(problem, self.of)
         rows = np.zeros(len(local), dtype=bool)
         rows[solved.linear.ordering.numbers] = True
@@ -279,24 +287,25 @@ class Heights:
             return self
         return replace(self, scale=scale, spots=None if self.spots is None else replace(self.spots, scale=scale))
 
-    def _breaking(self, solved: Solved) -> Mask:
-        """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
-        covariance = solved.ground_covariance(solved.cofactors, 1.0)
-        plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
-        rows = np.flatnonzero(self.of & np.isfinite(plan))
-        ground, slopes, found = self.terrain.ground, np.nan_to_num(self.terrain.slopes), self.broken.copy()
-        # The uncertainty is larger while the images are still displaced.
-        far = self.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], self.source.surface.sample_size))
-        with np.errstate(invalid="ignore"):
-            found[rows] = far > _BREAKS * self.sigmas[rows]
-        return found
-
     @property
     def sigma_is(self) -> Literal["stated", "enlarged", "estimated", "assumed"]:
         """The source of the sigmas."""
         if self.stated is not None:
             return "enlarged" if self.scale > 1.0 else "stated"
         return "estimated" if self.estimated else "assumed"
+
+
+def _breaking(heights: Heights, solved: Solved) -> Mask:
+    """Return where the DEM is no plane ``(N,)`` within the uncertainty of the points' places."""
+    covariance = solved.ground_covariance(solved.cofactors, 1.0)
+    plan = np.sqrt(np.maximum(covariance[:, 0, 0], covariance[:, 1, 1]))
+    rows = np.flatnonzero(heights.of & np.isfinite(plan))
+    ground, slopes, found = heights.terrain.ground, np.nan_to_num(heights.terrain.slopes), heights.broken.copy()
+    # The uncertainty is larger while the images are still displaced.
+    far = heights.source.breaks(ground[rows], slopes[rows], np.minimum(plan[rows], heights.source.surface.sample_size))
+    with np.errstate(invalid="ignore"):
+        found[rows] = far > _BREAKS * heights.sigmas[rows]
+    return found
 
 
 def _same_errors(one: Heights, other: Heights) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +12,11 @@ from ortho_pipeline.block.equations.problem import BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.intersection import predict
 from ortho_pipeline.block.local_frame import GEODETIC
-from ortho_pipeline.block.points import Index
+from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
-from ortho_pipeline.models.base import Array
+from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface
@@ -179,26 +180,37 @@ def starts(source: DemHeights, problem: BlockProblem, rays: Mask) -> Array:
     other points and where the DEM has no height.
     """
     points, frame, models = problem.points, problem.frame, problem.models
-    of = points.tie & ~problem.placed
-    ground, heights = np.full((len(points), 3), np.nan), np.full(len(points), np.nan)
-    left = np.flatnonzero(_first_rays(points.point, rays & of[points.point]))
+    first = np.flatnonzero(_first_rays(points.point, rays & (points.tie & ~problem.placed)[points.point]))
+    high = _along(points, models, first, np.full(len(first), np.nan))
+    ground = _along(points, models, first, source.heights(high))
+    # From there on rays are straight.
+    step = ground - high
+    slopes = step / np.where(step[:, 2:] == 0, np.inf, step[:, 2:])
+    heights, left = np.full(len(first), np.nan), np.arange(len(first))
     for _ in range(_FOLLOWED):
-        for image in np.unique(points.image[left]):
-            model, used = models[image], left[points.image[left] == image]
-            of_points = points.point[used]
-            at = np.where(np.isfinite(heights[of_points]), heights[of_points], model.reference_height)
-            ground[of_points] = ground_transform(model.crs, GEODETIC)(model.image_to_ground(points.measured[used], at))
-            heights[of_points] = at
-        there = source.heights(ground[points.point[left]])
-        far = np.abs(there - heights[points.point[left]]) > _NEAR_ENOUGH
-        heights[points.point[left]] = there
+        heights[left] = source.heights(ground[left])
+        off = heights[left] - ground[left, 2]
+        far = np.abs(off) > _NEAR_ENOUGH
         left = left[far]
         if not len(left):
             break
-    good: Mask = np.array(np.isfinite(heights) & np.isfinite(ground).all(axis=1), dtype=bool)
-    found = np.where(good[:, None], frame.of_geodetic(np.column_stack([ground[:, :2], heights])), np.nan)
+        ground[left] += slopes[left] * off[far, None]
+    good = np.isfinite(heights) & np.isfinite(ground).all(axis=1)
+    found = np.full((len(points), 3), np.nan)
+    ground[:, 2] = heights
+    found[points.point[first[good]]] = frame.of_geodetic(ground[good])
     seen = np.isfinite(predict(frame, models, points, found)).all(axis=1)
     found[points.point[rays & ~seen]] = np.nan
+    return found
+
+
+def _along(points: BlockPoints, models: Sequence[SensorModel], rays: Index, heights: Array) -> Array:
+    """Return lon, lat, h ``(n, 3)`` of `rays` ``(n,)`` at heights ``(n,)``; where they are NaN, at those of models."""
+    found, images = np.empty((len(rays), 3)), points.image[rays]
+    for image in np.unique(images):
+        model, of = models[image], np.flatnonzero(images == image)
+        at = np.where(np.isfinite(heights[of]), heights[of], model.reference_height)
+        found[of] = ground_transform(model.crs, GEODETIC)(model.image_to_ground(points.measured[rays[of]], at))
     return found
 
 

@@ -18,7 +18,7 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC, plan_partials
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
 
@@ -109,24 +109,19 @@ def _between(fit: BlockFit, first: int, second: int, rows: int, columns: int) ->
     return np.asarray(fit.cofactors.between(*(index.astype(np.int64) for index in both))[0, :rows, :columns])
 
 
-def weak_joins(joins: tuple[Join, ...], limit: float, *, with_heights: bool) -> tuple[Notice, ...]:
-    """Return a notice of pairs whose relative position is less accurate than a limit (px), with what would help."""
+def weak_joins(joins: tuple[Join, ...], limit: float) -> tuple[Notice, ...]:
+    """Return a notice of pairs whose relative position is less accurate than a limit (px)."""
     weak = sorted((join for join in joins if join.sigma > limit), key=lambda join: -join.sigma)
     if not weak:
         return ()
     named = "; ".join(
-        f"{join.first} and {join.second} by {join.sigma:.1f} px ({join.sigma * join.pixel:.2g} m) along azimuth "
+        f"{join.first} and {join.second}, {join.sigma:.2g} px ({join.sigma * join.pixel:.2g} m) along azimuth "
         f"{join.azimuth_deg:.0f}°"
         for join in weak[:_NAMED]
     )
     more = f"; and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""
-    dem = ("give a more accurate DEM",) if with_heights else ("give a DEM (", Setting("surface.dem"), ")")
-    text = Text(
-        f"{counted(len(weak), 'pair of images', 'pairs of images')} may be shifted against each other (sigma): "
-        f"{named}{more}; ",
-        *dem,
-        ", control points, or another view",
-    )
+    pairs = counted(len(weak), "pair of images", "pairs of images")
+    text = f"the relative position of {pairs} has a sigma above {limit:g} px: {named}{more}"
     worst = weak[0]
     fields = {"worst": [worst.first, worst.second], "sigma_px": worst.sigma, "limit_px": limit}
     return (Notice("weak-join", text, pairs=len(weak), **fields),)

@@ -147,7 +147,9 @@ def refuse_contradictions(
                 Setting("points.points", "FILE"),
                 ", or ",
                 Setting("points.ties", "auto"),
-                " to find tie points by matching",
+                " (and ",
+                Setting("surface.dem", "FILE"),
+                ") to find tie points by matching",
             ),
         )
     if options.points is None:

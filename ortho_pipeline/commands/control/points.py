@@ -64,7 +64,7 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
             raise InputError(
                 f"the correction {points.correction!r} needs control points",
                 field="points.gcps",
-                remedy="give a file of points",
+                remedy=Text("give a file of points, or match an orthoimage (", Setting("match.reference"), ")"),
             )
         return
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)

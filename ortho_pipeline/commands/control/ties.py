@@ -110,8 +110,8 @@ class Tied:
             column, row = entry["shift_px"]
             lines.append(
                 f"{pair}: {counted(entry['ties'], 'tie point')} ({entry['matched']} of {entry['tried']} matches "
-                f"between them succeeded); models differ by column {column:+.2f} px, row {row:+.2f} px; heights "
-                f"differ by {metres(entry['height_m'])}"
+                f"between them succeeded); delivered models differ by column {column:+.2f} px, row {row:+.2f} px; "
+                f"heights differ by {metres(entry['height_m'])}"
             )
         return "\n".join(lines)
 

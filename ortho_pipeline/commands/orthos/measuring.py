@@ -16,12 +16,13 @@ from scipy.ndimage import gaussian_filter
 
 from ortho_pipeline.commands.control.matching import Matched, match_scene
 from ortho_pipeline.commands.orthos.masks import ClassMask
-from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.imaging.matching.chip_search import SIDE
+from ortho_pipeline.imaging.matching.least_squares import RIM
 from ortho_pipeline.models import ImageCorrection, SensorModel, SmoothField
 from ortho_pipeline.models.base import Array, solve_2x2
 from ortho_pipeline.models.orthos.smooth_field import bending_of
@@ -30,6 +31,8 @@ from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.flat import FlatSurface
 
+#: Cells per side in which an ortho is looked at.
+CELLS = 16
 #: Default search radius: metres, pixels, and part of the shorter side.
 _METRES, _PIXELS, _PART = 100.0, 30.0, 0.25
 #: Matchings after the first, at most, and how far (px, and chip px) they search.
@@ -96,8 +99,18 @@ class MeasuredOrtho:
 
     @property
     def chip(self) -> float:
-        """Side (px) of a chip: matches share noise up to that distance."""
-        return float(SIDE * self.matched.matches.factor)
+        """Side (px) of the part of a chip that is compared: matches share noise up to that distance."""
+        return float((SIDE - 2 * RIM) * self.matched.matches.factor)
+
+    @functools.cached_property
+    def filled(self) -> Array:
+        """Shares ``(CELLS, CELLS)`` of pixels that have a value, in cells along rows and columns."""
+        return filled_of(self.scene, self.opened, CELLS)
+
+    @property
+    def shown(self) -> Array:
+        """Which cells ``(CELLS, CELLS)`` show ground: half of their pixels have a value, or as many as in any cell."""
+        return np.asarray(self.filled >= min(0.5, self.filled.max()))
 
     @functools.cached_property
     def field(self) -> DisplacementField:

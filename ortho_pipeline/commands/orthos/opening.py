@@ -6,6 +6,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from osgeo import gdal
+
 from ortho_pipeline import host
 from ortho_pipeline.errors import CrsError, InputError, completed
 from ortho_pipeline.errors.texts import Setting, Text
@@ -14,7 +17,9 @@ from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import MapGrid
+from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.raster.source import RasterSource
 
 #: Name of the "sensor" of a finished ortho.
 ORTHO = "ortho"
@@ -23,6 +28,19 @@ _LEVELS = ("productLevel", "PROCESSING_LEVEL", "Processing Level", "productType"
 #: Where metadata state the time of acquisition: domain and item.
 _ACQUIRED = (("IMAGERY", "ACQUISITIONDATETIME"), ("", "PRODUCT_START_TIME"), ("", "DATE_ACQUIRED"))
 _RAW = ("LV1", "LV2", "SENSOR", "PRIMARY", "BASIC", "STANDARD GEOMETRICALLY", "L1A", "L1B", "1A", "1B")
+
+
+def filled_of(scene: Scene, options: SceneOptions, cells: int) -> Array:
+    """Return the shares ``(cells, cells)`` of pixels that have a value, in cells along rows and columns.
+
+    They come from a sample of 8 x 8 pixels of each cell, of the first band.
+    """
+    source, side = RasterSource(scene.path, **options.access), 8 * cells  # a band needs its dataset
+    band = source.bands[0]
+    if band.GetMaskFlags() & gdal.GMF_ALL_VALID:
+        return np.ones((cells, cells))
+    valid = band.GetMaskBand().ReadAsArray(buf_xsize=side, buf_ysize=side) > 0
+    return np.asarray(valid.reshape(cells, 8, cells, 8).mean(axis=(1, 3)))
 
 
 def open_ortho(image: str | os.PathLike[str] | Scene, options: SceneOptions, *, only: bool = True) -> Scene:

@@ -168,6 +168,7 @@ def document_of(
     """Return what is published of an ortho: of its matches, or of points alone where it was not matched."""
     opened = found if isinstance(found, Scene) else found.scene
     pixel = pixel_of(opened)
+    filled = 1.0 if isinstance(found, Scene) else float(found.filled.mean())
     middle = opened.model.image_to_ground(np.array([[opened.width / 2, opened.height / 2]]), 0.0)
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
@@ -175,7 +176,7 @@ def document_of(
         "size": [opened.width, opened.height],
         "crs": opened.model.crs,
         "pixel_m": pixel,
-        "area_m2": opened.width * opened.height * pixel**2,
+        "area_m2": opened.width * opened.height * pixel**2 * filled,
         "lon_lat": json_value(ground_transform(opened.model.crs, "EPSG:4979")(middle)[0, :2]),
         "acquired": opened.facts.get("acquired"),
         "references": [str(path) for path in match.reference],

@@ -103,7 +103,9 @@ def _but(
         elif smallest not in errors:
             text += "but these points do not support it"
         else:
-            text += f"but its expected error over the scene is {errors[smallest]:.3g} px"
+            better = errors[chosen] / errors[smallest]
+            text += f"but its expected error over the scene, {errors[smallest]:.3g} px, is "
+            text += "larger" if better < 1 else "less than 2 % smaller" if better <= _WORTH else "not clearly smaller"
     fit = rows[chosen].fit
     weak = ", ".join(fit.reservations) if fit else ""
     return text + (f". {chosen} is {weak}: measure points there" if weak else "")

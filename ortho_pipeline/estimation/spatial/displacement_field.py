@@ -2,9 +2,11 @@ r"""The displacement field of an image, from displacements that matches measured
 
 Along each of two axes, :math:`d(x) = F(x) b + s(x) + n`: an affine trend, a smooth field with
 :math:`\mathrm{cov}(s_i, s_j) = \sigma_s^2 k(d_{ij} / c)`, and noise of matching with the variances
-:math:`\sigma_n^2 w_i`. Chips that overlap share noise: its correlation is the square of the part of its area that one
-shares with the other. That is the measured correlation of errors of drawn pairs whose truth is known. A match
-measures the mean displacement of its chip, so no field has a shorter range than the side of a chip.
+:math:`\sigma_n^2 w_i`. Chips that overlap share noise: a shift is a mean over the pixels of a chip, so the correlation
+is the part of its pixels that one shares with the other. Errors of drawn pairs whose truth is known have this
+correlation. A match measures the mean displacement of its chip. So no field has a shorter range than its side, and the
+covariance of two means is that at the root mean square distance of their points, :math:`d^2 + a^2 / 3` for chips of
+side :math:`a`. Without it a rough field explains the noise that chips share, and too little noise remains.
 
 Smoothness, range and strength of the field are unknown. So all functions of `shared_errors` have the same prior weight
 and are weighted by their restricted likelihood. A trend without slopes (a mere shift) is as likely beforehand as one
@@ -102,7 +104,7 @@ class DisplacementField:
         sigma : (N,), optional
             Standard deviations of the displacements, relative to each other.
         side : float
-            Side of the chips that were matched, in units of places: those that overlap share noise.
+            Side of the compared part of chips, in units of places: those that overlap share noise.
 
         Raises
         ------
@@ -240,7 +242,7 @@ class DisplacementField:
 
     def _covariance(self, kernel: tuple[int, float], one: Array, other: Array) -> Array:
         family, length = kernel
-        return np.asarray(FAMILIES[family](spatial.distance.cdist(one, other) / length))
+        return np.asarray(FAMILIES[family](_between_chips(spatial.distance.cdist(one, other), self.side) / length))
 
     def _whitened(self, kernel: tuple[int, float], ratio: float) -> Callable[[Array], Array]:
         """Return the function that whitens columns."""
@@ -308,13 +310,18 @@ def _design(place: Array) -> Array:
     return np.column_stack([np.ones(len(place)), place])
 
 
+def _between_chips(distance: Array, side: float) -> Array:
+    """Return root mean square distances of points of chips from distances of their centres."""
+    return np.asarray(np.sqrt(distance**2 + side**2 / 3.0))
+
+
 def _noise(place: Array, weight: Array, side: float) -> Array:
     """Return the covariance ``(n, n)`` of the noise: chips that overlap share a part of it."""
     root = np.sqrt(weight)
     if not side > 0:
         return np.diag(weight)
     apart = np.abs(place[:, None] - place) / side
-    shared = np.maximum(1.0 - apart, 0.0).prod(axis=2) ** 2
+    shared = np.maximum(1.0 - apart, 0.0).prod(axis=2)
     return np.asarray((_OF_PIXELS * shared + (1.0 - _OF_PIXELS) * np.eye(len(place))) * root[:, None] * root)
 
 
@@ -335,10 +342,11 @@ def _likely(place: Array, value: Array, weight: Array, side: float) -> tuple[_Ax
     near = float(np.median(np.partition(distance, 1, axis=1)[:, 1]))
     ranges = np.geomspace(np.clip(max(near, side), 0.01, 0.5), 1.0, _RANGES)
     ratios = np.concatenate([[0.0], np.geomspace(1.0 / count, _LARGEST, _RATIOS)])
+    between = _between_chips(distance, side)
     kernels = tuple((family, float(length)) for family in range(len(FAMILIES)) for length in ranges)
     logs, squares = (np.empty((2, len(kernels), len(ratios))) for _ in range(2))
     for number, (family, length) in enumerate(kernels):
-        kernel = inverse @ FAMILIES[family](distance / length) @ inverse.T
+        kernel = inverse @ FAMILIES[family](between / length) @ inverse.T
         values, vectors = np.linalg.eigh(basis.T @ kernel @ basis)
         each = 1.0 + ratios[:, None] * np.maximum(values, 0.0)
         squares[:, number] = ((vectors.T @ left) ** 2).T @ (1.0 / each).T

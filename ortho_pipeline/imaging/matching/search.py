@@ -399,7 +399,8 @@ def _standing_out(
             )
         raise InputError(
             f"cannot match the scene with {targets[0].called}: no clear best position within {reach:.0f} px "
-            f"(mean correlation of {counted(len(common), 'chip')}: {means[best]:.2f} and {means[other]:.2f})",
+            f"(mean correlation of {counted(len(common), 'chip')}: best {means[best]:.2f}, second best "
+            f"{means[other]:.2f})",
             file=targets[0].path,
             field=targets[0].field,
             remedy=_remedy(corrections[best], targets[0]),

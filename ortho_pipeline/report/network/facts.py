@@ -26,7 +26,7 @@ def found_network(fit: BlockFit, join_limit: float) -> tuple[NetworkRecord, tupl
     """Return the network of a block, and notices if joins are weaker than a limit (px) or it falls into parts."""
     joins = joins_of(fit)
     network = network_of(fit, joins, join_limit)
-    weak = weak_joins(joins, join_limit, with_heights=fit.heights is not None)
+    weak = weak_joins(joins, join_limit)
     if len(network.parts) < 2:
         return network, weak
     said = " and ".join(", ".join(part[:4]) + (" ..." if len(part) > 4 else "") for part in network.parts[:3])
@@ -46,7 +46,7 @@ def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...
 
 
 def placed(fit: BlockFit, starts: Mapping[str, Start]) -> dict[str, dict[str, Any]]:
-    """Return of each image, by its adjusted model, `outline`, angles of view, and the share that its points cover."""
+    """Return of each image, by its adjusted model, its outline, its pixel, and the share that its points cover."""
     heights = fit.ground[np.isfinite(fit.ground).all(axis=1), 2]
     found = {}
     for k, (label, start) in enumerate(starts.items()):
@@ -54,10 +54,12 @@ def placed(fit: BlockFit, starts: Mapping[str, Start]) -> dict[str, dict[str, An
         corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], dtype=float)
         level = float(np.median(heights)) if len(heights) else model.reference_height
         ground = ground_transform(model.crs, GEODETIC)(model.image_to_ground(corners, level))[:, :2]
-        view = viewing(model, *size)["view"] or {}
+        seen = viewing(model, *size)
+        view = seen["view"] or {}
         rays = np.asarray(fit.used_rays) & (fit.points.image == k)
         found[label] = {
             "outline": tuple(map(tuple, ground.tolist())) if np.isfinite(ground).all() else None,
+            "ground_pixel_m": seen["ground_pixel_m"],
             "incidence_deg": view.get("incidence_deg"),
             "sensor_azimuth_deg": view.get("sensor_azimuth_deg"),
             "covered": empty_parts(fit.points.measured[rays], size)[0],
@@ -65,10 +67,10 @@ def placed(fit: BlockFit, starts: Mapping[str, Start]) -> dict[str, dict[str, An
     return found
 
 
-def suffices_for(fit: BlockFit) -> MapScaleRecord | None:
-    """Return the map scales that the check points of a block suffice for in plan; None without any."""
+def suffices_for(fit: BlockFit, pixel: float | None) -> MapScaleRecord | None:
+    """Return the map scales that check points and pixel (m) of a block suffice for in plan; None without points."""
     check = fit.points.check & np.isfinite(fit.object_residuals).all(axis=1)
     if not check.any():
         return None
     survey = np.nan_to_num(fit.points.sigma_ground[check, :2])
-    return judge(fit.object_residuals[check, :2], "check", None, float(np.sqrt((survey**2).sum(axis=1).mean())))
+    return judge(fit.object_residuals[check, :2], "check", pixel, float(np.sqrt((survey**2).sum(axis=1).mean())))
