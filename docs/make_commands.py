@@ -202,7 +202,12 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
         "dem-sigma": "The reported accuracy must include the DEM error.",
     },
     "align": {"search": _FAR},
-    "stack": {"search": _FAR, "reference": "All dates must agree with an orthoimage that you trust."},
+    "stack": {
+        "search": _FAR,
+        "reference": "All dates must agree with an orthoimage that you trust.",
+        "dem": "Some dates are raw scenes.",
+        "height": "Some dates are raw scenes of flat ground.",
+    },
     "verify": {
         "search": _FAR,
         "output": "You want the report and the displacements in files.",
@@ -213,7 +218,6 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
         "output": "The results go to object storage.",
         "root": "The pipeline file names files outside its own folder, and you trust it.",
     },
-    "stack": {"dem": "Some dates are raw scenes.", "height": "Some dates are raw scenes of flat ground."},
     "ties": {
         "dem": "Almost always: with it, matching finds ties in hilly ground.",
         "dem-sigma": "The DEM may be more than 10 m off: the search for ties must then go further.",
