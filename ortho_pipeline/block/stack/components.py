@@ -25,8 +25,9 @@ from ortho_pipeline.block.stack.edges import Edges
 from ortho_pipeline.block.stack.trends import Trends
 from ortho_pipeline.models.base import Array
 
-#: Ranges of correlations, in halves of the longer side, and upper limits of the classes of distances.
-_RANGES = 0.2, 0.45, 1.0
+#: Ranges of correlations, in halves of the longer side: from one cell to errors that look like a trend. Upper limits of
+#: the classes of distances.
+_RANGES = 0.2, 0.5, 1.25
 _TERMS = 1 + 2 * len(_RANGES)
 _CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
 #: Edges and pairs of edges whose products are taken, at most.
