@@ -47,8 +47,7 @@ _SIGNED = re.compile(
 )
 #: The token of a page of answers opens none.
 _PAGE = re.compile(r"(?<=[?&])token=[^&]*", re.IGNORECASE)
-_SHOWN = 5
-_MOST_ENCODED = 5
+_SHOWN, _MOST_ENCODED = 5, 5
 #: No more is read at once of a file in an archive or behind a URL: a zip of 1 kB may hold billions of zeros.
 MAX_READ = 5_000_000
 #: No delivery has more files in a folder; a store behind a URL may.
@@ -110,8 +109,9 @@ class VsiPath:
 
     @property
     def parent(self) -> VsiPath:
-        """The folder."""
-        return VsiPath(self._name.rpartition("/")[0])
+        """The folder; of a server, a bucket or an archive on disk itself."""
+        folder = self._name.rpartition("/")[0]
+        return self if re.fullmatch(r"/vsi\w+(/\w+:/)?", folder) else VsiPath(folder)
 
     def with_name(self, name: str) -> VsiPath:
         """Return the file of that name in the same folder."""

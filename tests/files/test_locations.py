@@ -260,3 +260,8 @@ def test_a_root_does_not_open_what_lies_outside_of_it(tiny, tmp_path, source):
     )
     with pytest.raises(InputError, match="outside"):
         open_dataset(vrt, **SceneOptions(roots=(root,)).access)
+
+
+@pytest.mark.parametrize("root", ["/vsicurl/https://store.test", "/vsis3/bucket", "/vsizip/delivery.zip"])
+def test_nothing_is_above_a_server_a_bucket_or_an_archive(root):
+    assert str(VsiPath(f"{root}/a.tif").parent.parent.parent) == root

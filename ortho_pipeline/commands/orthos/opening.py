@@ -12,6 +12,7 @@ from osgeo import gdal
 from ortho_pipeline import host
 from ortho_pipeline.errors import CrsError, InputError, completed
 from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.files.locations import located
 from ortho_pipeline.files.shell import typed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.naming import crs_definition
@@ -76,7 +77,8 @@ def open_ortho(image: str | os.PathLike[str] | Scene, options: SceneOptions, *, 
         return plugins.open_scene(image, None, dict(options.sensor_options), **options.access)
     _refuse_raw(dataset, image, known)
     size = dataset.RasterXSize, dataset.RasterYSize
-    return Scene(ORTHO, image, *size, {MapGrid.kind: _grid_of(dataset, image, size)}, str(image), _facts(dataset))
+    path = located(image, allow_network=options.allow_network)
+    return Scene(ORTHO, path, *size, {MapGrid.kind: _grid_of(dataset, image, size)}, str(image), _facts(dataset))
 
 
 def _facts(dataset: Any) -> dict[str, str]:

@@ -82,7 +82,10 @@ def spots_of(view: SceneView, images: Sequence[Intensity]) -> int | None:
 def at_spots(
     view: SceneView, region: tuple[int, int, int, int], size: int, factor: int, inside: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """Return chips as `candidates` does, several at each spot: the middles of the cells ``(rows, columns)``."""
+    """Return chips as `candidates` does, several at each spot: the middles of the cells ``(rows, columns)``.
+
+    Each has a number of its own, from `_AT_SPOT`² times that of its cell on.
+    """
     half = (_SPOT - size) / 2 * factor
     edges = np.linspace(-half, half, _AT_SPOT + 1).tolist()
     parts = []
@@ -90,9 +93,9 @@ def at_spots(
         row, column = divmod(number, inside.shape[1])
         x = region[0] + (region[2] - region[0]) * (column + 0.5) / inside.shape[1]
         y = region[1] + (region[3] - region[1]) * (row + 0.5) / inside.shape[0]
-        for top, bottom in itertools.pairwise(edges):
-            for left, right in itertools.pairwise(edges):
-                parts.append(((x + left, y + top, x + right, y + bottom), number))
+        pieces = itertools.product(itertools.pairwise(edges), repeat=2)
+        for piece, ((top, bottom), (left, right)) in enumerate(pieces, number * _AT_SPOT**2):
+            parts.append(((x + left, y + top, x + right, y + bottom), piece))
     return _best_of(view, parts, size, factor)
 
 
