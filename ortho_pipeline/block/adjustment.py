@@ -130,7 +130,7 @@ def adjust(
     if common is not None:
         problem = common.applied(problem)
     solved, inside, dem_heights = _first(problem, state, selection, whole, dem_heights, robust)
-    rejected, near = tuple[GrossError, ...](), solved.state
+    rejected, near, searched = tuple[GrossError, ...](), solved.state, inside
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
         rejected, near = blunders.rejected, blunders.state
@@ -141,8 +141,9 @@ def adjust(
         problem = replace(solved.problem, pseudo=problem.pseudo)
         again = attempt(problem, near, inside)
         if dem_heights is not None and not again.converged:
-            # Heights that were renewed once may have no minimum in reach. Stable ones have.
-            again, dem_heights = dem_heights.settled(solved, inside)
+            # Heights that were renewed once may have no minimum in reach. Stable ones have. The search has taken the
+            # partials of the solution along.
+            again, dem_heights = dem_heights.settled(attempt(solved.problem, solved.state, searched), inside)
         solved, inside = _checked(again, inside)
     gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})

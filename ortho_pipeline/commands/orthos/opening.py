@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from osgeo import gdal
 
 from ortho_pipeline import host
 from ortho_pipeline.errors import CrsError, InputError, completed
@@ -29,6 +28,8 @@ _LEVELS = ("productLevel", "PROCESSING_LEVEL", "Processing Level", "productType"
 #: Where metadata state the time of acquisition: domain and item.
 _ACQUIRED = (("IMAGERY", "ACQUISITIONDATETIME"), ("", "PRODUCT_START_TIME"), ("", "DATE_ACQUIRED"))
 _RAW = ("LV1", "LV2", "SENSOR", "PRIMARY", "BASIC", "STANDARD GEOMETRICALLY", "L1A", "L1B", "1A", "1B")
+#: GDAL's flags of a band whose pixels are all valid (GMF_ALL_VALID).
+_ALL_VALID = 1
 
 
 def filled_of(scene: Scene, options: SceneOptions, cells: int) -> Array:
@@ -38,7 +39,7 @@ def filled_of(scene: Scene, options: SceneOptions, cells: int) -> Array:
     """
     source, side = RasterSource(scene.path, **options.access), 8 * cells  # a band needs its dataset
     band = source.bands[0]
-    if band.GetMaskFlags() & gdal.GMF_ALL_VALID:
+    if band.GetMaskFlags() == _ALL_VALID:
         return np.ones((cells, cells))
     valid = band.GetMaskBand().ReadAsArray(buf_xsize=side, buf_ysize=side) > 0
     return np.asarray(valid.reshape(cells, 8, cells, 8).mean(axis=(1, 3)))
