@@ -2,7 +2,7 @@
 
     python benchmarks/peers_warp.py --out peers.json                    GDAL, and OTB where it is installed
     python benchmarks/peers_warp.py --rasterio P --orthority P          and Python of environments with these
-    python benchmarks/peers_warp.py --read peers.json                   only the tables, into docs/comparison.md
+    python benchmarks/peers_warp.py --read peers.json                   the table of faults into docs/comparison.md
 
 `make peers` makes the environments. Each pixel of the image holds its own position, so every pixel of every ortho is
 compared with an exact calculation. The DEM is once in EPSG:4326, as most are, and once in the CRS of the ortho.
@@ -291,7 +291,7 @@ def behaviour(found: dict[str, Program], job: Job) -> dict[str, dict[str, str]]:
 
 def _verdict(job: Job, ortho: Path, done: subprocess.CompletedProcess[str]) -> str:
     if done.returncode:
-        return "failed, leaves a file" if ortho.exists() else "refused"
+        return "leaves a file" if ortho.exists() else "refused"
     try:
         off = errors(job, ortho, filled=True)
     except RuntimeError:
@@ -305,8 +305,8 @@ def _verdict(job: Job, ortho: Path, done: subprocess.CompletedProcess[str]) -> s
     return f"{said}: {np.median(off[off > 1.0]):.0f} px"
 
 
-def tables(document: dict[str, Any]) -> str:
-    """Return both tables as Markdown."""
+def times(document: dict[str, Any]) -> str:
+    """Return the table of time, memory and error as Markdown."""
     names = list(document["times"][DEMS[0]])
     lines = ["| | DEM in EPSG:4326 | DEM in the CRS of the ortho | memory | largest error |", "|---|---|---|---|---|"]
     for name in names:
@@ -316,8 +316,13 @@ def tables(document: dict[str, Any]) -> str:
         cells = [f"{statistics.median(run['wall'] for run in one['runs']):.1f} s, {one['ratio']:.1f}" for one in
                  (first, second)]  # fmt: skip
         lines.append(f"| {name} | {cells[0]} | {cells[1]} | {memory:.0f} MB | {worst:.3f} px |")
+    return "\n".join(lines)
+
+
+def faults(document: dict[str, Any]) -> str:
+    """Return the table of faults as Markdown."""
     names = list(next(iter(document["faults"].values())))
-    lines += ["", "| fault | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    lines = ["| fault | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     lines += [f"| {fault} | {' | '.join(row[name] for name in names)} |" for fault, row in document["faults"].items()]
     return "\n".join(lines)
 
@@ -331,13 +336,13 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=4000)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, help="all numbers as JSON")
-    parser.add_argument("--read", type=Path, help="measure nothing; write the tables of this file")
+    parser.add_argument("--read", type=Path, help="measure nothing; write the faults of this file")
     given = parser.parse_args()
     if given.read:
         document = json.loads(given.read.read_text())
         begin, _, rest = PAGE.read_text(encoding="utf-8").partition("<!-- peers -->\n")
         end = rest.partition("<!-- end of peers -->")[2]
-        PAGE.write_text(f"{begin}<!-- peers -->\n{tables(document)}\n<!-- end of peers -->{end}", encoding="utf-8")
+        PAGE.write_text(f"{begin}<!-- peers -->\n{faults(document)}\n<!-- end of peers -->{end}", encoding="utf-8")
         return
     with tempfile.TemporaryDirectory() as folder:
         jobs = {dem: Job(Path(folder), given.side, kind="ramp", dem_crs=dem).make() for dem in DEMS}
@@ -347,7 +352,7 @@ def main() -> None:
             "machine": machine(), "side": given.side, "times": timed(found, jobs, given.rounds),
             "faults": behaviour(found, small),
         }  # fmt: skip
-    print(tables(document))
+    print(times(document), faults(document), sep="\n\n")
     if given.out:
         given.out.write_text(json.dumps(document, indent=1) + "\n")
 
