@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 from osgeo import gdal, osr
-from warp import GSD, LAT, LON, UTM, Job, Run, errors, gdalwarp, machine, measure, otb, otb_works, ours
+from warp import GSD, LAT, LON, UTM, Job, Run, apart, errors, gdalwarp, machine, measure, otb, otb_works, ours
 
 from ortho_pipeline.exchange.rpc import rpc_metadata
 
@@ -129,8 +129,8 @@ def timed(found: dict[str, Program], jobs: dict[str, Job], rounds: int) -> dict[
                 assert words is not None
                 runs[dem].setdefault(name, []).append(measure(words))
                 if number == rounds - 1:
-                    off = errors(job, program.ortho(job, out), filled=True)
-                    told[dem][name] = {"max_px": float(off.max()), "rms_px": float(np.sqrt(np.mean(off**2.0)))}
+                    # In a process of its own: the peak memory of a program begins with that of its parent.
+                    told[dem][name] = apart(_size_of_errors, job, program.ortho(job, out))
         print(f"round {number + 1}: {runs}", file=sys.stderr)
     for dem, here in runs.items():
         for name, taken in here.items():
@@ -141,6 +141,11 @@ def timed(found: dict[str, Program], jobs: dict[str, Job], rounds: int) -> dict[
                 "cpu_ratio": statistics.median(a.cpu / b.cpu for a, b in zip(taken, base, strict=True)),
             }  # fmt: skip
     return told
+
+
+def _size_of_errors(job: Job, ortho: Path) -> dict[str, float]:
+    off = errors(job, ortho, filled=True)
+    return {"max_px": float(off.max()), "rms_px": float(np.sqrt(np.mean(off**2.0)))}
 
 
 #: What is wrong with a folder that holds the scene and its DEM.
