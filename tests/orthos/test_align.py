@@ -69,7 +69,7 @@ def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
     made.SetMetadataItem("PRODUCT", "a mosaic")
     for number, name in enumerate(("red", "green", "nir"), start=1):
         band = made.GetRasterBand(number)
-        band.WriteArray(np.where(np.arange(pixels.shape[1]) < 30, -9999, pixels // number).astype(np.int16))
+        band.WriteArray(np.where(np.arange(pixels.shape[1]) < 30, -9999, pixels.astype(int) // number).astype(np.int16))
         band.SetNoDataValue(-9999)
         band.SetDescription(name)
     made = None
