@@ -15,7 +15,7 @@ from ortho_pipeline.batch.plan import Job
 from ortho_pipeline.batch.records import Digests, FileState, RunRecord, key_of, siblings
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.files import confined
+from ortho_pipeline.files import clear_up, confined
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.stores.objects import Objects
@@ -24,6 +24,19 @@ from ortho_pipeline.stores.objects import Objects
 _COMPANION_BYTES = 5_000_000
 #: Checksums that this process has taken.
 DIGESTS = Digests()
+
+
+def recorded_at(place: Path, *files: Path, rebuild: bool) -> RunRecord | None:
+    """Return the record of some files, and learn its checksums; None if there is none, or all is to be made again.
+
+    What a killed command left of record and files is cleared up.
+    """
+    for file in (*files, place):
+        clear_up(file)
+    record = None if rebuild else RunRecord.at(place)
+    if record is not None:
+        DIGESTS.learn(record.inputs)
+    return record
 
 
 def is_scene(record: RunRecord) -> bool:

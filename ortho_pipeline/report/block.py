@@ -377,7 +377,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
 
 
 def _marks(report: BlockReport) -> list[str]:
-    """Return a legend of the marks on the map of the network."""
+    """Return what the marks on the map of the block mean."""
     there = {point.role for point in report.adjustment.points}
     kinds = {"control": "dots: control points", "check": "squares: check points", "tie": "small dots: tie points"}
     said = [what for role, what in kinds.items() if role in there]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import glob
 import io
 import os
@@ -57,8 +58,9 @@ class RawScene:
     resolved: Resolved
     inputs: tuple[FileState, ...]
 
+    @functools.cached_property
     def placed(self) -> Placement:
-        """Return the scene with its delivered model on its heights, and the grid of its ortho."""
+        """The scene with its delivered model on its heights, and the grid of its ortho."""
         return place_scene(self.resolved)
 
 
@@ -134,9 +136,10 @@ def dated_orthos(
                 field="surface.dem",
                 remedy=Text(GIVE_HEIGHTS, "; if it is an ortho, delete the old RPC or metadata files"),
             )
-        time, source = _date(path, stated, pattern, options, scene)
-        facts = [*(_facts_of(document) for document, _ in _documents(path)), scene.facts]
-        conditions = conditions_of(facts, open_dataset(path, **options.access))
+        documents, dataset = _documents(path), open_dataset(path, **options.access)
+        time, source = _date(path, stated, pattern, documents, dataset, scene)
+        facts = [*(_facts_of(document) for document, _ in documents), scene.facts]
+        conditions = conditions_of(facts, dataset)
         dated.append(Dated(name, path, time, source, scene, conditions=conditions))
     return sorted(dated, key=lambda one: (one.time, one.name))
 
@@ -194,21 +197,25 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[Path, str | None]]:
 
 
 def _date(
-    path: Path, stated: str | None, pattern: str | None, options: SceneOptions, scene: Scene
+    path: Path,
+    stated: str | None,
+    pattern: str | None,
+    documents: Sequence[tuple[Any, str]],
+    dataset: Any,
+    scene: Scene,
 ) -> tuple[datetime, str]:
     """Return the date of an ortho, and where it is from."""
     if stated is not None:
         return time_of(stated, path), "list"
     if pattern is not None:
         return by_pattern(path.name, pattern), "file name"
-    for document, name in _documents(path):
+    for document, name in documents:
         text = _stated_in(document)
         if text is not None:
             return time_of(text, path), name
     acquired = scene.facts.get("acquired")
     if scene.sensor != ORTHO and isinstance(acquired, str):
         return time_of(acquired, path), "metadata"
-    dataset = open_dataset(path, **options.access)
     for domain, item in _ITEMS:
         text = (dataset.GetMetadata(domain) or {}).get(item)
         if text:
@@ -225,14 +232,10 @@ def _date(
 
 
 def _documents(path: Path) -> list[tuple[Any, str]]:
-    """Return JSON documents next to an ortho, which may state its date."""
+    """Return JSON documents next to an image, which may state its date, clouds and sun."""
     stem = path.stem.removesuffix("_ortho")
     names = [path.with_suffix(".json"), path.with_name(f"{stem}_stac.json"), path.with_name(f"{stem}_report.json")]
-    return [
-        (read_json(name, _BYTES, "delete this file, or give the date in a list"), name.name)
-        for name in names
-        if name.is_file()
-    ]
+    return [(read_json(name, _BYTES, "repair or delete this file"), name.name) for name in names if name.is_file()]
 
 
 def _stated_in(document: Any) -> str | None:

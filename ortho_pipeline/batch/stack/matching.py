@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.batch.freshness import DIGESTS
+from ortho_pipeline.batch.freshness import DIGESTS, recorded_at
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError, error_document
-from ortho_pipeline.files import clear_up, read_json, write_json
+from ortho_pipeline.files import read_json, write_json
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
@@ -85,17 +85,13 @@ class Matcher:
         first, second = dates[one], dates[other]
         name = f"{first.name}__{second.name}"
         data, place = self.folder / f"{name}.json", self.folder / f"{name}.record.json"
-        clear_up(data)
-        clear_up(place)
-        record = None if self.rebuild else RunRecord.at(place)
-        if record is not None:
-            DIGESTS.learn(record.inputs)
+        record = recorded_at(place, data, rebuild=self.rebuild)
         inputs = tuple(
             FileState.of(role, dated.path.absolute(), DIGESTS)
             for role, dated in (("later ortho", first), ("earlier ortho", second))
         )
         key = key_of(inputs, self._configuration(), software)
-        if record is not None and record.key == key and record.intact(self.folder):
+        if record is not None and record.is_of(key, self.folder):
             if record.status == "failed" and record.error is not None:
                 return DatePair(one, other, None, str(record.error["message"]), True)
             if record.status == "done" and len(record.outputs) == 1:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.batch.freshness import DIGESTS
+from ortho_pipeline.batch.freshness import DIGESTS, recorded_at
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, map_grid_of
@@ -28,7 +28,6 @@ from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.files import clear_up
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import ImageCorrection
@@ -39,6 +38,11 @@ from ortho_pipeline.surface.rays import meet_surface
 
 #: Places per side of the image at which a correction is transferred to the model, and how many need heights.
 _SIDE, _FEWEST = 17, 3
+
+
+def written_with(output: OutputOptions) -> list[Any]:
+    """Return the options that the pixels of an ortho and its file depend on."""
+    return [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)]
 
 
 def write_placed(placed: Placement, path: Path) -> None:
@@ -74,7 +78,7 @@ class Levelled:
     @classmethod
     def of(cls, dates: Sequence[Dated], placed: Placed, stack: AdjustedStack) -> Levelled:
         """Return the positions of a stack."""
-        raw = {number: one.raw.placed() for number, one in enumerate(dates) if one.raw is not None}
+        raw = {number: one.raw.placed for number, one in enumerate(dates) if one.raw is not None}
         return cls(raw, placed, stack)
 
     def pair(self, first: int, second: int, at: Array, seen: Array) -> tuple[Array, Array]:
@@ -186,16 +190,12 @@ class Rectifier:
 
     def _rectified(self, one: Dated, resolved: Resolved) -> Dated:
         path, place = self.folder / f"{one.name}_ortho.tif", self.folder / f"{one.name}.record.json"
-        clear_up(path)
-        clear_up(place)
-        record = None if self.rebuild else RunRecord.at(place)
-        if record is not None:
-            DIGESTS.learn(record.inputs)
+        record = recorded_at(place, path, rebuild=self.rebuild)
         files = resolved.ledger.roles.items()
         raw = RawScene(resolved, tuple(FileState.of(role, file.absolute(), DIGESTS) for file, role in files))
-        placed = raw.placed()
+        placed = raw.placed
         key = key_of(raw.inputs, self._configuration(placed), self.software)
-        if record is None or record.key != key or not record.intact(self.folder):
+        if record is None or not record.is_of(key, self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             write_placed(placed, path)
             outputs = (FileState.of("ortho", path, name=path.name),)
@@ -208,5 +208,5 @@ class Rectifier:
             "model": placed.model.to_dict(),
             "grid": [grid.crs.to_wkt(), *grid.geotransform, grid.width, grid.height],
             "surface": json_value(placed.surface.provenance),
-            "output": [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)],
+            "output": written_with(output),
         }

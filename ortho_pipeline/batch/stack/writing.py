@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.batch.freshness import DIGESTS
+from ortho_pipeline.batch.freshness import DIGESTS, recorded_at
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, geotransform_of
-from ortho_pipeline.batch.stack.raw import corrected_model, write_placed
+from ortho_pipeline.batch.stack.raw import corrected_model, write_placed, written_with
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.placement import Placement
@@ -20,7 +20,6 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import write_moved
 from ortho_pipeline.exchange.rpc import export_rpc, write_vrt
-from ortho_pipeline.files import clear_up
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import OutputOptions, SceneOptions
@@ -74,11 +73,9 @@ class Writer:
         part = self._part(one, solved, number)
         place = self.folder / f"{one.name}.record.json"
         files = [self.folder / f"{one.name}{ending}" for ending in (*part.endings, "_model.json")]
-        for file in (*files, place):
-            clear_up(file)
+        record = recorded_at(place, *files, rebuild=self.rebuild)
         key = key_of(part.inputs, self._configuration(part), self.software)
-        record = None if self.rebuild else RunRecord.at(place)
-        if record is None or record.key != key or not record.intact(self.folder):
+        if record is None or not record.is_of(key, self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             if part.endings:
                 part.write(files[0])
@@ -91,7 +88,7 @@ class Writer:
         """Return how the files of a date are made."""
         if one.raw is None:
             return self._finished(one, self.placed.corrected(one, solved, number))
-        placement = one.raw.placed()
+        placement = one.raw.placed
         return self._raw(one.raw, placement, corrected_model(placement, self.placed, solved, number))
 
     def _finished(self, one: Dated, model: ImageCorrection) -> _Part:
@@ -128,11 +125,10 @@ class Writer:
         return _Part(raw.inputs, saved, ("_aligned.vrt",), write_rpc)
 
     def _configuration(self, part: _Part) -> dict[str, Any]:
-        output = self.output
         return {
             "surface": part.surface,
             "model": part.saved.model.to_dict(),
             "grid": [*self.placed.grid.geotransform, self.placed.grid.width, self.placed.grid.height],
             "corrections_only": self.corrections_only,
-            "output": [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)],
+            "output": written_with(self.output),
         }
