@@ -29,6 +29,7 @@ from ortho_pipeline.block.equations.elimination import step_of
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
 from ortho_pipeline.block.local_frame import plan_partials
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
@@ -87,7 +88,7 @@ def with_datum(
         who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"
         of += f"; {who} {_span(stated_m)} m"
     elif np.isfinite(stated).any():
-        of += f"; not the accuracy of the metadata, because rays miss each other by {missed:.3g} px"
+        of += f"; not the accuracy of the metadata, because rays miss each other by {significant(missed, 3)} px"
     return problem.with_pseudo(held), _why(control, by_ties, of)
 
 
@@ -99,7 +100,7 @@ def stated_accuracies(models: Mapping[str, SensorModel]) -> dict[str, float]:
 
 def _span(values: Array) -> str:
     """Return a range of numbers, or the number if all are equal."""
-    low, high = f"{values.min():.2g}", f"{values.max():.2g}"
+    low, high = significant(values.min()), significant(values.max())
     return low if low == high else f"{low} to {high}"
 
 

@@ -34,14 +34,19 @@ def metres(value: float) -> str:
     return f"{value:.2f} m" if abs(value) < 10 else f"{value:.1f} m"
 
 
+def significant(value: float, digits: int = 2) -> str:
+    """Return a value with some significant digits and without an exponent: 0.48, 14, 1,100."""
+    return f"{float(f'{value:.{digits}g}'):,.15g}"
+
+
 def size_m(value: float) -> str:
     """Return a size or an error in metres with two digits: 0.48 m, 2.5 m, 14 m."""
-    return f"{float(f'{value:.2g}'):g} m"
+    return f"{significant(value)} m"
 
 
 def area_km2(square_metres: float) -> str:
     """Return an area in square kilometres with two digits: 7.4 km², 0.62 km², 120 km²."""
-    return f"{float(f'{square_metres / 1e6:.2g}'):,.15g} km²"
+    return f"{significant(square_metres / 1e6)} km²"
 
 
 def class_size(centimetres: int) -> str:

@@ -20,6 +20,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.problem import Problem, Solution
@@ -285,7 +286,8 @@ class OutlyingPoint(Record):
     def of(cls, name: str, role: Role, distance: float, expected: float, chance: float, leverage: float = 0.0) -> Self:
         """Return the point with its reason as a sentence, without the name."""
         text = (
-            f"{distance:.3g} px from where the other points predict it ({expected:.2g} px expected). Measure it again: "
+            f"{significant(distance, 3)} px from where the other points predict it ({significant(expected)} px "
+            "expected). Measure it again: "
         )
         if role == "check":
             text += "it still counts in the RMSE of the check points"
@@ -435,12 +437,12 @@ def checks_apart(
         rest = None if off.all() or not off.any() else rms(sizes[~off])
     far = np.lexsort((-sizes, ~off))[: min(NAMED, int(off.sum()) or 3)]
     beyond = outside_of_hull(points.image[used], checks.problem.image[off])
-    without = "" if rest is None else f", {rest:.2g} px without {'it' if off.sum() == 1 else 'them'}"
+    without = "" if rest is None else f", {significant(rest)} px without {'it' if off.sum() == 1 else 'them'}"
     cause = "Either check points are wrong, or the model is poor between the control points"
     text = (
         f"{contradicting(int(off.sum()), len(ids), ids[far].tolist())}. "
-        f"RMSE {rms(sizes):.3g} px{'' if len(ids) == 1 else f' of all {len(ids)}'}{without}; "
-        f"{rms(usual):.2g} px expected from the control points. "
+        f"RMSE {significant(rms(sizes), 3)} px{'' if len(ids) == 1 else f' of all {len(ids)}'}{without}; "
+        f"{significant(rms(usual))} px expected from the control points. "
         f"{cause if apart or rest is None else 'The other check points agree with the control points'}"
     )
     return [

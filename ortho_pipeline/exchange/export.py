@@ -11,6 +11,7 @@ from typing import Any
 from osgeo import gdal
 
 from ortho_pipeline.display.notices import to_document
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.gcp import gcps_of_model, gcps_of_points, write_gcps, write_geolocation
 from ortho_pipeline.exchange.rpc import (
@@ -108,18 +109,22 @@ class Export:
         lines = [f"Model {model} of {source}"]
         if self.document["exact"] is not None:
             worst = self.document["max_error_px"]
-            lines.append("RPC: exact" if self.document["exact"] else f"RPC: refitted, at most {worst:.2g} px off")
+            lines.append(
+                "RPC: exact" if self.document["exact"] else f"RPC: refitted, at most {significant(worst)} px off"
+            )
         if "gcps" in self.document:
             lines.append("Control points: {n}, {source}".format(**self.document["gcps"]))
             lines += ["Left out: {id} ({reason})".format(**point) for point in self.document["gcps"]["left_out"]]
         lines += [
-            f"{kind.title}: at most {self.document[kind.name]['max_error_px']:.2g} px off"
+            f"{kind.title}: at most {significant(self.document[kind.name]['max_error_px'])} px off"
             for kind in written
             if kind.name not in FORMATS
         ]
         if "geolocation" in self.document:
             arrays = self.document["geolocation"]
-            lines.append(f"Geolocation: {arrays['heights']}, {arrays['max_error_px']:.2g} px off between its samples")
+            lines.append(
+                f"Geolocation: {arrays['heights']}, {significant(arrays['max_error_px'])} px off between its samples"
+            )
         return "\n".join([*lines, *(f"Warning: {text}" for text in self.document["warnings"])])
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
@@ -89,10 +90,12 @@ def fit_rpc(
     worst = float(np.abs(rpc.ground_to_image(ground) - image).max())
     if not worst <= REFUSE_ERROR and not force:
         raise InputError(
-            f"an RPC represents this model only to {worst:.3g} px",
+            f"an RPC represents this model only to {significant(worst, 3)} px",
             remedy="fit it over a smaller box or height range, or accept the error (force)",
         )
-    message = Notice("rpc-approximate", f"the RPC represents the model only to {worst:.3g} px", max_error_px=worst)
+    message = Notice(
+        "rpc-approximate", f"the RPC represents the model only to {significant(worst, 3)} px", max_error_px=worst
+    )
     if worst > WARN_ERROR:
         log.warning("%s", message)
     return RpcExport(rpc, False, worst, (message,) if worst > WARN_ERROR else ())

@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.rpc_kernel import polynomial, slopes
 
@@ -196,7 +197,7 @@ def _check_pixel(values: dict[str, float], jacobian: Array) -> None:
     long, short = np.linalg.svd(pixels, compute_uv=False) if np.isfinite(pixels).all() else (np.nan, np.nan)
     if not (_PIXEL[0] <= 1.0 / long and 1.0 / short <= _PIXEL[1]):
         raise InputError(
-            f"a pixel of this RPC would be {1.0 / long:.2g} x {1.0 / short:.2g} m on the ground",
+            f"a pixel of this RPC would be {significant(1.0 / long)} x {significant(1.0 / short)} m on the ground",
             field="col_scale, row_scale, lon_scale, lat_scale",
             remedy=_DAMAGED,
         )

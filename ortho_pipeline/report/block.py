@@ -14,7 +14,7 @@ from ortho_pipeline.block.network import NetworkRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
-from ortho_pipeline.display.numbers import flat, metres, px, size_m
+from ortho_pipeline.display.numbers import flat, metres, px, significant, size_m
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
@@ -261,8 +261,9 @@ def height_lines(heights: HeightsRecord | None) -> list[str]:
         return []
     left = f", {len(heights.left_out)} left out" if heights.left_out else ""
     return [
-        f"{counted(heights.used, 'height')} of the DEM{left}: sigma {heights.sigma_m:.2g} m ({heights.sigma_is}), "
-        f"bias {heights.bias_m:+.2f} m (sigma {heights.bias_sigma_m:.2g} m)"
+        f"{counted(heights.used, 'height')} of the DEM{left}: "
+        f"sigma {significant(heights.sigma_m)} m ({heights.sigma_is}), "
+        f"bias {heights.bias_m:+.2f} m (sigma {significant(heights.bias_sigma_m)} m)"
     ]
 
 
@@ -271,13 +272,14 @@ def sigma_lines(report: BlockReport) -> list[str]:
     found = []
     if (ground := report.absolute) is not None:
         found.append(
-            f"Expected absolute accuracy: sigma {ground.east_m:.2g} m east, {ground.north_m:.2g} m north, "
-            f"{ground.height_m:.2g} m in height (median of {counted(ground.points, 'point')})"
+            f"Expected absolute accuracy: sigma {significant(ground.east_m)} m east, "
+            f"{significant(ground.north_m)} m north, "
+            f"{significant(ground.height_m)} m in height (median of {counted(ground.points, 'point')})"
         )
     if (pairs := report.relative) is not None:
         found.append(
-            f"Expected relative position of {counted(pairs.pairs, 'pair')} of images: sigma {pairs.median_px:.2g} px "
-            f"(median), {pairs.worst_px:.2g} px (worst)"
+            f"Expected relative position of {counted(pairs.pairs, 'pair')} of images: "
+            f"sigma {significant(pairs.median_px)} px (median), {significant(pairs.worst_px)} px (worst)"
         )
     return found
 
@@ -309,7 +311,7 @@ def variance_lines(variances: VariancesRecord) -> list[str]:
     if not variances.separable:
         return [f"{who} no ground accuracy; their ground errors count as measuring errors"]
     found = [
-        f"{part.sigma:.2g} m in {what} (redundancy {part.redundancy:.1f})"
+        f"{significant(part.sigma)} m in {what} (redundancy {part.redundancy:.1f})"
         for what, part in (("plan", ground.xy), ("height", ground.h))
         if part.sigma is not None
     ]

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.display.numbers import metres, px, share
+from ortho_pipeline.display.numbers import metres, px, share, significant
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import in_metres
@@ -48,7 +48,7 @@ class MatchComponents(Record):
         """Say what there is of each part."""
         said = []
         if self.matching > 0:
-            said.append(f"{self.matching:.3g} times the variance that least-squares matching states")
+            said.append(f"{significant(self.matching, 3)} times the variance that least-squares matching states")
         if self.height_m > 0:
             said.append(f"height errors of {metres(self.height_m)}")
         said.append(f"other errors of {px(self.other_px)} per axis")

@@ -17,7 +17,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import share
+from ortho_pipeline.display.numbers import share, significant
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.geodesy.crs import ground_transform, utm_crs
@@ -161,9 +161,9 @@ class Footprint:
                 remedy="give a DEM of this place",
             )
         if self.unmet and surface.fill == "nearest":
+            reach = significant(surface.nearest_reach * surface.sample_size / 1000, 3)
             raise CoverageError(
-                f"parts of the scene are more than {surface.nearest_reach * surface.sample_size / 1000:.3g} km from "
-                "the nearest height of the DEM",
+                f"parts of the scene are more than {reach} km from the nearest height of the DEM",
                 file=file,
                 field="surface.fill",
                 remedy=Text("give a larger DEM, or ", choice),

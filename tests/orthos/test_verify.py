@@ -286,6 +286,10 @@ def test_a_datum_that_explains_a_shift_is_named():
     assert datum_of(crs, here, (here - there)[:2], 0.5) == "ED50"
     assert datum_of(crs, here, np.array([40.0, -55.0]), 0.5) is None
     assert datum_of(crs, here, np.array([2.0, 1.0]), 0.5) is None
+    # WGS 72 is known to 2 m there, and differs by (13.7, 3.8): 5.1 m away.
+    turkey = np.array([531000.0, 4123000.0])
+    assert datum_of(parse_crs("EPSG:32636"), turkey, np.array([15.1, 8.7]), 0.2) is None
+    assert datum_of(parse_crs("EPSG:32636"), turkey, np.array([14.0, 4.0]), 0.2) == "WGS 72"
     # PROJ has several transformations from Cape to WGS 84, and chooses one at the place.
     there = ground_transform("EPSG:4222", "EPSG:32735")([[27.0, -26.0, 0.0]])[0]
     here = ground_transform("EPSG:4326", "EPSG:32735")([[27.0, -26.0, 0.0]])[0]

@@ -260,7 +260,7 @@ def test_a_scale_says_what_sets_its_limit():
         "Good enough for maps at 1:100,000 in plan. The error (14 m) sets this limit."
     )
     coarse = MapScaleRecord(**judge(np.full((30, 2), 1e5), "check", None).to_json())
-    assert fitness(coarse) == "Not good enough for a usual map scale: the error (140000 m) is too large."
+    assert fitness(coarse) == "Not good enough for a usual map scale: the error (140,000 m) is too large."
     rows = {rule: (here, result) for rule, _, here, result in scale_rules(record)}
     assert rows["RMSE in plan"] == ("14.1 m", "1:100,000")
     # 14.142 m is 1415 cm: what is rounded is no better than it was.

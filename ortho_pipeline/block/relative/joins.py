@@ -18,6 +18,7 @@ from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC, plan_partials
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array
@@ -115,8 +116,8 @@ def weak_joins(joins: tuple[Join, ...], limit: float) -> tuple[Notice, ...]:
     if not weak:
         return ()
     named = "; ".join(
-        f"{join.first} and {join.second}, {join.sigma:.2g} px ({join.sigma * join.pixel:.2g} m) along azimuth "
-        f"{join.azimuth_deg:.0f}°"
+        f"{join.first} and {join.second}, {significant(join.sigma)} px ({significant(join.sigma * join.pixel)} m) "
+        f"along azimuth {join.azimuth_deg:.0f}°"
         for join in weak[:_NAMED]
     )
     more = f"; and {len(weak) - _NAMED} more" if len(weak) > _NAMED else ""

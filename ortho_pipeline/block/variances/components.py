@@ -12,6 +12,7 @@ from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
@@ -137,7 +138,7 @@ class Variances:
         for what, sigma, part in zip(("in plan", "in height"), sigmas, self.redundancy[1:], strict=True):
             if sigma is not None:
                 weak = ", hardly determined" if part < 2.0 else ""
-                found.append(f"{sigma:.2g} m {what} (redundancy {part:.1f}{weak})")
+                found.append(f"{significant(sigma)} m {what} (redundancy {part:.1f}{weak})")
         text = Text(f"{who}: estimated as {' and '.join(found)}; ", remedy)
         return [Notice("unstated-sigma", text, count=number, sigma_xy=self.sigma_xy, sigma_h=self.sigma_h)]
 

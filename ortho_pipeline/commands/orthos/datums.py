@@ -13,10 +13,11 @@ from pyproj.enums import PJType
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
 
-#: A shorter shift (m) is no datum's; a datum explains one to this part of it, or to so many metres.
-_SHORTEST, _PART, _METRES = 10.0, 0.1, 6.0
-#: Transformations that are less certain (m) explain nothing.
-_CERTAIN = 30.0
+#: A shorter shift (m) is no datum's.
+_SHORTEST = 10.0
+#: A transformation is known to a few metres, at least to its stated accuracy (m); a coarser one explains nothing, nor
+#: does one that is not known to this part of the shift: any shift would be near one of the many datums.
+_METRES, _COARSEST, _PART = 1.0, 30.0, 0.25
 
 
 def datum_of(crs: pyproj.CRS, place: Array, shift: Array, interval: float) -> str | None:
@@ -39,7 +40,7 @@ def datum_of(crs: pyproj.CRS, place: Array, shift: Array, interval: float) -> st
     if not (np.isfinite(lon) and np.isfinite(lat)):
         return None
     scale = metres_per_degree(np.array([[lon, lat, 0.0]]))[0]
-    tolerance, best = max(_PART * length, interval, _METRES), None
+    nearest, best = 1.0, None
     box = lon - 0.1, lat - 0.1, lon + 0.1, lat + 0.1
     near = transformer.AreaOfInterest(*box)
     for info in query_crs_info(
@@ -51,10 +52,12 @@ def datum_of(crs: pyproj.CRS, place: Array, shift: Array, interval: float) -> st
             )
             there = np.array(way.transform(lon, lat, errcheck=True))
             # Where a datum has several transformations, their accuracy is known once one is used.
-            if not 0 <= way.get_last_used_operation().accuracy <= _CERTAIN:
+            accuracy = way.get_last_used_operation().accuracy
+            tolerance = max(accuracy, _METRES) + interval
+            if not 0 <= accuracy <= _COARSEST or tolerance > _PART * length:
                 continue
             moved = (there - (lon, lat)) * scale
             apart = min(float(np.hypot(*(moved - shift))), float(np.hypot(*(moved + shift))))
-            if apart < tolerance:
-                tolerance, best = apart, info.name
+            if apart < nearest * tolerance:
+                nearest, best = apart / tolerance, info.name
     return best

@@ -259,8 +259,8 @@ def _of_shift(verified: Verified, relative: Accuracy) -> list[Cause]:
     datum = datum_of(parse_crs(measured.scene.model.crs), middle, bias, max(interval, 0.0))
     if datum is not None:
         text = (
-            f"the shift of {size_m(length)} is the difference between {datum} and the datum of the ortho. The wrong "
-            "datum was used"
+            f"the shift of {size_m(length)} equals the difference between {datum} and the datum of the ortho. A wrong "
+            "datum is the likely cause"
         )
         return [Cause("datum", text)]
     azimuth = math.degrees(math.atan2(bias[0], bias[1])) % 360

@@ -18,6 +18,7 @@ from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.rectification import rectify
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.sharpening.sharpen import require_one, require_several, sharpen
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.ground_residuals import metre_partials
@@ -150,7 +151,8 @@ def taken_over(adjusted: SensorModel, scene: Scene) -> tuple[SensorModel, int]:
         )
     if ratio < 1.5:
         raise InputError(
-            f"the pixels of this image are {ratio:.2g} times as wide as the panchromatic ones, so it is not coarser",
+            f"the pixels of this image are {significant(ratio)} times as wide as the panchromatic ones, so it is not "
+            "coarser",
             file=scene.path,
             field="sharpen",
             remedy=Text(

@@ -20,6 +20,7 @@ from ortho_pipeline.commands.sharpening.quality import reduced_quality
 from ortho_pipeline.commands.sharpening.registration import Agreement, displaced, measure_agreement
 from ortho_pipeline.commands.sharpening.samples import Sample, Weights, read_samples, regress
 from ortho_pipeline.display.notices import Notice, to_document
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import states, together, write_json
@@ -229,7 +230,8 @@ def _ratio_of(grids: tuple[Grid, Grid], pan: RasterSource, colours: RasterSource
     own = _own_ratio(grids)
     if own < 1 / _LEAST_RATIO:
         raise InputError(
-            f"the panchromatic ortho is coarser than the multispectral one: its pixels are {1 / own:.2g} times as wide",
+            "the panchromatic ortho is coarser than the multispectral one: its pixels are "
+            f"{significant(1 / own)} times as wide",
             file=pan.path,
             remedy="give the panchromatic ortho first, then the multispectral one",
         )
@@ -258,7 +260,7 @@ def _given_weights(weights: Sequence[float], pair: OrthoPair) -> tuple[float, ..
             f"{counted(len(weights), 'weight')} for {counted(count, 'band')}",
             file=pair.paths[1],
             field="weights",
-            remedy=f"give {count} numbers, such as {','.join([f'{1 / count:.2g}'] * count)}",
+            remedy=f"give {count} numbers, such as {','.join([significant(1 / count)] * count)}",
         )
     if not (np.isfinite(weights).all() and min(weights) >= 0 and max(weights) > 0):
         raise InputError(

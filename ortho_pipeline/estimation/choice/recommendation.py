@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
@@ -73,7 +74,8 @@ def recommend(
     expected = {name: expectation(by_name[name].fit, tests, size) for name in sound}  # type: ignore[arg-type]
     errors = expected_errors(sound, expected)
     chosen = _choose(sound, errors, by_name, [name for name in preferred if name in errors])
-    reason = f"{chosen}: expected error {errors[chosen]:.3g} px over the scene; RMSE {_shown(squares[chosen])} at "
+    reason = f"{chosen}: expected error {significant(errors[chosen], 3)} px over the scene; "
+    reason += f"RMSE {_shown(squares[chosen])} at "
     reason += f"{_what(checks, count - checks)}; {counted(by_name[chosen].parameters, 'parameter')}"
     reason += _but(chosen, smallest, squares, errors, doubts, by_name)
     return chosen, reason, "check" if checks else "leave-one-out"
@@ -104,7 +106,7 @@ def _but(
             text += "but these points do not support it"
         else:
             better = errors[chosen] / errors[smallest]
-            text += f"but its expected error over the scene, {errors[smallest]:.3g} px, is "
+            text += f"but its expected error over the scene, {significant(errors[smallest], 3)} px, is "
             text += "larger" if better < 1 else "less than 2 % smaller" if better <= _WORTH else "not clearly smaller"
     fit = rows[chosen].fit
     weak = ", ".join(fit.reservations) if fit else ""
@@ -112,7 +114,7 @@ def _but(
 
 
 def _shown(squares: Array) -> str:
-    return f"{math.sqrt(squares.mean()):.3g} px"
+    return f"{significant(math.sqrt(squares.mean()), 3)} px"
 
 
 def _tests(rows: Sequence[ComparedModel]) -> tuple[_Squares, np.ndarray, int]:

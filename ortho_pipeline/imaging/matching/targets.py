@@ -12,6 +12,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import CrsError, InputError, completed
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.shell import typed
@@ -275,7 +276,8 @@ def chip_factor(view: SceneView, targets: Sequence[Target], shown: Array) -> int
     if not 1 / _RATIO <= ratio <= _RATIO:
         first = targets[0]
         raise InputError(
-            f"a pixel of {os.path.basename(view.intensity.source.path)} is {ratio:.3g} pixels of {first.called}",
+            f"a pixel of {os.path.basename(view.intensity.source.path)} is {significant(ratio, 3)} pixels of "
+            f"{first.called}",
             file=first.path,
             field=first.field,
             remedy=f"match images whose resolutions differ by at most {int(_RATIO)} times",

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array, as_image
 from ortho_pipeline.models.correction import OverAnother
@@ -59,7 +60,7 @@ class SmoothField(OverAnother):
             raise InputError("an image has a positive size", field="size")
         if self.bending > STEEPEST:
             raise InputError(
-                f"this field changes by {self.bending:.2g} px per pixel, more than {STEEPEST} px",
+                f"this field changes by {significant(self.bending)} px per pixel, more than {STEEPEST} px",
                 field="coefficients",
                 remedy="give a smoother field",
             )

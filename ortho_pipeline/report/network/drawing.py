@@ -8,6 +8,7 @@ import numpy as np
 
 from ortho_pipeline.display.drawing import Drawing, round_down
 from ortho_pipeline.display.notices import doubted
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
@@ -91,7 +92,7 @@ def _draw_pairs(drawing: Drawing, report: BlockReport, middles: dict[str, Array]
             continue
         text = f"{one.first} – {one.second}: {counted(one.points, 'point')} in common, rays {one.angle_deg:.1f}° apart"
         if one.sigma_px is not None:
-            text += f"\nrelative position: sigma {one.sigma_px:.2g} px"
+            text += f"\nrelative position: sigma {significant(one.sigma_px)} px"
         look = "weak" if one.weak else "link-wide" if one.points > most / 2 else "link"
         with drawing.titled(text):
             drawing.line(look, x1, y1, x2, y2)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import area_km2, metres, size_m
+from ortho_pipeline.display.numbers import area_km2, metres, significant, size_m
 from ortho_pipeline.report.summary import RoleErrors, acquired, error_lines, place_text, processed
 
 #: Whose accuracy comes first, and what it is compared with.
@@ -88,7 +88,7 @@ def summary_text(document: Mapping[str, Any]) -> str:
     rows += [("cause", one["text"]) for one in document["causes"]]
     for one in document["requirements"]:
         word = "met" if one["met"] else "NOT met"
-        rows.append(("required", f"{one['requirement']}: {word} (upper limit {one['upper']:.3g})"))
+        rows.append(("required", f"{one['requirement']}: {word} (upper limit {significant(one['upper'], 3)})"))
     lines = [f"{key:<10}{value}" for key, value in rows]
     return "\n".join([*lines, *error_lines(errors_of(document))])
 

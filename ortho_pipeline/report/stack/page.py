@@ -7,6 +7,7 @@ import os
 from datetime import datetime
 
 from ortho_pipeline.display.drawing import Axes, Drawing, style_sheet
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files import write_text
@@ -150,4 +151,4 @@ def moving_map(record: StackRecord) -> tuple[Drawing | None, str]:
             drawing.rect("chosen", x - half, y - half, 2 * half, 2 * half)
             length = _ARROW / fastest
             drawing.arrow("control", x, y, one.rate_px_per_year[0] * length, one.rate_px_per_year[1] * length)
-    return drawing, f"{fastest:.2g} px a year"
+    return drawing, f"{significant(fastest)} px a year"
