@@ -213,7 +213,8 @@ def summary_text(report: BlockReport) -> str:
                 lines.append(f"{counted(rms.n, f'{role} point')}: {held}")
                 continue
             axes = zip("ENh", (rms.x, rms.y, rms.h), rms.min, rms.max, strict=True)
-            text = ", ".join(f"{axis} {value:.3f} ({a:+.2f} to {b:+.2f})" for axis, value, a, b in axes)
+            # Errors are adjusted minus known ground; residuals are the opposite.
+            text = ", ".join(f"{axis} {value:.3f} ({-b:+.2f} to {-a:+.2f})" for axis, value, a, b in axes)
             lines.append(f"{counted(rms.n, f'{role} point')}: RMSE {text} m")
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)

@@ -104,14 +104,14 @@ def errors_of_points(report: SceneReport) -> list[RoleErrors]:
 
 
 def errors_of_block(report: BlockReport) -> list[RoleErrors]:
-    """Return the errors of check points and of control points of a block: known minus adjusted ground.
+    """Return the errors of check points and of control points of a block: adjusted minus known ground.
 
     Control that is held at its coordinates has none.
     """
     found = []
     for role, title in (("check", "check points"), ("control", "control points (the fit)")):
         rows = [one.residual for one in report.adjustment.points if one.role == role and None not in one.residual]
-        errors = np.array(rows, dtype=np.float64)
+        errors = -np.array(rows, dtype=np.float64)
         if rows and not (role == "control" and np.abs(errors).max() < HELD):
             found.append(RoleErrors.of(role, title, errors))
     return found

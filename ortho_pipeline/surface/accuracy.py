@@ -214,7 +214,7 @@ def summary(document: dict[str, Any]) -> str:
             name = f"over {low:g}°" if high is None else f"{low:g}-{high:g}°"
             lines.append(f"{name:<12}{cells(row)}")
     lines.append(f"{'all':<12}{cells(document['overall'])}")
-    lines.append("DEM minus check height; of slopes without points there is no line")
+    lines.append("DEM minus check height; slopes without points have no row")
     if document["without_height"]:
         lines.append(f"without a height in the DEM, or of their own: {document['without_height']}")
     if document["gross"]:

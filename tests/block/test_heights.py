@@ -249,3 +249,16 @@ def test_a_point_outside_of_its_models_at_the_start_takes_part_later(tmp_path: P
     assert found.converged
     assert found.astray is None
     np.testing.assert_allclose(found.state.params, right.state.params, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_block_that_does_not_converge_after_the_search_for_gross_errors_is_solved(tmp_path):
+    """Heights that were renewed once had no minimum in reach there."""
+    path = Path(__file__).parents[2] / "benchmarks" / "heights.py"
+    spec = importlib.util.spec_from_file_location("heights_benchmark", path)
+    heights = sys.modules["heights_benchmark"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(heights)
+    block, source = heights.any_block(22025, tmp_path / "dem.tif")
+    fit = adjust(block.start, block.points, heights=source, hold=heights.HOLD)
+    assert fit.converged
+    np.testing.assert_allclose(fit.sigma0, 1.0, atol=0.2)
