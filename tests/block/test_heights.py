@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +15,12 @@ from ortho_pipeline.block.adjustment import _prepared, adjust
 from ortho_pipeline.block.datum import with_datum
 from ortho_pipeline.block.equations.solver import attempt
 from ortho_pipeline.block.fit import BlockFit
+from ortho_pipeline.block.heights import settling
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.heights.terrain import expected_slopes
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
-from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.surface.flat import FlatSurface
 
@@ -251,14 +255,33 @@ def test_a_point_outside_of_its_models_at_the_start_takes_part_later(tmp_path: P
     np.testing.assert_allclose(found.state.params, right.state.params, atol=1e-6)
 
 
+def test_heights_without_a_solution_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The solution before would have sigmas without the errors that the heights share."""
+    block = fly(Chain(images=3), 1)
+    heights = dem(block, tmp_path / "dem.tif", 1, white=2.0).with_sigma(2.0)
+    monkeypatch.setattr(settling, "attempt", lambda *given: replace(attempt(*given), converged=False))
+    with pytest.raises(NotConverged, match="with the heights of the DEM"):
+        adjust(block.start, block.points, heights=heights)
+
+
+#: Heights that were renewed once had no minimum in reach; points of nearly parallel rays moved by rounding without end.
+DIFFICULT = {22025: "renewed", 22159: "rounding", 22205: "rounding, silent"}
+
+
 @pytest.mark.slow
-def test_a_block_that_does_not_converge_after_the_search_for_gross_errors_is_solved(tmp_path):
-    """Heights that were renewed once had no minimum in reach there."""
+@pytest.mark.parametrize("seed", DIFFICULT)
+def test_blocks_that_were_difficult_to_solve(tmp_path: Path, seed: int) -> None:
     path = Path(__file__).parents[2] / "benchmarks" / "heights.py"
     spec = importlib.util.spec_from_file_location("heights_benchmark", path)
+    assert spec is not None
+    assert spec.loader is not None
     heights = sys.modules["heights_benchmark"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(heights)
-    block, source = heights.any_block(22025, tmp_path / "dem.tif")
+    block, source = heights.any_block(seed, tmp_path / "dem.tif")
     fit = adjust(block.start, block.points, heights=source, hold=heights.HOLD)
-    assert fit.converged
     np.testing.assert_allclose(fit.sigma0, 1.0, atol=0.2)
+    # The bias moves neighbours by as much as its sigma allows, and their relative sigmas contain it.
+    claimed = heights.claims(fit)
+    for pair in neighbours(block):
+        distance = apart(block, fit, *pair)
+        assert distance @ np.linalg.solve(claimed[pair], distance) < 25.0

@@ -27,6 +27,8 @@ EXACT, NEAR = 1e-8, 1e-4
 _STEPS = 50
 #: Near a minimum steps shrink to this part of the one before at least: they might creep there from far away.
 _SHRUNK = 0.1
+#: So many steps without a descent are rounding. It is large in points that nearly parallel rays do not determine.
+_RESTS = 5
 #: Part of the points that a step may lead out of the models, and still be one to believe of the others.
 _FEW = 0.5
 
@@ -232,7 +234,7 @@ def _inside(problem: BlockProblem, start: State, selection: Selection, tolerance
 def _descended(linear: Linear, tolerance: float) -> Solved:
     """Return the minimum by Gauss-Newton, damped where that does not descend, or where a step leads points `astray`."""
     ordering, square = linear.ordering, linear.misfits.square
-    damping, steps = 0.0, Steps()
+    damping, steps, squares = 0.0, Steps(), list[float]()
     for iteration in range(1, _STEPS + 1):
         step = step_of(linear, damping)
         if not step.finite or (iteration == 1 and step.condition > CONDITION_LIMIT):
@@ -244,6 +246,8 @@ def _descended(linear: Linear, tolerance: float) -> Solved:
         # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
         small = promised <= EXACT * length or (promised <= 1e-6 * length and promised > before / 4)
         small |= promised <= tolerance * length and promised <= _SHRUNK * before
+        small |= promised <= 1e-4 * length and square >= (1 - 1e-8) * min(squares[:-_RESTS], default=math.inf)
+        squares.append(square)
         if small and not damping:
             return Solved(linear, step, iteration)
         whole = step.whole

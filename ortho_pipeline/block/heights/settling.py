@@ -21,6 +21,8 @@ from ortho_pipeline.block.heights.source import DEFAULT_SIGMA, DemHeights
 from ortho_pipeline.block.heights.spots import NORMAL, SpotDifferences
 from ortho_pipeline.block.heights.terrain import LocalTerrain
 from ortho_pipeline.block.points import Index
+from ortho_pipeline.errors import NotConverged
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
@@ -162,6 +164,11 @@ class Heights:
         """Return the solution with stable heights, from one near it, and these heights.
 
         After fewer `rounds` than they need, it is near that.
+
+        Raises
+        ------
+        NotConverged
+            If there is no solution with the heights of a round, and `rounds` are not limited.
         """
         heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
@@ -178,6 +185,14 @@ class Heights:
                 return solved, replace(judged, wrong=heights.wrong, broken=heights.broken)
             again = attempt(problem, state, selection, tolerance)
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
+                if rounds == _ROUNDS:
+                    # The solution before does not contain what the heights share: its sigmas would be too small.
+                    raise NotConverged(
+                        "the adjustment did not converge with the heights of the DEM",
+                        remedy=Text(
+                            "give control points, or a more accurate DEM, or ", Setting("points.dem_heights", "off")
+                        ),
+                    )
                 break
             solved, heights = again, judged
         return solved, heights
