@@ -20,7 +20,14 @@ from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, progress
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import (
+    BlockOptions,
+    MatchOptions,
+    MosaicOptions,
+    OutputOptions,
+    SceneOptions,
+    SurfaceOptions,
+)
 
 _models = click.option(
     "--models",
@@ -55,6 +62,7 @@ class _Programs(click.Option):
 @matching_options
 @surface_options
 @click.option("--orthos", is_flag=True, help="Also make the orthos of all images on one grid, for 'ortho mosaic'.")
+@click.option("--mosaic", is_flag=True, help="Also make these orthos and one raster of them, mosaic.tif.")
 @click.option("--export", cls=_Programs, multiple=True, metavar="PROGRAM[,PROGRAM...]", help=_PROGRAMS)
 @block_output_options
 @sensor_options
@@ -68,6 +76,7 @@ def adjust(
     match: MatchOptions,
     surface: SurfaceOptions,
     orthos: bool,
+    mosaic: bool,
     export: tuple[str, ...],
     output: OutputOptions,
     scene: SceneOptions | list[SceneOptions],
@@ -78,11 +87,13 @@ def adjust(
     The images may be a stereo pair, a block, or one folder of photos. The command writes a model and an RPC of each
     image, the ground points with their sigmas, and one report. Points with ground coordinates are control or check
     points; the others tie the images together. --ties auto and --reference find points by matching; both need heights.
-    --orthos also makes the orthos of all images. --export writes what stereo programs need to compute a surface.
+    --orthos also makes the orthos of all images, and --mosaic one raster of them. --export writes what stereo programs
+    need to compute a surface.
     """
     from ortho_pipeline.commands import block as blocks
     from ortho_pipeline.stores.delivery import address_of
 
+    orthos |= mosaic
     if not orthos and output != OutputOptions():
         raise InputError(
             "this option is for orthos, and none are made",
@@ -108,6 +119,7 @@ def adjust(
             match=match,
             surface=surface,
             orthos=asked,
+            mosaic=MosaicOptions(format="COG") if mosaic else None,
             export=programs,
             command=command,
             progress=shown,

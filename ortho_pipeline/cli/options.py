@@ -317,6 +317,7 @@ block_output_options = _grouped(
     "resampling",
     "bands",
     "nodata",
+    "visibility",
     "format",
     "creation_options",
     "memory",

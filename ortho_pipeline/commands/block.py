@@ -23,7 +23,14 @@ from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands import inputs
 from ortho_pipeline.commands.block_images import labels_of, scenes_of, start_of
 from ortho_pipeline.commands.block_results.ground_points import csv_of, geojson_of, ground_rows, writer_of
-from ortho_pipeline.commands.block_results.orthos import adjusted_scenes, corrected, make_orthos, ortho_files
+from ortho_pipeline.commands.block_results.orthos import (
+    adjusted_scenes,
+    corrected,
+    make_orthos,
+    mosaic_of_orthos,
+    ortho_files,
+    with_mosaic,
+)
 from ortho_pipeline.commands.block_results.other_programs import AdjustedBlock, block_formats, files_for
 from ortho_pipeline.commands.control.block_points import (
     gather,
@@ -49,7 +56,15 @@ from ortho_pipeline.files import together, write_json, write_text
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
-from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import (
+    BlockOptions,
+    MatchOptions,
+    MosaicOptions,
+    OutputOptions,
+    PointOptions,
+    SceneOptions,
+    SurfaceOptions,
+)
 from ortho_pipeline.raster.quicklook import preview_png
 from ortho_pipeline.report import block as block_report
 from ortho_pipeline.report.block_records import BlockReport
@@ -74,6 +89,7 @@ def adjust(
     match: MatchOptions = MatchOptions(),
     surface: SurfaceOptions = SurfaceOptions(),
     orthos: OutputOptions | None = None,
+    mosaic: MosaicOptions | None = None,
     export: Sequence[str] = (),
     command: str | None = None,
     progress: Progress | None = None,
@@ -96,6 +112,8 @@ def adjust(
         Heights, for matching, as observations of the ties, and for orthos.
     orthos : OutputOptions, optional
         Make the orthos of all images, on one grid.
+    mosaic : MosaicOptions, optional
+        Combine these orthos into ``mosaic.tif``.
     export : sequence of str
         Names of programs that compute heights from the block: cars, asp, s2p, and formats of plugins.
 
@@ -103,8 +121,8 @@ def adjust(
     -------
     Result
         `files` has report, html, points, points-csv, and ``<image> model`` and ``<image> rpc`` (where an RPC stands for
-        the model) of each image; with orthos also ``<image> ortho`` and so on, as those of `rectify`; with exports the
-        configuration of each program by its name, and ``<image> geom`` and so on.
+        the model) of each image; with orthos also ``<image> ortho`` and so on, as those of `rectify`; with a mosaic
+        those of `mosaic`; with exports the configuration of each program by its name, and ``<image> geom`` and so on.
 
     Raises
     ------
@@ -114,10 +132,11 @@ def adjust(
     labels = labels_of(images := images_of(images, scene))
     files = _files(labels, Path(folder))
     of_orthos = {} if orthos is None else ortho_files(Path(folder), labels, orthos)
+    of_mosaic = mosaic_of_orthos(Path(folder), mosaic, orthos)
     scenes = scenes_of(images, scene, models)
     refuse_contradictions(points, match, surface, orthos=orthos is not None)
     programs = block_formats(export)
-    written = of_orthos | ({"export": files_for(programs, Path(folder), labels)} if programs else {})
+    written = of_orthos | of_mosaic | ({"export": files_for(programs, Path(folder), labels)} if programs else {})
     _check_paths(files, images, points, scenes, *models, match=match, surface=surface, further=written)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
@@ -149,18 +168,17 @@ def adjust(
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
         _write(files, report, fit, starts, exported, record)
-        block = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0])
-        told = block.export(programs, Path(folder), files)
+        told = AdjustedBlock(fit, starts, plain, gathered.heights, scenes[0]).export(programs, Path(folder), files)
         failure = attempted(lambda: _write_report(files, report, pictures), files, "report", "html")
         if orthos is not None:
-            under = [start.scene for start in starts.values()]
-            ground = corrected(gathered.heights or open_surface(surface, scenes[0], under=under), fit)
+            ground = gathered.heights or open_surface(surface, scenes[0], under=[one.scene for one in starts.values()])
             adjusted, options = adjusted_scenes(starts, fit, plain, files), (scenes[0], surface, orthos)
-            failed = make_orthos(adjusted, of_orthos, ground, options, command, progress)
+            failed = make_orthos(adjusted, of_orthos, corrected(ground, fit), options, command, progress)
             failure = failure or next(iter(failed.values()), None)
             files |= {f"{label} {kind}": path for label, own in of_orthos.items() for kind, path in own.items()}
     text = Text.joined("\n", [block_report.summary_text(report), *gathered.text, *told])
-    return Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
+    result = Result(files, {"report": report.to_json(), **gathered.document}, text, failure)
+    return result if mosaic is None else with_mosaic(result, of_orthos, of_mosaic["mosaic"]["mosaic"], mosaic)
 
 
 @with_items

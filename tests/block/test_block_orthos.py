@@ -49,7 +49,7 @@ def test_the_cartosat_pair_on_one_grid(sample: Path, tmp_path: Path) -> None:
     """Orthos fit each other with heights; names, reports and the mosaic are as after `ortho rectify`."""
     folder, out = sample / "cartosat", tmp_path / "block"
     images = [folder / "BANDA.tif", folder / "BANDF.tif"]
-    document = adjusted(images, out, "--dem", folder / "dem.tif", "--dem-sigma", "2")
+    document = adjusted(images, out, "--dem", folder / "dem.tif", "--dem-sigma", "2", "--mosaic")
     orthos = [out / "BANDA_ortho.tif", out / "BANDF_ortho.tif"]
     assert document["files"]["BANDA ortho"] == str(orthos[0])
     places = [gdal.Open(str(path)).GetGeoTransform() for path in orthos]
@@ -63,7 +63,9 @@ def test_the_cartosat_pair_on_one_grid(sample: Path, tmp_path: Path) -> None:
     assert report["surface"]["raised_m"] == pytest.approx(-document["report"]["adjustment"]["heights"]["mean_error_m"])
     assert not (out / "BANDA.vrt").exists()
     run("mosaic", *orthos, "-o", tmp_path / "mosaic.tif")
-    assert (tmp_path / "mosaic.tif").is_file()
+    one, other = (gdal.Open(str(path / "mosaic.tif")).ReadAsArray() for path in (tmp_path, out))
+    np.testing.assert_array_equal(one, other)
+    assert document["mosaic"]["seams"]
 
 
 def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ _ENOUGH, _REDUNDANT = 50, 0.2
 _SIGNIFICANT = 2.5
 #: Standard deviation (m) before the adjustment of a bias that spot heights fix.
 _FREE = 100.0
+_REMEDY = Text("give control points or a better DEM, or ", Setting("points.dem_heights", "off"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +164,7 @@ class Heights:
     def settled(self, solved: Solved, selection: Selection, rounds: int = _ROUNDS) -> tuple[Solved, Heights]:
         """Return the solution with stable heights, from one near it, and these heights.
 
-        After fewer `rounds` than they need, it is near that.
-
-        Raises
-        ------
-        NotConverged
-            If there is no solution with the heights of a round, and `rounds` are not limited.
+        After fewer `rounds` than they need, it is near that. With all rounds, no solution is `NotConverged`.
         """
         heights, tolerance = self, EXACT if rounds == _ROUNDS else NEAR
         for number in range(rounds):
@@ -187,12 +183,7 @@ class Heights:
             if not again.converged or again.undetermined or again.condition > CONDITION_LIMIT:
                 if rounds == _ROUNDS:
                     # The solution before does not contain what the heights share: its sigmas would be too small.
-                    raise NotConverged(
-                        "the adjustment did not converge with the heights of the DEM",
-                        remedy=Text(
-                            "give control points, or a more accurate DEM, or ", Setting("points.dem_heights", "off")
-                        ),
-                    )
+                    raise NotConverged("the adjustment did not converge with the heights of the DEM", remedy=_REMEDY)
                 break
             solved, heights = again, judged
         return solved, heights

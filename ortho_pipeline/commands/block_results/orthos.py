@@ -11,17 +11,20 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands.control.points import no_points
+from ortho_pipeline.commands.mosaic.assembly import mosaic as mosaic_of
+from ortho_pipeline.commands.mosaic.assembly import mosaic_files
 from ortho_pipeline.commands.rectification import OrthoJob, make_ortho
 from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
-from ortho_pipeline.commands.results import outputs
-from ortho_pipeline.errors import ReportError
+from ortho_pipeline.commands.results import Result, outputs
+from ortho_pipeline.errors import InputError, ReportError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
-from ortho_pipeline.options import OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MosaicOptions, OutputOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored, limit_cache
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.runtime.process_limits import Progress
@@ -128,3 +131,28 @@ def make_orthos(
         if isinstance(made, ReportError):
             failed[label] = made
     return failed
+
+
+def mosaic_of_orthos(
+    folder: Path, mosaic: MosaicOptions | None, orthos: OutputOptions | None
+) -> dict[str, dict[str, Path]]:
+    """Return the outputs of the mosaic of a block, under ``mosaic``; nothing without one.
+
+    Raises
+    ------
+    InputError
+        If there are no orthos.
+    """
+    if mosaic is None:
+        return {}
+    if orthos is None:
+        raise InputError("a mosaic needs orthos", field="mosaic", remedy=Text("add ", Setting("orthos")))
+    return {"mosaic": mosaic_files(folder / "mosaic.tif")}
+
+
+def with_mosaic(result: Result, orthos: Mapping[str, Mapping[str, Path]], path: Path, options: MosaicOptions) -> Result:
+    """Return the result of a block with a mosaic of its orthos."""
+    made = mosaic_of([files["ortho"] for files in orthos.values()], path, options)
+    text = Text.joined("\n", [result.summary, made.summary])
+    files, document = {**result.files, **made.files}, {**result.document, **made.document}
+    return Result(files, document, text, result.failure or made.failure)

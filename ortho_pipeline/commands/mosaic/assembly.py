@@ -65,7 +65,7 @@ def mosaic(
     options, path = options or MosaicOptions(format="COG"), Path(path)
     if options.format == "VRT":
         _refuse_far(paths)
-    files = {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
+    files = mosaic_files(path)
     _check_paths(paths, files)
     layers = [_ortho(ortho, name) for ortho, name in zip(paths, _names(paths), strict=True)]
     ledger = Ledger(begun=states([*paths, *(ortho.accuracy for ortho in layers if ortho.accuracy)]))
@@ -74,6 +74,11 @@ def mosaic(
         write_json(files["seams"], document)
         ledger.require_unchanged()
     return Result(files, {"mosaic": document}, summary_text(document), failure)
+
+
+def mosaic_files(path: Path) -> dict[str, Path]:
+    """Return the outputs by kind."""
+    return {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
 
 
 def _refuse_far(orthos: Sequence[Path]) -> None:
