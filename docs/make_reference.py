@@ -58,11 +58,11 @@ def page(name: str) -> str:
 
 
 def plugin_names() -> str:
-    """Return the page that lists the names for authors of plugins, by module, with the first lines of their docstrings."""
+    """Return the page that lists the names for authors of plugins, by module, with the first lines of docstrings."""
     parts = [
         "# Names for plugins",
-        "`from ortho_pipeline.plugin import NAME`. [Plugin reference](../plugin-reference.md) explains hooks and fields. "
-        "`help(ortho_pipeline.plugin.NAME)` prints a whole docstring.",
+        "`from ortho_pipeline.plugin import NAME`. [Plugin reference](../plugin-reference.md) explains hooks and "
+        "fields. `help(ortho_pipeline.plugin.NAME)` prints a whole docstring.",
     ]
     for module in sorted(plugin._NAMES):
         about = _prose(inspect.getdoc(_module(module)).splitlines()[0])
@@ -72,7 +72,7 @@ def plugin_names() -> str:
 
 
 def plugin_text(name: str) -> str:
-    """Return the docstring of a name of `ortho_pipeline.plugin`, or the comment above it if it is a value; "" if none."""
+    """Return the docstring of a name of `ortho_pipeline.plugin`, or the comment above a value; "" if none."""
     value, home = getattr(plugin, name), _module(plugin._HOMES[name])
     if (inspect.isclass(value) or inspect.isfunction(value)) and inspect.getdoc(value):
         return inspect.getdoc(value)

@@ -145,6 +145,7 @@ def adjust(
         provenance=record,
         warnings=[*_warnings(fit, starts), *notes, *complaints],
         join_limit=points.join_limit,
+        dem_unused=surface.dem is not None and points.dem_heights == "off",
     )
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):
