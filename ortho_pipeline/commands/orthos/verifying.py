@@ -275,12 +275,6 @@ def _band_causes(bands: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         return []
     text = f"bands {one['band']} and {other['band']} are displaced by {most:.2f} px"
     return [{"code": "bands", "text": text, "share": None}]
-        {
-            "code": "bands",
-            "text": f"bands {one['band']} and {other['band']} are displaced by {most:.2f} px",
-            "share": None,
-        }
-    ]
 
 
 def _of_points(points: PointErrors, pixel: float) -> dict[str, Any]:
