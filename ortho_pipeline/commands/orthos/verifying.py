@@ -84,6 +84,14 @@ def verify(
     ------
     InputError
         If the image is not an ortho, there is neither reference nor point, or matching fails.
+
+    Examples
+    --------
+    >>> displaced = op.rectify("sample_data/scene.tif", out, surface=op.SurfaceOptions(dem="sample_data/dem.tif"))
+    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"])
+    >>> found = op.verify(displaced.files["ortho"], match=match).document
+    >>> round(found["relative"]["bias_m"]["value"]), found["causes"][0]["code"]
+    (17, 'shift')
     """
     if not match.reference and points.gcps is None:
         raise InputError(
