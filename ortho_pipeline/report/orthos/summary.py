@@ -69,7 +69,9 @@ def errors_of(document: Mapping[str, Any]) -> list[RoleErrors]:
 def explained(cause: Mapping[str, Any]) -> str:
     """Return which part of the displacement a cause explains: `` (explains 95 %)``; nothing of bands."""
     share = cause.get("share")
-    return "" if share is None else f" (explains {share:.0%})".replace("%", " %")
+    if share is None:
+        return ""
+    return f" (explains {'less than 1' if share < 0.01 else f'{100 * share:.0f}'} %)"
 
 
 def summary_text(document: Mapping[str, Any]) -> str:
