@@ -7,14 +7,17 @@ neither its hooks nor its plugins.
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import inspect
 import re
 import typing
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import ortho_pipeline as op
+from ortho_pipeline import plugin
 
 FOLDER = Path(__file__).resolve().parent / "reference"
 _SECTION = re.compile(r"^(Parameters|Attributes|Returns|Raises|Examples|Notes)\n-{3,}\n", re.MULTILINE)
@@ -26,7 +29,7 @@ _MODULE = re.compile(r"\b(?:[a-z_]\w*\.)+(?=[A-Za-z_])")
 def main(folder: Path = FOLDER) -> None:
     """Write all pages, and remove those of names that are no more."""
     folder.mkdir(exist_ok=True)
-    pages = {f"{name}.md": page(name) for name in op.__all__}
+    pages = {f"{name}.md": page(name) for name in op.__all__} | {"plugin-names.md": plugin_names()}
     for old in folder.glob("*.md"):
         if old.name not in pages:
             old.unlink()
@@ -52,6 +55,33 @@ def page(name: str) -> str:
         else:
             parts += [f"## {member}()", _signature(member, found), *_described(found)]
     return "\n\n".join(parts) + "\n"
+
+
+def plugin_names() -> str:
+    """Return the page that lists the names for authors of plugins, by module, with the first lines of docstrings."""
+    parts = [
+        "# Names for plugins",
+        "`from ortho_pipeline.plugin import NAME`. [Plugin reference](../plugin-reference.md) explains hooks and "
+        "fields. `help(ortho_pipeline.plugin.NAME)` prints a whole docstring.",
+    ]
+    for module in sorted(plugin._NAMES):
+        about = _prose(inspect.getdoc(_module(module)).splitlines()[0])
+        rows = [f"| `{name}` | {_prose(plugin_text(name).splitlines()[0])} |" for name in plugin._NAMES[module]]
+        parts += [f"## {module}", about, "\n".join(["| name | what it is |", "|---|---|", *rows])]
+    return "\n\n".join(parts) + "\n"
+
+
+def plugin_text(name: str) -> str:
+    """Return the docstring of a name of `ortho_pipeline.plugin`, or the comment above a value; "" if none."""
+    value, home = getattr(plugin, name), _module(plugin._HOMES[name])
+    if (inspect.isclass(value) or inspect.isfunction(value)) and inspect.getdoc(value):
+        return inspect.getdoc(value)
+    stated = re.search(rf"^((?:#: .*\n)+)(?:\w+, )*{name}\b.*? = ", inspect.getsource(home), re.MULTILINE)
+    return stated[1].replace("#: ", "") if stated else ""
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"ortho_pipeline.{name}")
 
 
 def _members(thing: type) -> Iterator[tuple[str, Any]]:

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from ortho_pipeline.commands import rectify as rectify
     from ortho_pipeline.commands.arrays.lazy import ortho_array as ortho_array
     from ortho_pipeline.commands.control.matching import match_scene as match_scene
+    from ortho_pipeline.commands.mosaic.assembly import mosaic as mosaic
+    from ortho_pipeline.commands.orthos.aligning import align as align
+    from ortho_pipeline.commands.orthos.verifying import verify as verify
+    from ortho_pipeline.commands.sharpening.sharpen import sharpen as sharpen
     from ortho_pipeline.display.notices import Notice as Notice
     from ortho_pipeline.errors import OrthoError as OrthoError
     from ortho_pipeline.estimation.choice.comparison import compare as compare
@@ -59,6 +63,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.report.notebook.tables import html as html
     from ortho_pipeline.surface.base import Surface as Surface
     from ortho_pipeline.surface.dem import open_dem as open_dem
+    from ortho_pipeline.surface.rays import meet_surface as meet_surface
 
 __version__: str
 
@@ -87,6 +92,7 @@ _HOMES = {
     "SurfaceOptions": "options",
     "Vertical": "geodesy.crs",
     "adjust": "block.adjustment",
+    "align": "commands.orthos.aligning",
     "compare": "estimation.choice.comparison",
     "export_rpc": "exchange.rpc",
     "fit": "estimation.fit",
@@ -96,6 +102,8 @@ _HOMES = {
     "intersect": "block.intersection",
     "load_model": "exchange.model_file",
     "match_scene": "commands.control.matching",
+    "meet_surface": "surface.rays",
+    "mosaic": "commands.mosaic.assembly",
     "open_dem": "surface.dem",
     "open_scene": "host",
     "ortho_array": "commands.arrays.lazy",
@@ -106,8 +114,10 @@ _HOMES = {
     "read_spot_heights": "points.heights.spot_heights",
     "rectify": "commands",
     "save_model": "exchange.model_file",
+    "sharpen": "commands.sharpening.sharpen",
     "stack": "batch.stack.command",
     "to_geodataframe": "exchange.geodataframe",
+    "verify": "commands.orthos.verifying",
     "write_points": "points",
     "write_rpc_txt": "exchange.rpc",
 }

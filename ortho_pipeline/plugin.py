@@ -2,7 +2,7 @@
 
 It has the hooks and their types, errors and messages, files, the ellipsoid, sensor models, points, fits, and parts of
 commands. docs/plugins.md shows how to write a plugin; `ortho_pipeline.hookspecs` documents the hooks.
-docs/plugin-reference.md lists the names by purpose, and states how long they stay stable.
+docs/plugin-reference.md explains fields, and states how long names stay stable; `make docs` lists the names.
 
 Each name is loaded on first use: ``from ortho_pipeline.plugin import Subcommand, hookimpl`` loads neither NumPy nor
 GDAL.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib
-import inspect
 import json
 import os
 import re
@@ -15,6 +13,7 @@ import sys
 import sysconfig
 from pathlib import Path
 
+import make_reference
 import numpy as np
 import pytest
 from ortho_studies import hookspecs as of_studies
@@ -198,20 +197,10 @@ def test_everything_that_an_author_can_use_is_in_the_reference():
         assert f"`{name}`" in REFERENCE, f"{name} is not explained in docs/plugin-reference.md"
 
 
-def described(name: str) -> str | None:
-    """Return the docstring of a name of `plugin`, or the comment above it where it is a value."""
-    value, home = getattr(plugin, name), importlib.import_module(f"ortho_pipeline.{plugin._HOMES[name]}")
-    if (inspect.isclass(value) or inspect.isfunction(value)) and inspect.getdoc(value):
-        return inspect.getdoc(value)
-    stated = re.search(rf"^((?:#: .*\n)+)(?:\w+, )*{name}\b.*? = ", inspect.getsource(home), re.MULTILINE)
-    return stated and stated[1]
-
-
 def test_every_name_for_plugins_is_documented():
-    rows = re.search(r"\n## What you can import\n(.*?)\n## ", REFERENCE, re.DOTALL)[1].splitlines()
-    listed = [name for row in rows if row[:1] == "|" for name in re.findall(r"`(\w+)`", row.split("|")[1])]
-    assert set(listed) == set(plugin.__all__)
-    assert not [name for name in plugin.__all__ if not described(name)]
+    assert not [name for name in plugin.__all__ if not make_reference.plugin_text(name)]
+    listed = re.findall(r"^\| `(\w+)` \| \S.* \|$", make_reference.plugin_names(), re.MULTILINE)
+    assert sorted(listed) == plugin.__all__
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLE.rglob("*.py")), ids=lambda path: path.name)

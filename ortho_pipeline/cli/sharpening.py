@@ -39,7 +39,7 @@ def weights_option(command: Callable[..., Any]) -> Callable[..., Any]:
     "--ratio",
     type=click.IntRange(2, 100),
     metavar="N",
-    help="Panchromatic pixels along an original multispectral pixel, if MS_ORTHO was resampled to smaller pixels.",
+    help="How many panchromatic pixels wide an original multispectral pixel is, if MS_ORTHO was resampled.",
 )
 @folder_option
 @click_options("output", OutputOptions, "dtype", "nodata", "format", "creation_options", "memory", "threads")

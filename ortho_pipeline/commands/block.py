@@ -150,9 +150,8 @@ def adjust(
         heights=observed(points, surface, gathered.heights),
         accuracies={label: start.accuracy for label, start in starts.items() if start.accuracy is not None},
     )
-    if fit.heights is not None:
-        # The block has the last word on the accuracy of the DEM.
-        notes = [notice for notice in notes if notice.code != "dem-sigma-by-default"]
+    # The block has the last word on the accuracy of the DEM.
+    notes = [notice for notice in notes if fit.heights is None or notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)
@@ -164,6 +163,7 @@ def adjust(
         provenance=record,
         warnings=[*_warnings(fit, starts), *notes, *complaints],
         join_limit=points.join_limit,
+        dem_unused=surface.dem is not None and points.dem_heights == "off",
     )
     pictures = _pictures(starts, scenes[0])
     with together(folder, "block"):

@@ -18,6 +18,7 @@ from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import allowed
 from ortho_pipeline.files.locations import located
 from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import families
 from ortho_pipeline.options import PathLike, SceneOptions
 from ortho_pipeline.raster import source as raster
 
@@ -69,6 +70,21 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
     return _with_model_file(image, options, options.model)
 
 
+def _refuse_family(model: PathLike) -> None:
+    """Refuse the name of a model family (or a misspelt one) in place of a model file."""
+    if Path(model).suffix or os.path.exists(model):
+        return
+    raise InputError(
+        f"there is no model file {os.fspath(model)!r}",
+        field="scene.model",
+        remedy=Text(
+            "give a <stem>_model.json. To fit a model to points, use ",
+            Setting("points.fit_model", "NAME"),
+            f" ({', '.join(family.name for family in families())})",
+        ),
+    )
+
+
 def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model: PathLike) -> Scene:
     """Open an image with the model of a model file, which takes the place of its own."""
     if options.rpc is not None or options.sensor is not None or options.sensor_options:
@@ -86,6 +102,7 @@ def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model
         )
     dataset = raster.open_dataset(image, **options.access)
     host.Host.discover()  # model families of plugins, which the file may name
+    _refuse_family(model)
     saved = read_model_file(located(model, allow_network=options.allow_network))
     size = dataset.RasterXSize, dataset.RasterYSize
     offset = options.crop_offset

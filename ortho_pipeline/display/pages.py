@@ -7,6 +7,7 @@ import functools
 import importlib.util
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,22 @@ def render(template: str, package: str = "ortho_pipeline", **values: Any) -> str
 
 def _coded(text: str) -> Any:
     """Return a text with what stands between backticks as code, options as they are typed; everything is escaped."""
+    return _marked(text, lambda quoted: flag_of(Setting.read(quoted)).strip("`"))
+
+
+def _fields(text: str) -> Any:
+    """Return a text as `_coded` does, options as they are in a pipeline file."""
+    return _marked(text, str)
+
+
+def _marked(text: str, shown: Callable[[str], str]) -> Any:
     from markupsafe import Markup, escape
 
     parts = str(text).split("`")
     if len(parts) % 2 == 0:
         return escape(text)
     return Markup("").join(
-        Markup("<code>{}</code>").format(flag_of(Setting.read(part)).strip("`")) if number % 2 else escape(part)
+        Markup("<code>{}</code>").format(shown(part)) if number % 2 else escape(part)
         for number, part in enumerate(parts)
     )
 
@@ -83,6 +93,7 @@ def _environment(package: str) -> Any:
     )
     environment.filters |= {
         "coded": _coded,
+        "fields": _fields,
         "px": px,
         "m": metres,
         "signed": signed,

@@ -80,10 +80,11 @@ def build_report(
     provenance: Mapping[str, Any],
     warnings: Sequence[Notice],
     join_limit: float = math.inf,
+    dem_unused: bool = False,
 ) -> BlockReport:
     """Collect everything that the report says (docs/engineering/formats.md)."""
     places = placed(fit, starts)
-    network, of_network = found_network(fit, join_limit)
+    network, of_network = found_network(fit, join_limit, dem_unused)
     pixel = max((max(place["ground_pixel_m"] or (0.0,)) for place in places.values()), default=0.0) or None
     suffices = suffices_for(fit, pixel)
     images = {}

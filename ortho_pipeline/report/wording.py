@@ -320,7 +320,8 @@ def _left_out_notes(adjustment: Adjustment) -> list[str]:
     if not adjustment.rejected:
         return []
     lost = counted(len(adjustment.rejected), "control point")
-    return [f"{lost} left out. If you trust several of them, the model does not suit the scene."]
+    several = " If you trust most of them, the model does not suit the scene." if len(adjustment.rejected) > 1 else ""
+    return [f"{lost} left out.{several}"]
 
 
 def _outlying_notes(adjustment: Adjustment) -> list[str]:

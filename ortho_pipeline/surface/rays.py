@@ -54,6 +54,12 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
     -------
     ndarray, shape (N, 3)
         Ground in the model's CRS; NaN where the ray meets no terrain of the surface, or a void first.
+
+    Examples
+    --------
+    >>> dem = op.open_dem("sample_data/dem.tif", "egm96")
+    >>> print(np.round(op.meet_surface(op.open_scene("sample_data/scene.tif").model, [[500.0, 500.0]], dem), 4))
+    [[ 33.3497  37.2502 731.0427]]
     """
     image = np.asarray(image, dtype=float)
     if not isinstance(surface, DemSurface):

@@ -18,5 +18,5 @@ def test_thousands_have_no_exponent(value, text):
 
 def test_sizes_have_two_digits():
     assert [size_m(value) for value in (2.503, 0.4794, 14.14, 0.0312, 1234.0)] == [
-        "2.5 m", "0.48 m", "14 m", "0.031 m", "1200 m",
+        "2.5 m", "0.48 m", "14 m", "0.031 m", "1,200 m",
     ]  # fmt: skip

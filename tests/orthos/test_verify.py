@@ -219,6 +219,10 @@ def test_points_alone_say_how_accurate_an_ortho_is(shifted, tmp_path):
     np.testing.assert_allclose(found["rmse_m"]["value"], np.sqrt((error**2).sum(axis=1).mean()) * scale, rtol=0.01)
     assert "ASPRS 2023 class" in document["asprs"]
     assert "Indicative" not in document["asprs"]
+    assert run("verify", shifted[0], "--gcps", points, *words, "-o", tmp_path / "out").exit_code == 0
+    page = next((tmp_path / "out").glob("*_verify.html")).read_text()
+    assert "At points" in page
+    assert "Relative to the reference" not in page
     few = tmp_path / "few.csv"
     few.write_text("id,col,row,x,y\n" + "\n".join(rows[:3]))
     assert run("verify", shifted[0], "--gcps", few, *words).exit_code == 2

@@ -110,7 +110,7 @@ def _between(fit: BlockFit, first: int, second: int, rows: int, columns: int) ->
     return np.asarray(fit.cofactors.between(*(index.astype(np.int64) for index in both))[0, :rows, :columns])
 
 
-def weak_joins(joins: tuple[Join, ...], limit: float) -> tuple[Notice, ...]:
+def weak_joins(joins: tuple[Join, ...], limit: float, dem_unused: bool = False) -> tuple[Notice, ...]:
     """Return a notice of pairs whose relative position is less accurate than a limit (px)."""
     weak = sorted((join for join in joins if join.sigma > limit), key=lambda join: -join.sigma)
     if not weak:
@@ -124,5 +124,10 @@ def weak_joins(joins: tuple[Join, ...], limit: float) -> tuple[Notice, ...]:
     pairs = counted(len(weak), "pair of images", "pairs of images")
     text = f"the relative position of {pairs} has a sigma above {limit:g} px: {named}{more}"
     worst = weak[0]
-    fields = {"worst": [worst.first, worst.second], "sigma_px": worst.sigma, "limit_px": limit}
+    fields = {
+        "worst": [worst.first, worst.second],
+        "sigma_px": worst.sigma,
+        "limit_px": limit,
+        "dem_unused": dem_unused,
+    }
     return (Notice("weak-join", text, pairs=len(weak), **fields),)

@@ -60,6 +60,18 @@ def mosaic(
     ------
     InputError
         If an ortho is given twice or would be overwritten, and as `warp.mosaic.lay_out`.
+
+    Examples
+    --------
+    >>> boxes = {"west": (530e3, 4121.5e3, 532e3, 4123.5e3), "east": (531e3, 4121.5e3, 533e3, 4123.5e3)}
+    >>> orthos = []
+    >>> for name, box in boxes.items():
+    ...     grid = op.OutputOptions(crs="EPSG:32636", resolution=20.0, extent=box)
+    ...     done = op.rectify("sample_data/scene.tif", out / name, surface=op.SurfaceOptions(height=800.0), output=grid)
+    ...     orthos.append(done.files["ortho"])
+    >>> result = op.mosaic(orthos, out / "mosaic.tif")
+    >>> op.RasterSource(result.files["mosaic"]).width
+    150
     """
     paths = [place(located(ortho, allow_network=allow_network)) for ortho in orthos]
     options, path = options or MosaicOptions(format="COG"), Path(path)

@@ -86,6 +86,14 @@ def align(
     ------
     InputError
         If the image is not an ortho, or matching fails.
+
+    Examples
+    --------
+    >>> displaced = op.rectify("sample_data/scene.tif", out, surface=op.SurfaceOptions(dem="sample_data/dem.tif"))
+    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"])
+    >>> done = op.align(displaced.files["ortho"], out / "aligned", match=match)
+    >>> done.document["correction"]["kind"]
+    'field'
     """
     _refuse_unusable(match, bending)
     hidden = [ClassMask.parse(text) for text in masks]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ortho_pipeline.commands.orthos.datums import datum_of
 from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho
-from ortho_pipeline.commands.orthos.statistics import Accuracy, Verified, slopes_of
+from ortho_pipeline.commands.orthos.statistics import Verified, slopes_of
 from ortho_pipeline.display.numbers import size_m
 from ortho_pipeline.estimation.spatial.displacement_field import FEWEST_POINTS, DisplacementField
 from ortho_pipeline.geodesy.crs import parse_crs
@@ -175,37 +175,59 @@ class Cause:
     ----------
     code : str
         heights, datum, half-pixel, rotation, scale, model, shift, step, bands, smooth.
+    square : float
+        Mean square (m²) of the displacement that it explains.
     """
 
     code: str
     text: str
+    square: float
 
 
 def causes_of(
-    verified: Verified, relative: Accuracy, heights: HeightDependence | None, steps: Sequence[FieldStep]
-) -> list[Cause]:
-    """Return the likely causes of the displacement, the most specific first."""
-    measured = verified.measured
+    verified: Verified, heights: HeightDependence | None, steps: Sequence[FieldStep], rest: Verified
+) -> list[dict[str, Any]]:
+    """Return the likely causes of the displacement as JSON values; that which explains most of it first.
+
+    Parameters
+    ----------
+    rest : Verified
+        What is left without that which heights explain; `verified` itself if they explain nothing.
+    """
+    measured, whole = verified.measured, _square(verified.mean)
     found = []
     if heights is not None and heights.counts(measured.pixel):
-        found.append(_of_heights(heights))
-    found += _of_slopes(verified)
-    found += _of_shift(verified, relative)
-    found += [_of_step(step, measured) for step in steps]
+        found.append(_of_heights(heights, max(whole - _square(rest.mean), 0.0)))
+    found += _of_rest(rest, heights, steps)
+    return [
+        {"code": one.code, "text": one.text, "share": min(one.square / whole, 1.0) if whole > 0 else 0.0}
+        for one in sorted(found, key=lambda one: -one.square)
+    ]
+
+
+def _square(shifts: Array) -> float:
+    return float((shifts**2).sum(axis=1).mean())
+
+
+def _of_rest(verified: Verified, heights: HeightDependence | None, steps: Sequence[FieldStep]) -> list[Cause]:
+    """Return the causes of that which heights do not explain."""
+    measured = verified.measured
+    found = [*_of_slopes(verified), *_of_shift(verified), *(_of_step(step, measured) for step in steps)]
     rest = _bending(verified)
-    if rest > max(3.0 * float(verified.field.noise.max()) / 5, 0.2 * measured.pixel) and not any(
-        one.code == "heights" for one in found
+    if rest > max(3.0 * float(verified.field.noise.max()) / 5, 0.2 * measured.pixel) and not (
+        heights is not None and heights.counts(measured.pixel)
     ):
-        text = (
-            f"the displacement bends by {size_m(rest)} (RMS) over the ortho. Wrong heights or a sensor model that was "
-            "not adjusted cause this"
+        text = f"the displacement bends by {size_m(rest)} (RMS) over the ortho. "
+        text += (
+            "Wrong heights or a sensor model that was not adjusted cause this. Give a DEM to test the heights"
+            if heights is None
+            else "A sensor model that was not adjusted causes this"
         )
-        text += ". Give a DEM to test the heights" if heights is None else ""
-        found.append(Cause("smooth", text))
+        found.append(Cause("smooth", text, rest**2))
     return found
 
 
-def _of_heights(heights: HeightDependence) -> Cause:
+def _of_heights(heights: HeightDependence, square: float) -> Cause:
     angle = math.degrees(math.atan(heights.rate))
     text = (
         f"the displacement grows with height, by {heights.rate:.3f} m per metre towards azimuth "
@@ -214,7 +236,7 @@ def _of_heights(heights: HeightDependence) -> Cause:
     )
     if heights.zero is not None:
         text += f". It fits flat ground at {heights.zero:.0f} m above the ellipsoid"
-    return Cause("heights", text)
+    return Cause("heights", text, square)
 
 
 def _of_slopes(verified: Verified) -> list[Cause]:
@@ -223,6 +245,8 @@ def _of_slopes(verified: Verified) -> list[Cause]:
     # In the directions of columns (east, in a north-up map) and rows (south).
     turn = measured.metres / np.linalg.norm(measured.metres, axis=0)
     matrix = slopes @ np.linalg.inv(turn)
+    cells = (verified.cells - verified.cells.mean(axis=0)) * np.linalg.norm(measured.metres, axis=0)
+    square = _square(cells @ slopes.T)
     sigma = float(sigmas.max())
     reach = 0.35 * max(measured.size) * measured.pixel
     rotation = (matrix[0, 1] - matrix[1, 0]) / 2
@@ -236,15 +260,15 @@ def _of_slopes(verified: Verified) -> list[Cause]:
             f"the displacement changes linearly over the ortho, by up to {size_m(2 * reach * np.abs(matrix).max())}. "
             "An old or unadjusted sensor model (RPC) causes this"
         )
-        return [Cause("model", text)]
+        return [Cause("model", text, square)]
     if abs(rotation) > abs(scale):
         text = f"the ortho is rotated by {math.degrees(rotation):+.4f}° (clockwise is positive)"
-        return [Cause("rotation", text)]
-    return [Cause("scale", f"the ortho is {1e6 * scale:+.0f} parts per million too large")]
+        return [Cause("rotation", text, square)]
+    return [Cause("scale", f"the ortho is {1e6 * scale:+.0f} parts per million too large", square)]
 
 
-def _of_shift(verified: Verified, relative: Accuracy) -> list[Cause]:
-    measured = verified.measured
+def _of_shift(verified: Verified) -> list[Cause]:
+    measured, relative = verified.measured, verified.relative()
     bias = np.array([relative.bias_east.value, relative.bias_north.value])
     interval = max(one.high - one.low for one in (relative.bias_east, relative.bias_north))
     length = float(np.hypot(*bias))
@@ -254,7 +278,7 @@ def _of_shift(verified: Verified, relative: Accuracy) -> list[Cause]:
     halves = np.abs(pixels - 0.5 * np.sign(pixels))
     if (halves < max(_EXACTLY, interval / measured.pixel)).all():
         text = "the ortho is displaced by half a pixel along both axes. Pixel centres were used as pixel corners"
-        return [Cause("half-pixel", text)]
+        return [Cause("half-pixel", text, length**2)]
     middle = measured.scene.model.image_to_ground(np.array(measured.size)[None] / 2, 0.0)[0]
     datum = datum_of(parse_crs(measured.scene.model.crs), middle, bias, max(interval, 0.0))
     if datum is not None:
@@ -262,10 +286,10 @@ def _of_shift(verified: Verified, relative: Accuracy) -> list[Cause]:
             f"the shift of {size_m(length)} equals the difference between {datum} and the datum of the ortho. A wrong "
             "datum is the likely cause"
         )
-        return [Cause("datum", text)]
+        return [Cause("datum", text, length**2)]
     azimuth = math.degrees(math.atan2(bias[0], bias[1])) % 360
     shifted = f"the whole ortho is shifted by {size_m(length)} towards azimuth {azimuth:.0f}°"
-    return [Cause("shift", f"{shifted}. If the reference is right, correct it with ortho align")]
+    return [Cause("shift", f"{shifted}. If the reference is right, correct it with ortho align", length**2)]
 
 
 def _of_step(step: FieldStep, measured: MeasuredOrtho) -> Cause:
@@ -274,7 +298,8 @@ def _of_step(step: FieldStep, measured: MeasuredOrtho) -> Cause:
         f"the displacement jumps by {size_m(size)} at {step.axis} {step.at:.0f}. A seam line of a mosaic, a join of "
         "detectors or a jump of the attitude causes this"
     )
-    return Cause("step", text)
+    part = step.at / measured.size[0 if step.axis == "column" else 1]
+    return Cause("step", text, part * (1 - part) * size**2)
 
 
 def _bending(verified: Verified) -> float:

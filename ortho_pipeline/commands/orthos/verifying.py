@@ -84,6 +84,14 @@ def verify(
     ------
     InputError
         If the image is not an ortho, there is neither reference nor point, or matching fails.
+
+    Examples
+    --------
+    >>> displaced = op.rectify("sample_data/scene.tif", out, surface=op.SurfaceOptions(dem="sample_data/dem.tif"))
+    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"])
+    >>> found = op.verify(displaced.files["ortho"], match=match).document
+    >>> round(found["relative"]["bias_m"]["value"]), found["causes"][0]["code"]
+    (17, 'shift')
     """
     if not match.reference and points.gcps is None:
         raise InputError(
@@ -186,7 +194,7 @@ def document_of(
         document |= _of_matches(found, surface, match.reference_sigma)
         notices += [one for one in found.searched.notices if one.code != "search-by-default"]
     else:
-        document |= {"relative": None, "absolute": None, "causes": [], "steps": []}
+        document |= {"relative": None, "absolute": None, "heights": None, "bands": [], "causes": [], "steps": []}
     document["points"] = None if points is None else _of_points(points, pixel)
     document["asprs"] = _asprs(document)
     document["requirements"] = []
@@ -231,10 +239,8 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
         "rows": profile(verified, 1),
         "steps": [one.to_json() for one in steps],
         "bands": bands,
-        "causes": [
-            {"code": one.code, "text": one.text} for one in causes_of(rest, rest.relative(), heights, steps)
-        ] + _band_causes(bands),
-    }  # fmt: skip
+        "causes": causes_of(verified, heights, steps, rest) + _band_causes(bands),
+    }
 
 
 def _bands(measured: MeasuredOrtho) -> list[dict[str, Any]]:
@@ -265,7 +271,7 @@ def _bands(measured: MeasuredOrtho) -> list[dict[str, Any]]:
     ]
 
 
-def _band_causes(bands: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _band_causes(bands: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     apart = [
         (float(np.hypot(one["column_px"] - other["column_px"], one["row_px"] - other["row_px"])), one, other)
         for one in bands
@@ -275,7 +281,8 @@ def _band_causes(bands: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     most, one, other = max(apart, key=lambda found: found[0], default=(0.0, {}, {}))
     if most < 0.3 or most < 4 * np.hypot(one["sigma_px"], other["sigma_px"]):
         return []
-    return [{"code": "bands", "text": f"bands {one['band']} and {other['band']} are displaced by {most:.2f} px"}]
+    text = f"bands {one['band']} and {other['band']} are displaced by {most:.2f} px"
+    return [{"code": "bands", "text": text, "share": None}]
 
 
 def _of_points(points: PointErrors, pixel: float) -> dict[str, Any]:

@@ -78,6 +78,18 @@ def sharpen(
     ------
     InputError
         If an ortho has the wrong bands or no place on a map, or they do not overlap or show different scenes.
+
+    Examples
+    --------
+    >>> flat = op.SurfaceOptions(height=800.0)
+    >>> grids = {"pan": op.OutputOptions(resolution=5.0), "colours": op.OutputOptions(resolution=20.0, bands=(1, 1))}
+    >>> made = {
+    ...     name: op.rectify("sample_data/scene.tif", out / name, surface=flat, output=grid).files["ortho"]
+    ...     for name, grid in grids.items()
+    ... }
+    >>> done = op.sharpen(made["pan"], made["colours"], out / "sharp")
+    >>> sorted(done.files)
+    ['json', 'ortho']
     """
     paths = [place(located(path, allow_network=scene.allow_network)) for path in (pan, colours)]
     stem = Path(pan).stem

@@ -210,11 +210,11 @@ def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
     image = spread_over(view)
     inside = _inside(view, targets, image)
     if inside.sum() < _SAMPLES_SHOWN:
-        what = "does not overlap the scene"
-        remedy = "give images of the same place; if they are, check the model of the scene with `ortho info IMAGE`"
+        what = "does not overlap the image"
+        remedy = "give images of the same place; `ortho info IMAGE` shows where each is"
         if inside.any():
-            what = f"covers {inside.mean():.1%} of the scene, which is too little to match"
-            remedy = "give images that cover more of the scene, or measure points by hand"
+            what = f"covers {inside.mean():.1%} of the image, which is too little to match"
+            remedy = "give references that cover more of it, or measure points by hand"
         raise InputError(f"{targets[0].called} {what}", file=targets[0].path, field=targets[0].field, remedy=remedy)
     return image[inside]
 

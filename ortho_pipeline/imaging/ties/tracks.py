@@ -27,6 +27,8 @@ from ortho_pipeline.raster.caching.block_cache import limit_cache
 _MOST = 10
 #: Largest difference (in sigmas) between the heights of one point from two pairs.
 _SIGMAS = 3.5
+#: Scenes that a message names.
+_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +75,10 @@ def tie(views: Sequence[SceneView], settings: TieSettings) -> Ties:
     overlaps = _overlaps(views, targets)
     if not overlaps:
         raise InputError(
-            "no two scenes overlap",
-            file=views[0].intensity.source.path,
-            field="images",
-            remedy="give scenes that overlap; if they do, check their models with `ortho info IMAGE`",
+            "no two of these images overlap: "
+            + ", ".join(os.path.basename(view.intensity.source.path) for view in views[:_NAMED])
+            + ("" if len(views) <= _NAMED else ", ..."),
+            remedy="give images that overlap; `ortho info IMAGE` shows where each is",
         )
     block = _Block(views, targets, settings)
     for home, view in enumerate(views):

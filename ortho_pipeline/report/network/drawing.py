@@ -89,7 +89,11 @@ def _draw_pairs(drawing: Drawing, report: BlockReport, middles: dict[str, Array]
     for one in sorted(pairs, key=lambda one: -one.points)[:_PAIRS]:
         (x1, y1), (x2, y2) = (middles[name].tolist() for name in (one.first, one.second))
         if math.hypot(x2 - x1, y2 - y1) < _SHORT:
-            continue
+            if not one.weak:
+                continue
+            # A warning names this pair: a line across both middles.
+            middle = (x1 + x2) / 2
+            x1, x2 = middle - _SHORT, middle + _SHORT
         text = f"{one.first} – {one.second}: {counted(one.points, 'point')} in common, rays {one.angle_deg:.1f}° apart"
         if one.sigma_px is not None:
             text += f"\nrelative position: sigma {significant(one.sigma_px)} px"

@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
 
 
-def found_network(fit: BlockFit, join_limit: float) -> tuple[NetworkRecord, tuple[Notice, ...]]:
-    """Return the network of a block, and notices if joins are weaker than a limit (px) or it falls into parts."""
+def found_network(fit: BlockFit, join_limit: float, dem_unused: bool) -> tuple[NetworkRecord, tuple[Notice, ...]]:
+    """Return the network of a block, and notices if joins are weaker than a limit (px) or it falls into parts.
+
+    `dem_unused`: the user gave a DEM whose heights are no observations.
+    """
     joins = joins_of(fit)
     network = network_of(fit, joins, join_limit)
-    weak = weak_joins(joins, join_limit)
+    weak = weak_joins(joins, join_limit, dem_unused)
     if len(network.parts) < 2:
         return network, weak
     said = " and ".join(", ".join(part[:4]) + (" ..." if len(part) > 4 else "") for part in network.parts[:3])

@@ -17,7 +17,7 @@ from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files import write_text
 from ortho_pipeline.raster.quicklook import preview_png
-from ortho_pipeline.report.orthos.summary import about, best_part, errors_of, headline, interval_text
+from ortho_pipeline.report.orthos.summary import about, best_part, errors_of, explained, headline, interval_text
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.summary import error_table, processed
 
@@ -57,6 +57,7 @@ def write_page(
         signals=signals(document["warnings"], document["notices"]),
         levels=WORDS,
         interval=interval_text,
+        explained=explained,
     )
     write_text(path, page)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.display.numbers import area_km2, metres, significant, size_m
+from ortho_pipeline.display.numbers import area_km2, metres, significant
 from ortho_pipeline.report.summary import RoleErrors, acquired, error_lines, place_text, processed
 
 #: Whose accuracy comes first, and what it is compared with.
@@ -46,7 +46,7 @@ def headline(document: Mapping[str, Any]) -> str:
     part = best_part(document)
     if part is None:
         return "Accuracy unknown: there are no matches and no points."
-    value = size_m(document[part]["ce90_m"]["value"])
+    value = metres(document[part]["ce90_m"]["value"])
     if part == "points":
         return f"90 % of errors at the points are below {value}."
     where = "its true position" if part == "absolute" else "the reference"
@@ -64,6 +64,14 @@ def errors_of(document: Mapping[str, Any]) -> list[RoleErrors]:
         RoleErrors.of(role, title, np.array([[one["east_m"], one["north_m"]] for one in places]))
         for role, title, places in kinds
     ]
+
+
+def explained(cause: Mapping[str, Any]) -> str:
+    """Return which part of the displacement a cause explains: `` (explains 95 %)``; nothing of bands."""
+    share = cause.get("share")
+    if share is None:
+        return ""
+    return f" (explains {'less than 1' if share < 0.01 else f'{100 * share:.0f}'} %)"
 
 
 def summary_text(document: Mapping[str, Any]) -> str:
@@ -85,7 +93,7 @@ def summary_text(document: Mapping[str, Any]) -> str:
         matches = document["matches"]
         tested = f"they test {matches['tested_share']:.0%} of the ortho"
         rows.append(("matches", f"{matches['kept']} of {matches['tried']} places; {tested}"))
-    rows += [("cause", one["text"]) for one in document["causes"]]
+    rows += [("cause", f"{one['text']}{explained(one)}") for one in document["causes"]]
     for one in document["requirements"]:
         word = "met" if one["met"] else "NOT met"
         rows.append(("required", f"{one['requirement']}: {word} (upper limit {significant(one['upper'], 3)})"))

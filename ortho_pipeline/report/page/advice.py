@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors.texts import Setting, Text
 
 Level = Literal["stop", "look", "know"]
@@ -38,6 +39,7 @@ _STOP: dict[str, str] = {
     "metadata-contradict": "Find out which one is right before you use the ortho. Ask the supplier of the scene.",
 }
 _LOOK: dict[str, str] = {
+    "untested": "Add check points, or an orthoimage of the same place to match with.",
     "datum-unknown": Text(
         "State the height datum with ", Setting("scene.sensor_options", "DATUM", key="vertical"), "."
     ),
@@ -75,7 +77,7 @@ _LOOK: dict[str, str] = {
     "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
     "search-by-default": Text("Change the radius with ", Setting("match.search"), "."),
-    "points-cover-part": "Add ties where images overlap, and control near the corners of the block.",
+    "points-cover-part": "Add points in the empty parts: control, or ties if images overlap there.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
     "few-ties": "Measure some ties between these images.",
     "no-matches": "Give this image control points or a more similar reference.",
@@ -138,19 +140,16 @@ WORDS: dict[Level, str] = {"stop": "Error", "look": "Warning", "know": "Note"}
 
 @dataclass(frozen=True)
 class Signal:
-    """A notice as people read it: its text, how grave it is, and what to do."""
+    """A notice as people read it: how grave it is, its code (docs/notices.md), its text, and what to do."""
 
     level: Level
+    code: str
     text: str
     to_do: str
 
 
 #: Of a result that no point tests.
-UNTESTED = Signal(
-    "look",
-    "No point tests the accuracy of this result.",
-    "Add check points, or an orthoimage of the same place to match with.",
-)
+UNTESTED = Notice("untested", "no point tests the accuracy of this result")
 
 
 def advised(code: str) -> tuple[Level, str]:
@@ -172,7 +171,7 @@ def signals(warnings: Sequence[str], notices: Sequence[Mapping[str, Any]], *, te
     # These notices say it too, and why.
     codes = {one["code"] for one in notices}
     if not tested and not codes & {"no-redundancy"}:
-        found.insert(0, UNTESTED)
+        found.insert(0, Signal(*_signal(UNTESTED.to_json())))
     order = list(WORDS)
     return sorted(found, key=lambda one: order.index(one.level))
 
@@ -181,19 +180,21 @@ def signal_lines(found: Sequence[Signal]) -> list[Text]:
     """Return notices as lines for the terminal; what several of them have to do stands once, below the last."""
     lines: list[Text] = []
     for number, one in enumerate(found):
-        lines.append(Text(f"{WORDS[one.level]}: ", one.text))
+        lines.append(Text(f"{WORDS[one.level]}: ", one.text, f" [{one.code}]"))
         if one.to_do not in [other.to_do for other in found[number + 1 : number + 2]]:
             lines += [] if one.to_do.startswith(_NOTHING) else [Text("  Remedy: ", one.to_do)]
     return lines
 
 
-def _signal(notice: Mapping[str, Any]) -> tuple[Level, str, str]:
+def _signal(notice: Mapping[str, Any]) -> tuple[Level, str, str, str]:
     level, to_do = advised(notice["code"])
     if notice["code"] == "few-check-points" and not notice.get("count", 1):
         to_do = "Reserve some check points: with 30 you can claim an accuracy class."
     if notice["code"] == "checks-apart":
         to_do = _about_checks(notice, to_do)
-    return level, _sentence(notice["text"]), to_do
+    if notice["code"] == "weak-join" and notice.get("dem_unused"):
+        to_do = Text("Repeat without ", Setting("points.dem_heights", "off"), ", or give control points.")
+    return level, notice["code"], _sentence(notice["text"]), to_do
 
 
 def _about_checks(notice: Mapping[str, Any], to_do: str) -> str:

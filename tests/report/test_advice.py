@@ -1,0 +1,46 @@
+"""What notices tell people: their code, and a remedy that is possible."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from click.testing import CliRunner
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.display.drawing import Drawing
+from ortho_pipeline.report.network.drawing import _draw_pairs
+from ortho_pipeline.report.page.advice import signal_lines, signals
+
+
+def test_the_code_follows_the_text():
+    lines = signal_lines(signals([], [{"code": "left-out", "text": "G03 was left out"}], tested=False))
+    assert lines[0] == "Warning: No point tests the accuracy of this result [untested]"
+    assert lines[2] == "Warning: G03 was left out [left-out]"
+
+
+def test_heights_that_are_off_are_the_remedy_of_a_weak_join():
+    weak = {"code": "weak-join", "text": "the relative position is weak"}
+    (given,) = signals([], [{**weak, "dem_unused": True}])
+    assert "Repeat without" in given.to_do
+    (absent,) = signals([], [{**weak, "dem_unused": False}])
+    assert absent.to_do.startswith("Give a DEM")
+
+
+def test_a_weak_pair_is_drawn_although_its_images_lie_on_each_other():
+    pair = SimpleNamespace(first="a", second="b", points=9, angle_deg=30.0, sigma_px=15.0, weak=True)
+    report = SimpleNamespace(network=SimpleNamespace(pairs=[pair]))
+    places = {"a": SimpleNamespace(tolist=lambda: [50.0, 50.0]), "b": SimpleNamespace(tolist=lambda: [52.0, 50.0])}
+    drawing = Drawing(100.0, 100.0, "a map", "map")
+    _draw_pairs(drawing, report, places)
+    assert 'class="weak"' in drawing.svg()
+    pair.weak = False
+    drawing = Drawing(100.0, 100.0, "a map", "map")
+    _draw_pairs(drawing, report, places)
+    assert "<line" not in drawing.svg()
+
+
+def test_a_family_in_place_of_a_model_file_leads_to_the_right_option(tmp_path):
+    words = ["rectify", "sample_data/scene.tif", "--model", "dlt", "--height", "800", "-o", str(tmp_path)]
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == 2
+    assert "--fit-model NAME (affine2d, " in done.output
