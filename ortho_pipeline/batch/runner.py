@@ -81,7 +81,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         _check_versions(job)
         listing = siblings(folders(job))
         # Before the work, so that an object which changes meanwhile is noticed by the next run.
-        far = far_states(job)
+        far = far_states(job.request)
         good = _still_good(record, job, listing, checksums)
         if good is not None:
             # A worker of this run may have made it and died before it reported.
