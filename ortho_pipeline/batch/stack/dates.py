@@ -14,6 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from ortho_pipeline.batch.freshness import state_of
+from ortho_pipeline.batch.paths import Place
 from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
 from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has_surface
@@ -24,6 +26,7 @@ from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import decoded, read_bounded, read_json
+from ortho_pipeline.files.locations import VsiPath, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
@@ -72,20 +75,29 @@ class Dated:
     ----------
     raw : RawScene, optional
         The raw scene of which the ortho was made for matching.
+    made : FileState, optional
+        The state of that ortho.
     """
 
     name: str
-    path: Path
+    path: Place
     time: datetime
     source: str
     scene: Scene
     raw: RawScene | None = None
+    made: FileState | None = None
     conditions: Conditions = field(default_factory=Conditions)
 
     @property
-    def image(self) -> Path:
+    def image(self) -> Place:
         """The file that was given."""
-        return self.path if self.raw is None else Path(self.raw.resolved.scene.path)
+        return self.path if self.raw is None else place(self.raw.resolved.scene.path)
+
+    def state(self, role: str, allow_network: bool) -> FileState:
+        """Return the state of the ortho."""
+        if self.made is not None:
+            return self.made.replaced(role=role)
+        return state_of(role, self.path, allow_network=allow_network)
 
     @property
     def days(self) -> float:
@@ -142,6 +154,18 @@ def dated_orthos(
         conditions = conditions_of(facts, dataset)
         dated.append(Dated(name, path, time, source, scene, conditions=conditions))
     return sorted(dated, key=lambda one: (one.time, one.name))
+
+
+def placed_at(name: str | os.PathLike[str], options: SceneOptions) -> Place:
+    """Return the place of a file that a user names: a path, or one in an archive or behind a URL.
+
+    Raises
+    ------
+    InputError
+        If it is on another machine, and the network is not allowed.
+    """
+    found = located(name, allow_network=options.allow_network)
+    return found if isinstance(found, VsiPath) else Path(found)
 
 
 def _files(given: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, str | None]]:

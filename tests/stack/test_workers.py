@@ -1,0 +1,139 @@
+"""`ortho stack` by several workers: processes, parts of a job array, dask, a bucket; killed at any moment."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from osgeo import gdal
+from rasters import Rasters
+from servers import moto_server
+from test_raw import delivered
+
+from ortho_pipeline.batch.stack.command import match_part, stack
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.stores.objects import Objects
+
+gdal.UseExceptions()
+SETTINGS: dict[str, Any] = {
+    "match": MatchOptions(points=120),
+    "surface": SurfaceOptions(height=50.0),
+    "output": OutputOptions(resampling="cubic", threads=1, format="GTiff"),
+}
+WORDS = ["--match-points", "120", "--height", "50", "--threads", "1"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes]]:
+    """A raw scene and three orthos, and what one process makes of them."""
+    folder = tmp_path_factory.mktemp("workers")
+    delivered(folder / "in")
+    for path in Rasters(side=240, dates=4, error=4.0, interval=50.0).write(folder / "more")[2:]:
+        path.rename(folder / "in" / path.name)
+    stack([folder / "in"], folder / "out", **SETTINGS)
+    return folder, contents(folder / "out")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return all outputs without records of their making, which have dates."""
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and "record" not in path.name]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths if not path.name.endswith(".lock")}
+
+
+def test_two_processes_make_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    stack([made[0] / "in"], tmp_path / "out", executor="processes", workers=2, **SETTINGS)
+    assert contents(tmp_path / "out") == made[1]
+
+
+def test_an_array_of_jobs_makes_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    for number in (2, 3, 1):
+        said = match_part([made[0] / "in"], tmp_path / "out", (number, 3), **SETTINGS)
+        assert said.document["pairs"] == 2
+        assert not (tmp_path / "out" / "stack.json").exists()
+    result = stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
+    assert "6 (6 from an earlier run)" in result.summary
+    assert contents(tmp_path / "out") == made[1]
+    with pytest.raises(InputError, match="no part 4 of 3"):
+        match_part([made[0] / "in"], tmp_path / "out", (4, 3), **SETTINGS)
+
+
+def killed(out: Path, images: Path, seconds: float) -> bool:
+    """Begin a run, and kill it and its processes after some time; return whether it had ended before."""
+    words = ["stack", str(images), "-o", str(out), *WORDS]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    running = subprocess.Popen([sys.executable, "-m", "ortho_pipeline", *words], **quiet)
+    try:
+        running.wait(seconds)
+        return True
+    except subprocess.TimeoutExpired:
+        os.kill(running.pid, signal.SIGKILL)
+        running.wait()
+        return False
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_any_moment_resumes(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    random_ = random.Random(4)
+    for _ in range(3):
+        killed(tmp_path / "out", made[0] / "in", random_.uniform(1.0, 4.0))
+    stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
+    assert contents(tmp_path / "out") == made[1]
+
+
+# -- object storage and servers ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A bucket, for us and for GDAL."""
+    with moto_server("stacks") as (host, port):
+        at = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_S3_ENDPOINT": f"{host}:{port}", "AWS_HTTPS": "NO",
+              "AWS_VIRTUAL_HOSTING": "FALSE", "AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test",
+              "AWS_REGION": "us-east-1"}  # fmt: skip
+        for name, value in at.items():
+            monkeypatch.setenv(name, value)
+        yield "s3://stacks/run"
+
+
+FAR: dict[str, Any] = {**SETTINGS, "scene": SceneOptions(allow_network=True)}
+
+
+def test_a_bucket_gets_complete_files(made: tuple[Path, dict[str, bytes]], bucket: str, tmp_path: Path) -> None:
+    match_part([made[0] / "in"], bucket, (1, 2), **FAR)
+    result = stack([made[0] / "in"], bucket, **FAR)
+    assert "6 (3 from an earlier run)" in result.summary
+    assert result.files["json"] == f"{bucket}/stack.json"
+    store = Objects(bucket, allow_network=True)
+    assert fetched(store, tmp_path / "a") == made[1]
+    for name in (f"{name}_delivery.json" for name in ("stack", f"aligned/{result.dates[0].name}")):
+        for file in json.loads(store.read(name, 1 << 20)[0])["files"]:
+            folder = Objects(f"{bucket}/{name}".rpartition("/")[0], allow_network=True)
+            assert folder.read(file["name"], file["bytes"])[1].sha256 == file["sha256"]
+    cube = pytest.importorskip("xarray") and result.to_xarray(chunks=100)
+    assert cube.isel(band=0, y=120, x=120).compute().shape == (4,)
+    # Nothing is made again, and a damaged ortho is.
+    before = dict.fromkeys(store.names())
+    stack([made[0] / "in"], bucket, **FAR)
+    store.put(f"aligned/{result.dates[1].name}_aligned.tif", b"damaged")
+    again = stack([made[0] / "in"], bucket, **FAR)
+    assert "6 (6 from an earlier run)" in again.summary
+    assert dict.fromkeys(store.names()) == before
+    assert fetched(store, tmp_path / "b") == made[1]
+
+
+def fetched(store: Objects, folder: Path) -> dict[str, bytes]:
+    """Return the outputs in a store, without records."""
+    for name, size in store.names():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        store.fetch(name, folder / name, size)
+    found = contents(folder)
+    return {name: data for name, data in found.items() if not name.endswith("_delivery.json")}
