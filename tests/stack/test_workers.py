@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 from osgeo import gdal
 from rasters import Rasters
-from servers import moto_server
+from servers import moto_server, serving
 from test_raw import delivered
 
 from ortho_pipeline.batch.stack.command import match_part, stack
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.stores.objects import Objects
 
 gdal.UseExceptions()
@@ -137,3 +137,47 @@ def fetched(store: Objects, folder: Path) -> dict[str, bytes]:
         store.fetch(name, folder / name, size)
     found = contents(folder)
     return {name: data for name, data in found.items() if not name.endswith("_delivery.json")}
+
+
+def test_images_by_url_give_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    """A raw scene with its RPC and finished orthos, by a list and one by one."""
+    with serving(made[0] / "in") as server:
+        images = [f"{server.address}/{path.name}" for path in sorted((made[0] / "in").glob("*.tif"))]
+        with pytest.raises(InputError, match="off by default"):
+            stack(images, tmp_path / "out", **SETTINGS)
+        (tmp_path / "list.csv").write_text("\n".join(["file", *images]))
+        stack([tmp_path / "list.csv"], tmp_path / "out", **FAR)
+    found = contents(tmp_path / "out")
+    same = [name for name in made[1] if name.endswith(".tif") or name.startswith("pairs")]
+    assert len(same) == 11
+    assert {name: found[name] for name in same} == {name: made[1][name] for name in same}
+
+
+def test_a_folder_of_a_bucket_is_a_stack(made: tuple[Path, dict[str, bytes]], bucket: str) -> None:
+    images = Objects("s3://stacks/in", allow_network=True)
+    for path in (made[0] / "in").iterdir():
+        images.put(path.name, path)
+    result = stack(["s3://stacks/in/"], bucket, StackOptions(corrections_only=True), **FAR)
+    store = Objects(bucket, allow_network=True)
+    names = {path.name for path in (made[0] / "in").glob("*.tif")}
+    for name, output in result.orthos.items():
+        text = store.read(output.removeprefix(f"{bucket}/"), 1 << 20)[0].decode()
+        assert f"/vsis3/stacks/in/{name}.tif" in text
+        names.remove(f"{name}.tif")
+    assert not names
+    with pytest.raises(InputError, match="cannot refer to an image on this machine"):
+        stack([made[0] / "in"], bucket, StackOptions(corrections_only=True), **FAR)
+
+
+def test_items_in_a_bucket_are_those_of_a_folder(made: tuple[Path, dict[str, bytes]], bucket: str) -> None:
+    output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
+    stack([made[0] / "in"], made[0] / "items", **{**SETTINGS, "output": output})
+    result = stack([made[0] / "in"], bucket, **{**FAR, "output": output})
+    assert result.files["stac"] == f"{bucket}/aligned/catalog.json"
+    aligned = Objects(f"{bucket}/aligned", allow_network=True)
+    names = [path.name for path in (made[0] / "items" / "aligned").glob("*_stac.json")]
+    assert len(names) == 4
+    for name in (*names, "catalog.json"):
+        assert aligned.read(name, 1 << 20)[0] == (made[0] / "items" / "aligned" / name).read_bytes()
+    stack([made[0] / "in"], bucket, **FAR)
+    assert not any("stac" in name or "catalog" in name for name, _ in aligned.names())

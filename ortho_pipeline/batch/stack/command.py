@@ -293,10 +293,12 @@ def _documents(planned: _Planned, dates: Sequence[Dated], record: StackRecord) -
                 files["stac"] = write_items(aligned, within, dates, record)
         with together(planned.folder, "stack"):
             return files | _write_documents(record, Path(planned.folder))
-    _retire_items(aligned.store, items)
+    _retire_items(Objects(planned.folder, allow_network=allowed), items)
     if planned.output.stac:
-        with delivered(aligned.place, _ITEMS, allow_network=allowed, keep=lambda path: path.name in items) as upload:
-            files["stac"] = f"{aligned.place}/{write_items(aligned, upload.folder, dates, record).name}"
+        with delivered(planned.folder, _ITEMS, allow_network=allowed, keep=lambda path: path.name in items) as upload:
+            within = upload.folder / _ALIGNED
+            within.mkdir()
+            files["stac"] = f"{aligned.place}/{write_items(aligned, within, dates, record).name}"
     with delivered(planned.folder, "stack", allow_network=allowed, keep=lambda path: True) as upload:
         written = _write_documents(record, upload.folder)
     return files | {role: f"{planned.folder}/{path.name}" for role, path in written.items()}
@@ -313,7 +315,7 @@ def _retire_items(store: Objects, names: set[str]) -> None:
     """Remove the items of an earlier run from object storage: they would state its sigmas."""
     delivery = f"{_ITEMS}_delivery.json"
     if store.exists(delivery):
-        for name in (delivery, *sorted(names)):
+        for name in (delivery, *(f"{_ALIGNED}/{name}" for name in sorted(names))):
             store.delete(name)
 
 
