@@ -66,6 +66,14 @@ def test_an_array_of_jobs_makes_the_same(made: tuple[Path, dict[str, bytes]], tm
         match_part([made[0] / "in"], tmp_path / "out", (4, 3), **SETTINGS)
 
 
+@pytest.mark.slow
+def test_dask_makes_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+        stack([made[0] / "in"], tmp_path / "out", scheduler=cluster.scheduler_address, **SETTINGS)
+    assert contents(tmp_path / "out") == made[1]
+
+
 def killed(out: Path, images: Path, seconds: float) -> bool:
     """Begin a run, and kill it and its processes after some time; return whether it had ended before."""
     words = ["stack", str(images), "-o", str(out), *WORDS]
