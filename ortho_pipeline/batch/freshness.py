@@ -13,7 +13,7 @@ from typing import Any
 
 from ortho_pipeline.batch.plan import Job
 from ortho_pipeline.batch.records import Digests, FileState, RunRecord, key_of, siblings
-from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.ledger import Ledger, versions
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import clear_up, confined
@@ -38,6 +38,26 @@ def recorded_at(place: Path, *files: Path, rebuild: bool) -> RunRecord | None:
     if record is not None:
         DIGESTS.learn(record.inputs)
     return record
+
+
+def require_versions(expected: Mapping[str, Any]) -> None:
+    """Refuse work for a run with other software.
+
+    Raises
+    ------
+    InputError
+        With what differs.
+    """
+    here = versions()
+    other = [
+        f"{name} {here[name]} instead of {expected.get(name)}" for name in here if here[name] != expected.get(name)
+    ]
+    if other:
+        raise InputError(
+            f"this worker has different software versions: {'; '.join(other)}",
+            field="scheduler",
+            remedy="install the same versions everywhere",
+        )
 
 
 def is_scene(record: RunRecord) -> bool:

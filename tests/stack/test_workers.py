@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from osgeo import gdal
 from rasters import Rasters
 from servers import moto_server, serving
 from test_raw import delivered
 
 from ortho_pipeline.batch.stack.command import match_part, stack
+from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.stores.objects import Objects
@@ -54,6 +56,23 @@ def test_two_processes_make_the_same(made: tuple[Path, dict[str, bytes]], tmp_pa
     assert contents(tmp_path / "out") == made[1]
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--executor", "dask"], "--scheduler: dask needs the address"),
+        (["--executor", "processes", "--scheduler", "tcp://127.0.0.1:1"], "only dask has a scheduler"),
+        (["--shard", "auto"], "the environment describes no job array"),
+        (["--shard", "3/2"], "'3/2' is not K/N"),
+    ],
+)
+def test_workers_that_cannot_be_are_refused(
+    made: tuple[Path, dict[str, bytes]], tmp_path: Path, words: list[str], said: str
+) -> None:
+    result = CliRunner().invoke(cli, ["stack", str(made[0] / "in"), "-o", str(tmp_path / "out"), *WORDS, *words])
+    assert result.exit_code == 2
+    assert said in result.output
+
+
 def test_an_array_of_jobs_makes_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
     for number in (2, 3, 1):
         said = match_part([made[0] / "in"], tmp_path / "out", (number, 3), **SETTINGS)
@@ -74,25 +93,22 @@ def test_dask_makes_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path
     assert contents(tmp_path / "out") == made[1]
 
 
-def killed(out: Path, images: Path, seconds: float) -> bool:
-    """Begin a run, and kill it and its processes after some time; return whether it had ended before."""
-    words = ["stack", str(images), "-o", str(out), *WORDS]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    running = subprocess.Popen([sys.executable, "-m", "ortho_pipeline", *words], **quiet)
+def killed(out: Path, images: Path, seconds: float, *words: str) -> None:
+    """Begin a run, and kill it after some time if it has not ended."""
+    command = [sys.executable, "-m", "ortho_pipeline", "stack", str(images), "-o", str(out), *WORDS, *words]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         running.wait(seconds)
-        return True
     except subprocess.TimeoutExpired:
         os.kill(running.pid, signal.SIGKILL)
         running.wait()
-        return False
 
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_at_any_moment_resumes(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
-    random_ = random.Random(4)
-    for _ in range(3):
-        killed(tmp_path / "out", made[0] / "in", random_.uniform(1.0, 4.0))
+    drawn = random.Random(4)
+    for words in ([], ["--workers", "2"], []):
+        killed(tmp_path / "out", made[0] / "in", drawn.uniform(1.5, 5.0), *words)
     stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
     assert contents(tmp_path / "out") == made[1]
 

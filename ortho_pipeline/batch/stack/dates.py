@@ -95,11 +95,9 @@ class Dated:
         """The file that was given."""
         return self.path if self.raw is None else place(self.raw.resolved.scene.path)
 
-    def state(self, role: str, allow_network: bool) -> FileState:
+    def state(self, allow_network: bool) -> FileState:
         """Return the state of the ortho."""
-        if self.made is not None:
-            return self.made.replaced(role=role)
-        return state_of(role, self.path, allow_network=allow_network)
+        return self.made or state_of("ortho", self.path, allow_network=allow_network)
 
     @property
     def days(self) -> float:

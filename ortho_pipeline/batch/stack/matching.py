@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.batch.executors import Crew
-from ortho_pipeline.batch.records import key_of
+from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.batch.stack.recorded import LARGEST, FileSet, Made, RecordedFolder
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
-from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import read_json, write_json
@@ -74,21 +73,20 @@ class Matcher:
         self, dates: Sequence[Dated], wanted: Sequence[tuple[int, int]], crew: Crew, told: Callable[[float], None]
     ) -> list[DatePair]:
         """Return all pairs, matched now or before; `told` hears the finished share."""
-        software = versions()
-        sets = [self._set(dates[one], dates[other], software) for one, other in wanted]
+        for one, other in wanted:
+            self.folder.learn(_name_of(dates[one], dates[other]))
+        allowed = self.scene.allow_network
+        state = {node: dates[node].state(allowed) for node in {node for pair in wanted for node in pair}}
+        sets = [self._set(dates, state, one, other) for one, other in wanted]
         made = self.folder.make_all(crew, sets, told)
         return [self._pair(one, other, made[of_pair.name]) for (one, other), of_pair in zip(wanted, sets, strict=True)]
 
-    def _set(self, first: Dated, second: Dated, software: dict[str, Any]) -> FileSet:
-        name = f"{first.name}__{second.name}"
-        self.folder.learn(name)
-        inputs = tuple(
-            dated.state(role, self.scene.allow_network)
-            for role, dated in (("later ortho", first), ("earlier ortho", second))
-        )
-        key = key_of(inputs, self._configuration(), software)
+    def _set(self, dates: Sequence[Dated], state: Mapping[int, FileState], one: int, other: int) -> FileSet:
+        first, second = dates[one], dates[other]
+        name = _name_of(first, second)
+        inputs = state[one].replaced(role="later ortho"), state[other].replaced(role="earlier ortho")
         write = functools.partial(self._write, replace(first, raw=None), replace(second, raw=None), _file_of(name))
-        return FileSet(name, key, inputs, {"matches": _file_of(name)}, write, may_fail=True)
+        return FileSet(name, inputs, self._configuration(), {"matches": _file_of(name)}, write, may_fail=True)
 
     def _pair(self, one: int, other: int, made: Made) -> DatePair:
         record = made.record
@@ -141,6 +139,10 @@ def _copied(one: Dated, folder: Path, options: SceneOptions) -> Dated:
     path, (parent, _, name) = folder / f"{one.name}{one.path.suffix}", address.rpartition("/")
     Objects(parent, allow_network=options.allow_network).fetch(name, path, LARGEST)
     return replace(one, path=path, scene=replace(one.scene, path=path))
+
+
+def _name_of(first: Dated, second: Dated) -> str:
+    return f"{first.name}__{second.name}"
 
 
 def _file_of(name: str) -> str:

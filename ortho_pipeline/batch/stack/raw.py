@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from ortho_pipeline.batch.executors import Crew
 from ortho_pipeline.batch.freshness import DIGESTS, far_states
-from ortho_pipeline.batch.records import FileState, key_of
+from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, map_grid_of
 from ortho_pipeline.batch.stack.recorded import FileSet, Made, RecordedFolder
@@ -26,7 +26,7 @@ from ortho_pipeline.commands.heights.opening import has_surface, open_surface
 from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.placement import Placement, open_rasters
 from ortho_pipeline.commands.rectification import warp_placed
-from ortho_pipeline.commands.resolved.ledger import Ledger, versions
+from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
@@ -144,7 +144,6 @@ class Rectifier:
     surface: SurfaceOptions
     scene: SceneOptions
     output: OutputOptions
-    software: dict[str, Any] = field(default_factory=versions)
 
     def orthos(
         self, dates: Sequence[Dated], some: Collection[int], crew: Crew, told: Callable[[float], None]
@@ -204,8 +203,8 @@ class Rectifier:
 
     def _set(self, name: str, raw: RawScene) -> FileSet:
         file, placed = _ortho_of(name), raw.placed
-        key = key_of(raw.inputs, self._configuration(placed), self.software)
-        return FileSet(name, key, raw.inputs, {"ortho": file}, functools.partial(write_in, placed, file))
+        write = functools.partial(write_in, placed, file)
+        return FileSet(name, raw.inputs, self._configuration(placed), {"ortho": file}, write)
 
     def _with_ortho(self, one: Dated, raw: RawScene, made: Made) -> Dated:
         path = self.folder.path(_ortho_of(one.name))

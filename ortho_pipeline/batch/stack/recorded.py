@@ -9,14 +9,15 @@ import contextlib
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ortho_pipeline.batch.executors import Crew, completed
-from ortho_pipeline.batch.freshness import DIGESTS, change_in_store, recorded_at
+from ortho_pipeline.batch.freshness import DIGESTS, change_in_store, recorded_at, require_versions
 from ortho_pipeline.batch.plan import STATE
-from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, locked
+from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, key_of, locked
+from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files.locations import VsiPath, located
 from ortho_pipeline.runtime.process_limits import one_blas_thread
@@ -33,8 +34,10 @@ class FileSet:
 
     Parameters
     ----------
-    key : str
-        From `key_of`: the same while nothing that the files depend on has changed.
+    inputs : tuple of FileState
+        The files that they are made from.
+    configuration : mapping
+        JSON values of all else that they depend on, but for the software.
     files : mapping
         Their names by role.
     write : callable (folder) -> None
@@ -44,14 +47,21 @@ class FileSet:
     """
 
     name: str
-    key: str
     inputs: tuple[FileState, ...]
+    configuration: Mapping[str, Any]
     files: Mapping[str, str]
     write: Callable[[Path], None]
     may_fail: bool = False
+    software: Mapping[str, Any] = field(default_factory=versions)
+
+    @property
+    def key(self) -> str:
+        """The key of their record: the same while nothing that they depend on has changed."""
+        return key_of(self.inputs, self.configuration, self.software)
 
     def made(self, folder: Path) -> RunRecord:
         """Write the files into a folder, and return their record."""
+        require_versions(self.software)
         record = RunRecord(name=self.name, key=self.key, status="failed", inputs=self.inputs)
         try:
             folder.mkdir(parents=True, exist_ok=True)

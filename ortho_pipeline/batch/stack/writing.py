@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.executors import Crew
-from ortho_pipeline.batch.records import FileState, key_of
+from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, geotransform_of
 from ortho_pipeline.batch.stack.raw import corrected_model, write_in, written_with
@@ -17,7 +17,6 @@ from ortho_pipeline.batch.stack.recorded import FileSet, RecordedFolder
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.placement import Placement
-from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import write_moved
@@ -59,7 +58,6 @@ class Writer:
     scene: SceneOptions
     output: OutputOptions
     corrections_only: bool
-    software: dict[str, Any] = field(default_factory=versions)
 
     def write(
         self, dates: Sequence[Dated], solved: AdjustedStack, crew: Crew, told: Callable[[float], None]
@@ -76,7 +74,7 @@ class Writer:
         names = [model] if part.write is None else [image, model]
         write = None if part.write is None else functools.partial(part.write, image)
         return FileSet(
-            one.name, key_of(part.inputs, self._configuration(part), self.software), part.inputs,
+            one.name, part.inputs, self._configuration(part),
             {Path(name).suffix[1:]: name for name in names}, functools.partial(_write, write, part.saved, model),
         )  # fmt: skip
 
@@ -95,7 +93,7 @@ class Writer:
             else functools.partial(_write_resampled, scene, model, self.placed.grid, self.output, access)
         )
         saved = SavedModel(model, scene.sensor, scene.model_source, (scene.width, scene.height), {})
-        inputs = (one.state("ortho", access.allow_network),)
+        inputs = (one.state(access.allow_network),)
         return _Part(inputs, saved, "_aligned.vrt" if self.corrections_only else "_aligned.tif", write)
 
     def _raw(self, raw: RawScene, placement: Placement, model: ImageCorrection) -> _Part:

@@ -67,6 +67,7 @@ def stack(
     groups = grouped_options(grouped, "match", "surface", "scene", "output")
     groups["output"] = replace(groups["output"], resampling=resampling)
     part = part_of_array() if isinstance(shard, str) else shard
+    groups |= {name: grouped[name] for name in ("executor", "workers", "scheduler")}
     with progress() as shown:
         if part is None:
             result: Result = command.stack(orthos, folder, stack, progress=shown, **groups)
