@@ -19,6 +19,7 @@ from rasters import Rasters
 from servers import moto_server, serving
 from test_raw import delivered
 
+from ortho_pipeline.batch import freshness
 from ortho_pipeline.batch.stack.command import match_part, stack
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
@@ -205,3 +206,12 @@ def test_items_in_a_bucket_are_those_of_a_folder(made: tuple[Path, dict[str, byt
         assert aligned.read(name, 1 << 20)[0] == (made[0] / "items" / "aligned" / name).read_bytes()
     stack([made[0] / "in"], bucket, **FAR)
     assert not any("stac" in name or "catalog" in name for name, _ in aligned.names())
+
+
+def test_workers_with_other_software_are_refused(
+    made: tuple[Path, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(freshness, "versions", lambda: {"gdal": "1.0"})
+    with pytest.raises(InputError, match=r"different software versions: gdal 1\.0 instead of"):
+        stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
+    assert not list(tmp_path.rglob("*.record.json"))
