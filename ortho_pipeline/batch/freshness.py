@@ -13,11 +13,12 @@ from typing import Any
 
 from ortho_pipeline.batch.plan import Job
 from ortho_pipeline.batch.records import Digests, FileState, RunRecord, key_of, siblings
-from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.ledger import Ledger, versions
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import clear_up, confined
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import Location
+from ortho_pipeline.files.locations import Location, VsiPath
 from ortho_pipeline.stores.objects import Objects
 
 #: Larger files next to an image are not metadata.
@@ -39,6 +40,26 @@ def recorded_at(place: Path, *files: Path, rebuild: bool) -> RunRecord | None:
     return record
 
 
+def require_versions(expected: Mapping[str, Any]) -> None:
+    """Refuse work for a run with other software.
+
+    Raises
+    ------
+    InputError
+        With what differs.
+    """
+    here = versions()
+    other = [
+        f"{name} {here[name]} instead of {expected.get(name)}" for name in here if here[name] != expected.get(name)
+    ]
+    if other:
+        raise InputError(
+            f"this worker has different software versions: {'; '.join(other)}",
+            field="scheduler",
+            remedy="install the same versions everywhere",
+        )
+
+
 def is_scene(record: RunRecord) -> bool:
     """Return whether a record belongs to a finished scene and has all facts of a summary."""
     return record.status == "done" and bool(record.facts)
@@ -56,7 +77,10 @@ def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> 
         DIGESTS.learn(record.inputs)
     known = {state.path: state.role for state in record.inputs if os.path.isfile(state.path)}
     roles = Ledger.of(job.request).roles
-    read = (*_local_states(job, {**{str(path): role for path, role in roles.items()}, **known}), *far_states(job))
+    read = (
+        *_local_states(job, {**{str(path): role for path, role in roles.items()}, **known}),
+        *far_states(job.request),
+    )
     return read if record.key == key_of(read, job.configuration, job.versions) else None
 
 
@@ -83,7 +107,7 @@ def as_recorded(record: RunRecord, job: Job) -> bool:
             return False
 
 
-def far_states(job: Job) -> tuple[FileState, ...]:
+def far_states(request: Request) -> tuple[FileState, ...]:
     """Return size and tag of the inputs in object storage, or on a server with tags.
 
     Raises
@@ -93,17 +117,50 @@ def far_states(job: Job) -> tuple[FileState, ...]:
     StorageError
         If the store does not answer.
     """
-    states = []
-    for address in sorted({Location(path).url for _, path in job.request.files if Location(path).is_far}):
-        if not Location(address).is_address:
-            continue
-        folder, _, name = address.rpartition("/")
+    addresses = sorted({Location(path).url for _, path in request.files if Location(path).is_far})
+    allowed = request.scene.allow_network
+    return tuple(
+        far_state("far input", address, allow_network=allowed) for address in addresses if Location(address).is_address
+    )
+
+
+def far_state(role: str, address: str, *, allow_network: bool) -> FileState:
+    """Return size and tag of a file in object storage, or on a server with tags; see `far_states`."""
+    folder, _, name = address.rpartition("/")
+    try:
+        size, tag = Objects(folder, allow_network=allow_network).stated(name)
+    except FileNotFoundError as error:
+        raise InputError("file not found", file=address, remedy="check the address") from error
+    return FileState(role=role, path=address, bytes=size, mtime_ns=0, sha256="", tag=tag)
+
+
+def state_of(role: str, path: Path | VsiPath, *, allow_network: bool) -> FileState:
+    """Return the state of an input: checksum, or size and tag; of a file in an archive, the state of the archive."""
+    place = Location(path)
+    if place.is_far:
+        return far_state(role, place.url, allow_network=allow_network)
+    return FileState.of(role, (place.archive or Path(place)).absolute(), DIGESTS)
+
+
+def change_in_store(store: Objects, record: RunRecord, checksums: bool = False) -> str:
+    """Return how outputs in object storage differ from their record; empty if they do not.
+
+    Parameters
+    ----------
+    checksums : bool
+        Compare the content. Otherwise the store tells size and tag.
+    """
+    for state in record.outputs:
         try:
-            size, tag = Objects(folder, allow_network=job.request.scene.allow_network).stated(name)
-        except FileNotFoundError as error:
-            raise InputError("file not found", file=address, remedy="check the address") from error
-        states.append(FileState(role="far input", path=address, bytes=size, mtime_ns=0, sha256="", tag=tag))
-    return tuple(states)
+            if checksums:
+                same = store.read(state.path, state.bytes)[1].sha256 == state.sha256
+            else:
+                same = store.stated(state.path) == (state.bytes, state.tag)
+        except (FileNotFoundError, InputError):
+            return f"{state.path} is missing or has grown"
+        if not same:
+            return f"{state.path} has changed"
+    return ""
 
 
 def folders(job: Job) -> list[str | os.PathLike[str]]:
@@ -149,7 +206,7 @@ def reads_the_same(record: RunRecord, job: Job) -> bool:
     try:
         far = tuple(state for state in record.inputs if state.tag)
         near = record.replaced(inputs=tuple(state for state in record.inputs if not state.tag))
-        if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job)):
+        if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job.request)):
             return False
         with confined(job.output):
             roles = Ledger.of(job.request).roles

@@ -27,6 +27,7 @@ from ortho_pipeline.batch.freshness import (
     inputs_as_recorded,
     is_scene,
     reads_the_same,
+    require_versions,
     untouched,
 )
 from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan
@@ -78,10 +79,10 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
     # What an earlier run wrote, and this one may not write any more.
     before = record.outputs if record is not None else ()
     try:
-        _check_versions(job)
+        require_versions(job.versions)
         listing = siblings(folders(job))
         # Before the work, so that an object which changes meanwhile is noticed by the next run.
-        far = far_states(job)
+        far = far_states(job.request)
         good = _still_good(record, job, listing, checksums)
         if good is not None:
             # A worker of this run may have made it and died before it reported.
@@ -136,21 +137,6 @@ def _rectified(job: Job) -> Result:
         name=job.name,
         digest=DIGESTS,
     )
-
-
-def _check_versions(job: Job) -> None:
-    here = versions()
-    other = [
-        f"{name} {here[name]} instead of {job.versions.get(name)}"
-        for name in here
-        if here[name] != job.versions.get(name)
-    ]
-    if other:
-        raise InputError(
-            f"this worker has different software versions: {'; '.join(other)}",
-            field="scheduler",
-            remedy="install the same versions everywhere",
-        )
 
 
 def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: bool) -> RunRecord | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,11 +13,20 @@ import click
 from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.cli.machine.browser import open_option, page_of, show_page
 from ortho_pipeline.cli.machine.terminal import printable, say
-from ortho_pipeline.cli.options import dry_run_option, json_option, mosaic_options, network_option
+from ortho_pipeline.cli.options import (
+    dry_run_option,
+    executor_option,
+    json_option,
+    mosaic_options,
+    network_option,
+    scheduler_option,
+    shard_option,
+    workers_option,
+)
 from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_files, print_json, print_result, progress
 from ortho_pipeline.errors.texts import counted
-from ortho_pipeline.options import EXECUTORS, MosaicOptions, SceneOptions
+from ortho_pipeline.options import MosaicOptions, SceneOptions
 
 if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
@@ -29,29 +37,10 @@ FAILED = 1
 _SHOWN = 60
 
 
-class _Shard(click.ParamType):
-    name = "K/N|auto"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int] | str:
-        """Return (k, n) of 'k/n', or 'auto'."""
-        if isinstance(value, tuple) or value == "auto":
-            return value
-        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
-        if not match or not 1 <= int(match[1]) <= int(match[2]):
-            self.fail(f"{value!r} is not K/N, such as 1/4", param, ctx)
-        return int(match[1]), int(match[2])
-
-
 @click.command(cls=Command)
 @click.argument("pipeline_file", metavar="PIPELINE.yaml", type=click.Path(), required=False)
-@click.option(
-    "--executor",
-    type=click.Choice(EXECUTORS),
-    help="How scenes are distributed.  [default: processes; dask with --scheduler]",
-)
-@click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: all processors]"
-)
+@executor_option("How scenes are distributed.  [default: processes; dask with --scheduler]")
+@workers_option
 @click.option(
     "--threads",
     type=click.IntRange(min=1),
@@ -61,14 +50,9 @@ class _Shard(click.ParamType):
 @click.option(
     "--memory", "-wm", type=Megabytes(), default="512", show_default=True, metavar="MB", help="Memory per scene."
 )
-@click.option("--scheduler", metavar="URL", help="Address of the dask scheduler, such as tcp://host:8786.")
+@scheduler_option
 @click.option("--only", multiple=True, metavar="NAME", help="Make only this scene. May be repeated.")
-@click.option(
-    "--shard",
-    type=_Shard(),
-    metavar="K/N|auto",
-    help="Make only the K-th of N parts. auto: read both from the environment of AWS Batch, Kubernetes or Slurm.",
-)
+@shard_option("Make only the K-th of N parts.")
 @click.option(
     "--output",
     "-o",

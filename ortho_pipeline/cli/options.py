@@ -13,10 +13,11 @@ from typing import Any
 import click
 
 from ortho_pipeline.cli.flags import FLAGS, with_flags
-from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo
+from ortho_pipeline.cli.parsing import Megabytes, OneOrTwo, Shard
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import (
+    EXECUTORS,
     GROUPS,
     BlockOptions,
     MatchOptions,
@@ -360,3 +361,22 @@ folder_option = click.option(
     callback=_folder,
     help="Output folder.",
 )
+
+
+def executor_option(text: str) -> Decorator:
+    """Return the option of who does the work."""
+    return click.option("--executor", type=click.Choice(EXECUTORS), help=text)
+
+
+workers_option = click.option(
+    "--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: all processors]"
+)
+scheduler_option = click.option(
+    "--scheduler", metavar="URL", help="Address of the dask scheduler, such as tcp://host:8786."
+)
+
+
+def shard_option(text: str) -> Decorator:
+    """Return the option of a worker that does only a part of the work."""
+    where = "auto: read both from the environment of AWS Batch, Kubernetes or Slurm."
+    return click.option("--shard", type=Shard(), metavar="K/N|auto", help=f"{text} {where}")

@@ -13,7 +13,7 @@ import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import click
 
@@ -248,3 +248,18 @@ def _quiet(ctx: click.Context, _: click.Parameter, value: bool) -> None:
 
 def _debug(ctx: click.Context, _: click.Parameter, value: bool) -> None:
     ctx.meta["debug"] = value
+
+
+class Shard(click.ParamType):  # type: ignore[type-arg]
+    """The K-th of N parts."""
+
+    name = "K/N|auto"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int] | str:
+        """Return (k, n) of 'k/n', or 'auto'."""
+        if isinstance(value, tuple) or value == "auto":
+            return cast(tuple[int, int] | str, value)
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", value)
+        if not match or not 1 <= int(match[1]) <= int(match[2]):
+            self.fail(f"{value!r} is not K/N, such as 1/4", param, ctx)
+        return int(match[1]), int(match[2])

@@ -22,6 +22,7 @@ from click.testing import CliRunner, Result
 from osgeo import gdal
 
 from ortho_pipeline.batch import config as batch_config
+from ortho_pipeline.batch import freshness
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch import runner as batch
 from ortho_pipeline.batch.executors import Processes, WorkerDied, completed
@@ -481,13 +482,13 @@ def test_the_dem_concerns_all_scenes_and_other_software_too(block, monkeypatch):
     assert block.run() == dict.fromkeys(("s0", "s1", "s2"), "done")
     newer = {**versions(), "gdal": "99.0"}
     monkeypatch.setattr(batch_plan, "versions", lambda: newer)
-    monkeypatch.setattr(batch, "versions", lambda: newer)
+    monkeypatch.setattr(freshness, "versions", lambda: newer)
     assert block.run() == dict.fromkeys(("s0", "s1", "s2"), "done")
 
 
 def test_a_worker_with_other_software_refuses(block, monkeypatch):
     job = batch_plan.plan(block.file).jobs[0]
-    monkeypatch.setattr(batch, "versions", lambda: {**job.versions, "gdal": "1.0"})
+    monkeypatch.setattr(freshness, "versions", lambda: {**job.versions, "gdal": "1.0"})
     outcome = batch.make_scene(job)
     assert outcome.status == "failed"
     assert "gdal 1.0 instead of" in outcome.error["message"]

@@ -125,7 +125,7 @@ def test_a_raw_scene_and_an_ortho_agree(tmp_path: Path, monkeypatch: pytest.Monk
     assert one.GetGeoTransform() == other.GetGeoTransform()
     inner = [image.ReadAsArray()[15:-15, 15:-15].astype(float).ravel() for image in (one, other)]
     assert np.corrcoef(*inner)[0, 1] > 0.97
-    monkeypatch.setattr(raw, "write_placed", lambda *given: pytest.fail("it is made again"))
+    monkeypatch.setattr(raw, "write_in", lambda *given: pytest.fail("it is made again"))
     before = json.loads((tmp_path / "out" / "stack.json").read_text())
     again = run(tmp_path / "in", tmp_path / "out", options=StackOptions(corrections_only=True))
     assert [one["shift_px"] for one in again.document["dates"]] == [one["shift_px"] for one in before["dates"]]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.executors import Crew, completed
-from ortho_pipeline.batch.freshness import inputs_as_recorded, is_scene
+from ortho_pipeline.batch.freshness import change_in_store, inputs_as_recorded, is_scene
 from ortho_pipeline.batch.plan import STATE, Job, Plan
 from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.results import BatchResult, Outcome
@@ -126,16 +126,9 @@ def why_stale(where: SharedFolder, job: Job, record: RunRecord) -> str:
     if not is_scene(record):
         return "its record is incomplete"
     store = Objects(where.address_of(job.name), allow_network=where.allow_network)
-    for state in record.outputs:
-        try:
-            if where.checksums:
-                same = store.read(state.path, state.bytes)[1].sha256 == state.sha256
-            else:
-                same = store.stated(state.path) == (state.bytes, state.tag)
-        except (FileNotFoundError, InputError):
-            return f"{state.path} is missing or has grown"
-        if not same:
-            return f"{state.path} has changed"
+    changed = change_in_store(store, record, where.checksums)
+    if changed:
+        return changed
     if inputs_as_recorded(record, job, where.checksums) is None:
         return "its inputs, settings or software have changed"
     return ""

@@ -2,37 +2,48 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ortho_pipeline.batch.executors import Crew, crew_of
 from ortho_pipeline.batch.records import locked
-from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, time_of
+from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, placed_at, time_of
 from ortho_pipeline.batch.stack.document import record_of
 from ortho_pipeline.batch.stack.items import items_of, write_items
 from ortho_pipeline.batch.stack.matching import DatePair, Matcher
 from ortho_pipeline.batch.stack.placing import Placed, pixel_of
 from ortho_pipeline.batch.stack.raw import Levelled, Rectifier
-from ortho_pipeline.batch.stack.result import StackResult, summary
-from ortho_pipeline.batch.stack.writing import Told, Writer
+from ortho_pipeline.batch.stack.recorded import RecordedFolder, recorded_in
+from ortho_pipeline.batch.stack.result import StackResult, part_summary, summary
+from ortho_pipeline.batch.stack.writing import Writer
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.graph import pairs_of
 from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.results import SCHEMA_VERSION, Result
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import retire, together, write_json
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.raster.caching.block_cache import cache_restored
 from ortho_pipeline.report.stack.page import write_page
-from ortho_pipeline.runtime.process_limits import one_blas_thread
-from ortho_pipeline.stores.delivery import address_of
+from ortho_pipeline.report.stack.records import StackRecord
+from ortho_pipeline.runtime.process_limits import Progress, one_blas_thread
+from ortho_pipeline.stores.delivery import address_of, delivered
+from ortho_pipeline.stores.objects import Objects
 
 _EDGES, _ALIGNED, _RAW = "pairs", "aligned", "raw"
 _DAYS_A_YEAR = 365.25
+#: What the items are called together in object storage.
+_ITEMS = "items"
 
 
 @one_blas_thread()
@@ -46,7 +57,10 @@ def stack(
     surface: SurfaceOptions = SurfaceOptions(),
     scene: SceneOptions = SceneOptions(),
     output: OutputOptions | None = None,
-    progress: Told | None = None,
+    executor: str | Executor | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
 ) -> StackResult:
     """Make finished orthos and raw scenes of many dates agree with each other.
 
@@ -56,12 +70,14 @@ def stack(
     ----------
     orthos : sequence of path
         Images, folders of them, patterns of names, and CSV lists with the columns file and date.
-    folder : path
-        Folder of all outputs.
+    folder : path or address
+        Folder of all outputs, on this machine or in object storage.
     surface : SurfaceOptions
         Heights for raw scenes.
     output : OutputOptions, optional
         Of the aligned orthos. Default: cubic resampling.
+    executor, workers, scheduler
+        Who rectifies, matches and writes, as in `run`. Default: this process, or dask where a scheduler is given.
     progress : callable, optional
         Called with a stage and its finished share.
 
@@ -83,25 +99,101 @@ def stack(
     >>> [(one.time[:10], one.east_north_m, one.sigma_m) for one in done.dates]  # doctest: +SKIP
     >>> done.to_xarray().sel(time="2024").median("time").compute()  # doctest: +SKIP
     """
-    if address_of(folder) is not None:
-        raise InputError(
-            "a stack is written to a folder on this machine", file=str(folder), field="folder", remedy="give a folder"
-        )
-    output = OutputOptions(resampling="cubic") if output is None else output
-    if output.stac and options.corrections_only:
-        raise InputError(
-            "STAC items need aligned orthos, and only corrections are written",
-            field="output.stac",
-            remedy=Text("leave out ", Setting("output.stac"), " or ", Setting("stack.corrections_only")),
-        )
-    dates = dated_orthos(orthos, options.date_pattern, scene, surface)
-    nodes, fixed = _with_datum(dates, options.datum, match, scene)
-    told, folder = progress or (lambda what, share: None), Path(folder)
-    with locked(folder / _EDGES / ".lock", owner="ortho stack"):
-        rectifier = Rectifier(folder / _RAW, surface, scene, output, options.rebuild)
-        dates = rectifier.orthos(dates, told)
-        nodes, placed = [*dates, *nodes[len(dates) :]], Placed.of(dates)
-        matcher = Matcher(folder / _EDGES, replace(match, reference=()), scene, output, options.rebuild)
+    planned = _Planned.of(orthos, folder, options, match, surface, scene, output, progress)
+    _refuse_unfit(planned)
+    with (
+        _held(planned.folder, shared=False),
+        _crew(executor, workers, scheduler, planned) as (crew, threads),
+    ):
+        return _made(planned.with_threads(threads), crew)
+
+
+@one_blas_thread()
+@cache_restored()
+def match_part(
+    orthos: Sequence[str | os.PathLike[str]],
+    folder: str | os.PathLike[str],
+    part: tuple[int, int],
+    options: StackOptions = StackOptions(),
+    *,
+    match: MatchOptions = MatchOptions(),
+    surface: SurfaceOptions = SurfaceOptions(),
+    scene: SceneOptions = SceneOptions(),
+    output: OutputOptions | None = None,
+    executor: str | Executor | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Match the k-th of n parts of the pairs of a stack; several workers share a folder.
+
+    `stack` finds these pairs matched.
+
+    Parameters
+    ----------
+    part : (k, n)
+        From 1.
+
+    Raises
+    ------
+    InputError
+        As `stack`, or if there is no such part.
+    """
+    number, count = part
+    if not 1 <= number <= count:
+        raise InputError(f"there is no part {number} of {count}", field="shard", remedy="use a part such as 1/4")
+    planned = _Planned.of(orthos, folder, options, match, surface, scene, output, progress)
+    # Neighbours in the list have dates in common.
+    first, last = ((number + step) * len(planned.wanted) // count for step in (-1, 0))
+    planned = replace(planned, wanted=planned.wanted[first:last])
+    with (
+        _held(planned.folder, shared=True),
+        _crew(executor, workers, scheduler, planned) as (crew, threads),
+    ):
+        _, pairs = _matched(planned.with_threads(threads), crew)
+    matched = sum(pair.matches is not None for pair in pairs)
+    document = {"schema_version": SCHEMA_VERSION, "part": list(part), "pairs": len(pairs), "matched": matched}
+    return Result({}, document, part_summary(part, pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class _Planned:
+    """What a stack is made of, and where.
+
+    Parameters
+    ----------
+    nodes : list of Dated
+        The dates, and after them the reference if it is the datum.
+    count : int
+        Number of dates.
+    fixed : int, optional
+        Number of the datum; None is the mean.
+    wanted : list of (int, int)
+        The pairs.
+    """
+
+    nodes: list[Dated]
+    count: int
+    fixed: int | None
+    wanted: list[tuple[int, int]]
+    folder: str
+    options: StackOptions
+    match: MatchOptions
+    surface: SurfaceOptions
+    scene: SceneOptions
+    output: OutputOptions
+    told: Progress
+
+    @classmethod
+    def of(
+        cls, orthos: Sequence[str | os.PathLike[str]], folder: str | os.PathLike[str], options: StackOptions,
+        match: MatchOptions, surface: SurfaceOptions, scene: SceneOptions, output: OutputOptions | None,
+        progress: Progress | None,
+    ) -> _Planned:  # fmt: skip
+        """Open the images, and choose the pairs."""
+        output = OutputOptions(resampling="cubic") if output is None else output
+        dates = dated_orthos(orthos, options.date_pattern, scene, surface)
+        nodes, fixed = _with_datum(dates, options.datum, match, scene)
         seen = [one.conditions for one in dates]
         wanted = pairs_of(
             [one.days for one in dates], options.neighbours, [one.cloud_percent for one in seen],
@@ -109,23 +201,122 @@ def stack(
         )  # fmt: skip
         if len(nodes) > len(dates):
             wanted += [(date, len(dates)) for date in range(len(dates))]
-        pairs = matcher.pairs(nodes, wanted, lambda done, of: told("matching", done / of))
-        solved = _adjusted(nodes, dates, placed, pairs, fixed, not options.shift_only)
-        aligned = folder / _ALIGNED
-        writer = Writer(aligned, placed, scene, output, options.corrections_only, options.rebuild)
-        outputs = writer.write(dates, solved, told)
-        record = record_of(dates, placed, pairs, solved, outputs, options.datum)
-        files = {"aligned": aligned, "json": folder / "stack.json", "html": folder / "stack.html"}
-        with together(aligned, "items of a stack"):
-            # Items of an earlier run would state its sigmas.
-            retire(items_of(aligned, dates))
-            if output.stac:
-                files["stac"] = write_items(aligned, dates, record)
-        with together(folder, "stack"):
-            write_json(files["json"], record.to_json())
-            write_page(record, files["html"])
+        told = progress or (lambda what, share: None)
+        place = os.fspath(folder).rstrip("/") if address_of(folder) is not None else os.fspath(folder)
+        return cls(nodes, len(dates), fixed, wanted, place, options, match, surface, scene, output, told)
+
+    def with_threads(self, threads: int | None) -> _Planned:
+        """Return the plan with threads for each piece of work."""
+        return replace(self, output=replace(self.output, threads=threads))
+
+    def part(self, name: str) -> RecordedFolder:
+        """Return a folder within that of the outputs."""
+        return recorded_in(self.folder, name, self.scene.allow_network, self.options.rebuild)
+
+
+def _refuse_unfit(planned: _Planned) -> None:
+    """Refuse outputs that cannot be."""
+    options, far = planned.options, address_of(planned.folder) is not None
+    if planned.output.stac and options.corrections_only:
+        raise InputError(
+            "STAC items need aligned orthos, and only corrections are written",
+            field="output.stac",
+            remedy=Text("leave out ", Setting("output.stac"), " or ", Setting("stack.corrections_only")),
+        )
+    near = next((one for one in planned.nodes[: planned.count] if not Location(one.image).is_far), None)
+    if far and options.corrections_only and near is not None:
+        raise InputError(
+            "a VRT in object storage cannot refer to an image on this machine",
+            file=near.image,
+            field="stack.corrections_only",
+            remedy=Text("leave out ", Setting("stack.corrections_only"), ", or give the addresses of the images"),
+        )
+
+
+def _crew(
+    executor: str | Executor | None, workers: int | None, scheduler: str | None, planned: _Planned
+) -> contextlib.AbstractContextManager[tuple[Crew, int | None]]:
+    if executor is None and scheduler is None:
+        executor = "sequential" if workers is None else "processes"
+    return crew_of(executor, workers, planned.output.threads, scheduler, len(planned.wanted))
+
+
+@contextlib.contextmanager
+def _held(folder: str, *, shared: bool) -> Iterator[None]:
+    """Keep other runs out of the folder; workers of parts share it."""
+    if address_of(folder) is not None:
+        yield
+        return
+    with locked(Path(folder) / _EDGES / ".lock", shared=shared, owner="ortho stack"):
+        yield
+
+
+def _matched(planned: _Planned, crew: Crew) -> tuple[list[Dated], list[DatePair]]:
+    """Return the nodes with orthos of the raw scenes that the pairs need, and the matched pairs."""
+    told, count = planned.told, planned.count
+    rectifier = Rectifier(planned.part(_RAW), planned.surface, planned.scene, planned.output)
+    some = {node for pair in planned.wanted for node in pair if node < count}
+    dates = rectifier.orthos(planned.nodes[:count], some, crew, lambda share: told("rectifying", share))
+    nodes = [*dates, *planned.nodes[count:]]
+    matcher = Matcher(planned.part(_EDGES), replace(planned.match, reference=()), planned.scene, planned.output)
+    return nodes, matcher.pairs(nodes, planned.wanted, crew, lambda share: told("matching", share))
+
+
+def _made(planned: _Planned, crew: Crew) -> StackResult:
+    """Make all of a stack."""
+    options, scene, told = planned.options, planned.scene, planned.told
+    nodes, pairs = _matched(planned, crew)
+    dates = nodes[: planned.count]
+    placed = Placed.of(dates)
+    solved = _adjusted(nodes, dates, placed, pairs, planned.fixed, not options.shift_only)
+    aligned = planned.part(_ALIGNED)
+    writer = Writer(aligned, placed, scene, planned.output, options.corrections_only)
+    names = writer.write(dates, solved, crew, lambda share: told("writing", share))
+    outputs = {name: f"{_ALIGNED}/{file}" for name, file in names.items()}
+    record = record_of(dates, placed, pairs, solved, outputs, options.datum)
+    files = _documents(planned, dates, record)
     said = summary(record, sum(pair.fresh for pair in pairs))
     return StackResult(files, record.to_json(), said, record=record, access=scene.access)
+
+
+def _documents(planned: _Planned, dates: Sequence[Dated], record: StackRecord) -> dict[str, Any]:
+    """Write items, record and page; return the files of the stack."""
+    aligned, allowed = planned.part(_ALIGNED), planned.scene.allow_network
+    items = {path.name for path in items_of(Path(), dates)}
+    files: dict[str, Any] = {"aligned": Path(aligned.place) if not aligned.is_far else aligned.place}
+    if not aligned.is_far:
+        within = Path(aligned.place)
+        with together(within, "items of a stack"):
+            # Items of an earlier run would state its sigmas.
+            retire(within / name for name in sorted(items))
+            if planned.output.stac:
+                files["stac"] = write_items(aligned, within, dates, record)
+        with together(planned.folder, "stack"):
+            return files | _write_documents(record, Path(planned.folder))
+    _retire_items(Objects(planned.folder, allow_network=allowed), items)
+    if planned.output.stac:
+        with delivered(planned.folder, _ITEMS, allow_network=allowed, keep=lambda path: path.name in items) as upload:
+            within = upload.folder / _ALIGNED
+            within.mkdir()
+            files["stac"] = f"{aligned.place}/{write_items(aligned, within, dates, record).name}"
+    with delivered(planned.folder, "stack", allow_network=allowed, keep=lambda path: True) as upload:
+        written = _write_documents(record, upload.folder)
+    return files | {role: f"{planned.folder}/{path.name}" for role, path in written.items()}
+
+
+def _write_documents(record: StackRecord, folder: Path) -> dict[str, Path]:
+    files = {"json": folder / "stack.json", "html": folder / "stack.html"}
+    write_json(files["json"], record.to_json())
+    write_page(record, files["html"])
+    return files
+
+
+def _retire_items(store: Objects, names: set[str]) -> None:
+    """Remove the items of an earlier run from object storage: they would state its sigmas."""
+    delivery = f"{_ITEMS}_delivery.json"
+    if store.exists(delivery):
+        for name in (delivery, *(f"{_ALIGNED}/{name}" for name in sorted(names))):
+            store.delete(name)
 
 
 def _with_datum(
@@ -139,7 +330,7 @@ def _with_datum(
     if datum == "mean":
         return list(dates), None
     if datum == "reference":
-        path = Path(match.reference[0])
+        path = placed_at(match.reference[0], scene)
         last = dates[-1].time
         return [*dates, Dated("reference", path, last, "", open_ortho(path, scene))], len(dates)
     for number, one in enumerate(dates):

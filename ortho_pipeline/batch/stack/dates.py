@@ -14,6 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from ortho_pipeline.batch.freshness import state_of
+from ortho_pipeline.batch.paths import PipelinePaths, Place
 from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
 from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has_surface
@@ -21,12 +23,15 @@ from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.orthos.verifying import RASTERS
 from ortho_pipeline.commands.placement import Placement, place_scene
 from ortho_pipeline.commands.resolved.resolved import Resolved
+from ortho_pipeline.commands.stac.given import resolved
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import decoded, read_bounded, read_json
+from ortho_pipeline.files.locations import Location, VsiPath, located, place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.stores.sidecars import ask_beside
 
 #: A list and a JSON document next to an ortho are no larger.
 _BYTES = 50_000_000
@@ -72,20 +77,27 @@ class Dated:
     ----------
     raw : RawScene, optional
         The raw scene of which the ortho was made for matching.
+    made : FileState, optional
+        The state of that ortho.
     """
 
     name: str
-    path: Path
+    path: Place
     time: datetime
     source: str
     scene: Scene
     raw: RawScene | None = None
+    made: FileState | None = None
     conditions: Conditions = field(default_factory=Conditions)
 
     @property
-    def image(self) -> Path:
+    def image(self) -> Place:
         """The file that was given."""
-        return self.path if self.raw is None else Path(self.raw.resolved.scene.path)
+        return self.path if self.raw is None else place(self.raw.resolved.scene.path)
+
+    def state(self, allow_network: bool) -> FileState:
+        """Return the state of the ortho."""
+        return self.made or state_of("ortho", self.path, allow_network=allow_network)
 
     @property
     def days(self) -> float:
@@ -111,15 +123,17 @@ def dated_orthos(
     InputError
         If an image has no date, two have one name, or one is raw and there are no heights.
     """
-    found: dict[str, tuple[Path, str | None]] = {}
-    heights, skipped = has_surface(surface), {os.path.realpath(path) for path in dem_files(surface)}
-    for path, stated in _files(given):
-        if os.path.realpath(path) in skipped:
+    found: dict[str, _Given] = {}
+    heights, skipped = has_surface(surface), {_real(path) for path in dem_files(surface)}
+    for one in _files(given, options):
+        if _real(one.path) in skipped:
             continue
-        name = path.stem
-        if name in found and os.path.realpath(found[name][0]) != os.path.realpath(path):
-            raise InputError(f"two images are called {name}", file=path, field="orthos", remedy="rename one of them")
-        found[name] = path, stated
+        name = one.path.stem
+        if name in found and _real(found[name].path) != _real(one.path):
+            raise InputError(
+                f"two images are called {name}", file=one.path, field="orthos", remedy="rename one of them"
+            )
+        found[name] = one
     if len(found) < 2:
         raise InputError(
             f"a stack needs at least two images, not {len(found)}",
@@ -127,7 +141,8 @@ def dated_orthos(
             remedy=f"give a folder with orthos ({', '.join(RASTERS)})",
         )
     dated = []
-    for name, (path, stated) in found.items():
+    for name, one in found.items():
+        path = one.path
         scene = open_ortho(path, options, only=False)
         if scene.sensor != ORTHO and not heights:
             raise InputError(
@@ -136,36 +151,99 @@ def dated_orthos(
                 field="surface.dem",
                 remedy=Text(GIVE_HEIGHTS, "; if it is an ortho, delete the old RPC or metadata files"),
             )
-        documents, dataset = _documents(path), open_dataset(path, **options.access)
-        time, source = _date(path, stated, pattern, documents, dataset, scene)
+        documents, dataset = _documents(one), open_dataset(path, **options.access)
+        time, source = _date(one, pattern, documents, dataset, scene)
         facts = [*(_facts_of(document) for document, _ in documents), scene.facts]
         conditions = conditions_of(facts, dataset)
         dated.append(Dated(name, path, time, source, scene, conditions=conditions))
     return sorted(dated, key=lambda one: (one.time, one.name))
 
 
-def _files(given: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, str | None]]:
-    """Return files and the dates that lists state."""
-    found: list[tuple[Path, str | None]] = []
+def placed_at(name: str | os.PathLike[str], options: SceneOptions) -> Place:
+    """Return the place of a file that a user names: a path, or one in an archive or behind a URL.
+
+    Raises
+    ------
+    InputError
+        If it is on another machine, and the network is not allowed.
+    """
+    found = located(name, allow_network=options.allow_network)
+    return found if isinstance(found, VsiPath) else Path(found)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """An image that was given, with the date that a list states, and the STAC item that names it."""
+
+    path: Place
+    stated: str | None = None
+    item: Place | None = None
+
+
+def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> list[_Given]:
+    """Return the images of folders, lists, patterns and STAC items."""
+    found: list[_Given] = []
     for one in given:
-        path = Path(one)
+        name = Location(one)
+        if name.is_address:
+            found += _far_files(name, options)
+            continue
+        path = placed_at(name.document if name.is_item else name, options)
         if path.is_dir():
-            found += [(file, None) for file in sorted(path.iterdir()) if file.suffix.lower() in RASTERS]
+            images = (file for file in path.iterdir() if file.suffix.lower() in RASTERS)
+            found += [_Given(file) for file in sorted(images, key=str)]
         elif path.suffix.lower() in (".csv", ".txt") and path.is_file():
-            found += read_list(path)
-        elif not path.exists() and any(mark in str(one) for mark in "*?["):
-            matches = sorted(glob.glob(str(one)))
+            found += _listed(path, options)
+        elif name.is_item and path.is_file():
+            found.append(_of_item(name, options))
+        elif not path.exists() and any(mark in name for mark in "*?["):
+            matches = sorted(glob.glob(name))
             if not matches:
                 raise InputError("no file has such a name", file=path, field="orthos", remedy="check the pattern")
-            found += [(Path(file), None) for file in matches]
+            found += [_Given(Path(file)) for file in matches]
         else:
-            found.append((path, None))
+            found.append(_Given(path))
+    ask_beside(*(one.path for one in found), allow_network=options.allow_network)
     return found
 
 
+def _far_files(address: Location, options: SceneOptions) -> list[_Given]:
+    """Return the images of an address: of an image, a STAC item, a list, a folder or pattern in object storage."""
+    if address.is_item:
+        return [_of_item(address, options)]
+    ending = Path(address).suffix.lower()
+    if ending in (".csv", ".txt"):
+        return _listed(placed_at(address, options), options)
+    is_pattern = any(mark in address for mark in "*?[")
+    if not is_pattern and (address.is_on_web or ending):
+        return [_Given(placed_at(address, options))]
+    pattern = address if is_pattern else f"{address.rstrip('/')}/*"
+    paths = PipelinePaths(address, None, options.allow_network).matching(pattern, "orthos")
+    images = [path for path in paths if path.suffix.lower() in RASTERS]
+    if not images:
+        raise InputError("no image has such an address", file=address, field="orthos", remedy="check the address")
+    return [_Given(path) for path in images]
+
+
+def _of_item(name: Location, options: SceneOptions) -> _Given:
+    image, opened = resolved(name, options)
+    if opened.rpc != options.rpc:
+        raise InputError(
+            "the RPC of this image is an asset of its own, and a stack takes the RPC next to the image",
+            file=name,
+            field="orthos",
+            remedy="download the image and the RPC to one folder, with the same stem",
+        )
+    return _Given(placed_at(image, options), item=placed_at(name.document, options))
+
+
+def _listed(path: Place, options: SceneOptions) -> list[_Given]:
+    return [_Given(placed_at(file, options), stated) for file, stated in read_list(path)]
+
+
 @reads("give a CSV file with the columns file and date")
-def read_list(path: str | os.PathLike[str]) -> list[tuple[Path, str | None]]:
-    """Return the files of a list, and their dates if it has a column of them.
+def read_list(path: str | os.PathLike[str]) -> list[tuple[str, str | None]]:
+    """Return the files of a list, relative to its folder, and their dates if it has a column of them.
 
     Raises
     ------
@@ -187,26 +265,23 @@ def read_list(path: str | os.PathLike[str]) -> list[tuple[Path, str | None]]:
         raise InputError(
             "this list has no column of files", file=path, field="line 1", remedy="name the columns file and date"
         )
-    found: list[tuple[Path, str | None]] = []
+    found: list[tuple[str, str | None]] = []
     for number, row in enumerate(rows[1:], start=2):
         if len(row) <= file or not row[file].strip() or "\0" in row[file]:
             raise InputError("a row of this list has no file", file=path, field=f"line {number}")
         stated = row[date].strip() if date is not None and len(row) > date else ""
-        found.append((Path(path).parent / row[file].strip(), stated or None))
+        name = Location(row[file].strip())
+        found.append((name if name.is_address else os.path.join(os.path.dirname(path), name), stated or None))
     return found
 
 
 def _date(
-    path: Path,
-    stated: str | None,
-    pattern: str | None,
-    documents: Sequence[tuple[Any, str]],
-    dataset: Any,
-    scene: Scene,
+    one: _Given, pattern: str | None, documents: Sequence[tuple[Any, str]], dataset: Any, scene: Scene
 ) -> tuple[datetime, str]:
     """Return the date of an ortho, and where it is from."""
-    if stated is not None:
-        return time_of(stated, path), "list"
+    path = one.path
+    if one.stated is not None:
+        return time_of(one.stated, path), "list"
     if pattern is not None:
         return by_pattern(path.name, pattern), "file name"
     for document, name in documents:
@@ -231,10 +306,18 @@ def _date(
     )
 
 
-def _documents(path: Path) -> list[tuple[Any, str]]:
-    """Return JSON documents next to an image, which may state its date, clouds and sun."""
+def _real(path: str | os.PathLike[str]) -> str:
+    """Return a path on this machine without links, another one as it is."""
+    return os.fspath(path) if Location(path).is_far else os.path.realpath(path)
+
+
+def _documents(one: _Given) -> list[tuple[Any, str]]:
+    """Return the STAC item of an image and JSON documents next to it, which may state its date, clouds and sun."""
+    path = one.path
     stem = path.stem.removesuffix("_ortho")
     names = [path.with_suffix(".json"), path.with_name(f"{stem}_stac.json"), path.with_name(f"{stem}_report.json")]
+    if one.item is not None:
+        names = [one.item, *(name for name in names if name != one.item)]
     return [(read_json(name, _BYTES, "repair or delete this file"), name.name) for name in names if name.is_file()]
 
 

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.batch.freshness import DIGESTS, recorded_at
-from ortho_pipeline.batch.records import FileState, RunRecord, key_of
+from ortho_pipeline.batch.executors import Crew
+from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated
+from ortho_pipeline.batch.stack.recorded import LARGEST, FileSet, Made, RecordedFolder
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
-from ortho_pipeline.commands.resolved.ledger import versions
-from ortho_pipeline.errors import InputError, error_document
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import files_of
 from ortho_pipeline.files import read_json, write_json
 from ortho_pipeline.files.json.records import Count, Record
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
+from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.stores.objects import Objects
 
 #: Error that all matches of a pair share, px of a chip; more than `ortho verify` assumes.
 _ALIKE = 0.0075
@@ -56,55 +62,38 @@ class DatePair:
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """Matches pairs, with a record for each in a folder.
+    """Matches pairs, with a record for each in a folder."""
 
-    Parameters
-    ----------
-    rebuild : bool
-        Match also pairs with a record.
-    """
-
-    folder: Path
+    folder: RecordedFolder
     match: MatchOptions
     scene: SceneOptions
     output: OutputOptions
-    rebuild: bool = False
 
     def pairs(
-        self, dates: Sequence[Dated], wanted: Sequence[tuple[int, int]], told: Callable[[int, int], None]
+        self, dates: Sequence[Dated], wanted: Sequence[tuple[int, int]], crew: Crew, told: Callable[[float], None]
     ) -> list[DatePair]:
-        """Return all pairs, matched now or before; `told` hears how many are done."""
-        software = versions()
-        found = []
-        for number, (one, other) in enumerate(wanted):
-            found.append(self._pair(dates, one, other, software))
-            told(number + 1, len(wanted))
-        return found
+        """Return all pairs, matched now or before; `told` hears the finished share."""
+        for one, other in wanted:
+            self.folder.learn(_name_of(dates[one], dates[other]))
+        allowed = self.scene.allow_network
+        state = {node: dates[node].state(allowed) for node in {node for pair in wanted for node in pair}}
+        sets = [self._set(dates, state, one, other) for one, other in wanted]
+        made = self.folder.make_all(crew, sets, told)
+        return [self._pair(one, other, made[of_pair.name]) for (one, other), of_pair in zip(wanted, sets, strict=True)]
 
-    def _pair(self, dates: Sequence[Dated], one: int, other: int, software: dict[str, Any]) -> DatePair:
+    def _set(self, dates: Sequence[Dated], state: Mapping[int, FileState], one: int, other: int) -> FileSet:
         first, second = dates[one], dates[other]
-        name = f"{first.name}__{second.name}"
-        data, place = self.folder / f"{name}.json", self.folder / f"{name}.record.json"
-        record = recorded_at(place, data, rebuild=self.rebuild)
-        inputs = tuple(
-            FileState.of(role, dated.path.absolute(), DIGESTS)
-            for role, dated in (("later ortho", first), ("earlier ortho", second))
-        )
-        key = key_of(inputs, self._configuration(), software)
-        if record is not None and record.is_of(key, self.folder):
-            if record.status == "failed" and record.error is not None:
-                return DatePair(one, other, None, str(record.error["message"]), True)
-            if record.status == "done" and len(record.outputs) == 1:
-                return DatePair(one, other, read_matches(data), fresh=True)
-        made = RunRecord(name=name, key=key, status="failed", inputs=inputs)
-        try:
-            matches = self._matched(first, second)
-        except InputError as error:
-            made.replaced(error=error_document(error)).write(place)
-            return DatePair(one, other, None, error.message)
-        write_json(data, matches.to_json())
-        made.replaced(status="done", outputs=(FileState.of("matches", data, name=data.name),)).write(place)
-        return DatePair(one, other, matches)
+        name = _name_of(first, second)
+        inputs = state[one].replaced(role="later ortho"), state[other].replaced(role="earlier ortho")
+        write = functools.partial(self._write, replace(first, raw=None), replace(second, raw=None), _file_of(name))
+        return FileSet(name, inputs, self._configuration(), {"matches": _file_of(name)}, write, may_fail=True)
+
+    def _pair(self, one: int, other: int, made: Made) -> DatePair:
+        record = made.record
+        if record.error is not None:
+            return DatePair(one, other, None, str(record.error["message"]), made.kept)
+        with self.folder.local(_file_of(record.name)) as folder:
+            return DatePair(one, other, read_matches(folder / _file_of(record.name)), fresh=made.kept)
 
     def _configuration(self) -> dict[str, Any]:
         return {
@@ -113,6 +102,12 @@ class Matcher:
             "reference_bands": None if self.match.reference_bands is None else list(self.match.reference_bands),
             "search_rotation": self.match.search_rotation,
         }
+
+    def _write(self, first: Dated, second: Dated, name: str, folder: Path) -> None:
+        # Of far images the matcher reads fewer places, and many pairs need all of them.
+        with tempfile.TemporaryDirectory(prefix="ortho_") as scratch:
+            here = (_copied(one, Path(scratch), self.scene) for one in (first, second))
+            write_json(folder / name, self._matched(*here).to_json())
 
     def _matched(self, first: Dated, second: Dated) -> EdgeMatches:
         options = replace(self.match, reference=(str(second.path),))
@@ -134,6 +129,24 @@ class Matcher:
             tried=len(kept),
             kept=int((matches.reason == "").sum()),
         )
+
+
+def _copied(one: Dated, folder: Path, options: SceneOptions) -> Dated:
+    """Return a date with a copy of its ortho on this machine; itself if the ortho is there, or more than one file."""
+    address = Location(one.path).url
+    if not address.is_address or len(files_of(open_dataset(one.path, **options.access))) > 1:
+        return one
+    path, (parent, _, name) = folder / f"{one.name}{one.path.suffix}", address.rpartition("/")
+    Objects(parent, allow_network=options.allow_network).fetch(name, path, LARGEST)
+    return replace(one, path=path, scene=replace(one.scene, path=path))
+
+
+def _name_of(first: Dated, second: Dated) -> str:
+    return f"{first.name}__{second.name}"
+
+
+def _file_of(name: str) -> str:
+    return f"{name}.json"
 
 
 def _pairs(values: Array) -> tuple[tuple[float, float], ...]:

@@ -5,17 +5,20 @@ The aligned ortho is resampled once, from the raw image.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import functools
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ortho_pipeline.batch.freshness import DIGESTS, recorded_at
-from ortho_pipeline.batch.records import FileState, RunRecord, key_of
+from ortho_pipeline.batch.executors import Crew
+from ortho_pipeline.batch.freshness import DIGESTS, far_states
+from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, map_grid_of
+from ortho_pipeline.batch.stack.recorded import FileSet, Made, RecordedFolder
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.block_results.orthos import on_one_grid
 from ortho_pipeline.commands.control.points import no_points
@@ -23,12 +26,13 @@ from ortho_pipeline.commands.heights.opening import has_surface, open_surface
 from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.placement import Placement, open_rasters
 from ortho_pipeline.commands.rectification import warp_placed
-from ortho_pipeline.commands.resolved.ledger import Ledger, versions
+from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.opening import on_surface
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -45,15 +49,16 @@ def written_with(output: OutputOptions) -> list[Any]:
     return [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)]
 
 
-def write_placed(placed: Placement, path: Path) -> None:
-    """Write the ortho of a placed scene.
+def write_in(placed: Placement, name: str, folder: Path) -> None:
+    """Write the ortho of a placed scene into a folder.
 
     Raises
     ------
     InputError
         If it cannot be read or written.
     """
-    warp_placed(placed, None, open_rasters(placed.scene, placed.request), path, lambda stage, share: None)
+    source = open_rasters(placed.scene, placed.request)
+    warp_placed(placed, None, source, folder / name, lambda stage, share: None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,25 +138,24 @@ def corrected_model(placement: Placement, placed: Placed, stack: AdjustedStack, 
 
 @dataclass(frozen=True, eq=False)
 class Rectifier:
-    """Makes an ortho of each raw scene with its delivered model; one whose inputs are as recorded is kept.
+    """Makes an ortho of each raw scene with its delivered model; one whose inputs are as recorded is kept."""
 
-    Parameters
-    ----------
-    rebuild : bool
-        Write also what is as recorded.
-    """
-
-    folder: Path
+    folder: RecordedFolder
     surface: SurfaceOptions
     scene: SceneOptions
     output: OutputOptions
-    rebuild: bool = False
-    software: dict[str, Any] = field(default_factory=versions)
 
-    def orthos(self, dates: Sequence[Dated], told: Callable[[str, float], None]) -> list[Dated]:
+    def orthos(
+        self, dates: Sequence[Dated], some: Collection[int], crew: Crew, told: Callable[[float], None]
+    ) -> list[Dated]:
         """Return the dates with orthos in place of raw scenes: in the CRS and pixel size of the first finished ortho.
 
         Without any, they have the UTM zone of the first scene and the smallest pixel.
+
+        Parameters
+        ----------
+        some : collection of int
+            Dates whose orthos are needed; the others stay as they are.
 
         Raises
         ------
@@ -176,31 +180,37 @@ class Rectifier:
             grid = map_grid_of(finished)
             output = replace(self.output, crs=grid.crs, resolution=grid.pixel)
         access = SceneOptions(allow_network=self.scene.allow_network, roots=self.scene.roots)
-        found = []
-        for number, one in enumerate(dates):
-            if one.name in scenes:
-                scene = scenes[one.name]
+        opened: dict[int, RawScene] = {}
+        for number in sorted(some):
+            scene = scenes.get(dates[number].name)
+            if scene is not None:
                 request = Request(scene, access, surface=self.surface, output=output)
                 ledger = Ledger.of(request, scene, heights)
-                found.append(self._rectified(one, Resolved(request, scene, heights, no_points(), None, ledger)))
-            else:
-                found.append(one)
-            told("rectifying", (number + 1) / len(dates))
-        return found
+                resolved = Resolved(request, scene, heights, no_points(), None, ledger)
+                self.folder.learn(dates[number].name)
+                opened[number] = RawScene(resolved, self._inputs(resolved))
+        sets = [self._set(dates[number].name, raw_scene) for number, raw_scene in opened.items()]
+        made = self.folder.make_all(crew, sets, told)
+        return [
+            self._with_ortho(one, opened[number], made[one.name]) if number in opened else one
+            for number, one in enumerate(dates)
+        ]
 
-    def _rectified(self, one: Dated, resolved: Resolved) -> Dated:
-        path, place = self.folder / f"{one.name}_ortho.tif", self.folder / f"{one.name}.record.json"
-        record = recorded_at(place, path, rebuild=self.rebuild)
-        files = resolved.ledger.roles.items()
-        raw = RawScene(resolved, tuple(FileState.of(role, file.absolute(), DIGESTS) for file, role in files))
-        placed = raw.placed
-        key = key_of(raw.inputs, self._configuration(placed), self.software)
-        if record is None or not record.is_of(key, self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_placed(placed, path)
-            outputs = (FileState.of("ortho", path, name=path.name),)
-            RunRecord(name=one.name, key=key, status="done", inputs=raw.inputs, outputs=outputs).write(place)
-        return replace(one, path=path, scene=open_ortho(path, SceneOptions()), raw=raw)
+    @staticmethod
+    def _inputs(resolved: Resolved) -> tuple[FileState, ...]:
+        near = (FileState.of(role, file.absolute(), DIGESTS) for file, role in resolved.ledger.roles.items())
+        return (*near, *far_states(resolved.request))
+
+    def _set(self, name: str, raw: RawScene) -> FileSet:
+        file, placed = _ortho_of(name), raw.placed
+        write = functools.partial(write_in, placed, file)
+        return FileSet(name, raw.inputs, self._configuration(placed), {"ortho": file}, write)
+
+    def _with_ortho(self, one: Dated, raw: RawScene, made: Made) -> Dated:
+        path = self.folder.path(_ortho_of(one.name))
+        state = made.record.outputs[0].replaced(path=Location(path.absolute()).url)
+        access = SceneOptions(allow_network=self.scene.allow_network)
+        return replace(one, path=path, scene=open_ortho(path, access), raw=raw, made=state)
 
     def _configuration(self, placed: Placement) -> dict[str, Any]:
         output, grid = placed.request.output, placed.grid
@@ -210,3 +220,7 @@ class Rectifier:
             "surface": json_value(placed.surface.provenance),
             "output": written_with(output),
         }
+
+
+def _ortho_of(name: str) -> str:
+    return f"{name}_ortho.tif"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ortho_pipeline.batch.stack.matching import DatePair
 from ortho_pipeline.commands.arrays.cube import cube_of
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError
@@ -45,10 +46,16 @@ class StackResult(Result):
         return self.record.dates
 
     @property
-    def orthos(self) -> dict[str, Path]:
-        """The aligned orthos by the names of dates, without dates that could not be corrected."""
-        folder = Path(self.files["json"]).parent
-        return {one.name: folder / one.output for one in self.dates if one.output is not None}
+    def orthos(self) -> dict[str, Any]:
+        """The aligned orthos by the names of dates, without dates that could not be corrected.
+
+        They are paths, or addresses if the stack is in object storage.
+        """
+        aligned = self.files["aligned"]
+        names = {one.name: Path(one.output).name for one in self.dates if one.output is not None}
+        return {
+            one: aligned / name if isinstance(aligned, Path) else f"{aligned}/{name}" for one, name in names.items()
+        }
 
     def to_xarray(self, chunks: int | None = None) -> xarray.DataArray:
         """Return the aligned orthos as a lazy array ``(time, band, y, x)``, whose blocks dask reads when needed.
@@ -102,3 +109,12 @@ def summary(record: StackRecord, fresh: int = 0) -> str:
         )
     lines.append(f"Moving ground: {counted(len(record.moving), 'area')}; steps: {len(record.steps)}")
     return "\n".join(lines)
+
+
+def part_summary(part: tuple[int, int], pairs: Sequence[DatePair]) -> str:
+    """Return what people read of a part of the pairs."""
+    fresh, matched = sum(pair.fresh for pair in pairs), sum(pair.matches is not None for pair in pairs)
+    return (
+        f"Part {part[0]} of {part[1]}: {counted(len(pairs), 'pair')} ({fresh} from an earlier run), "
+        f"{len(pairs) - matched} not matched"
+    )

@@ -2,40 +2,43 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.batch.freshness import DIGESTS, recorded_at
-from ortho_pipeline.batch.records import FileState, RunRecord, key_of
+from ortho_pipeline.batch.executors import Crew
+from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.dates import Dated, RawScene
 from ortho_pipeline.batch.stack.placing import Placed, geotransform_of
-from ortho_pipeline.batch.stack.raw import corrected_model, write_placed, written_with
+from ortho_pipeline.batch.stack.raw import corrected_model, write_in, written_with
+from ortho_pipeline.batch.stack.recorded import FileSet, RecordedFolder
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
 from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.placement import Placement
-from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import write_moved
-from ortho_pipeline.exchange.rpc import export_rpc, write_vrt
+from ortho_pipeline.exchange.rpc import RPC, export_rpc, write_vrt
 from ortho_pipeline.files.json.values import json_value
+from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import OutputOptions, SceneOptions
-from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.raster.source import Grid, open_dataset
 
-Told = Callable[[str, float], None]
+#: Writes the image of a date with a name into a folder.
+WriteImage = Callable[[str, Path], None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """How the files of a date are made: from which files, with which model, and how its image is written."""
+    """How the files of a date are made: from which files, with which model, and how its image is written, if at all."""
 
     inputs: tuple[FileState, ...]
     saved: SavedModel
-    endings: tuple[str, ...]
-    write: Callable[[Path], None]
+    ending: str = ""
+    write: WriteImage | None = None
     surface: Any = None
 
 
@@ -48,41 +51,32 @@ class Writer:
     corrections_only : bool
         Keep the pixels, and write VRTs with a corrected map grid; of raw scenes with an RPC, if one represents the
         corrected model.
-    rebuild : bool
-        Write also what is as recorded.
     """
 
-    folder: Path
+    folder: RecordedFolder
     placed: Placed
     scene: SceneOptions
     output: OutputOptions
     corrections_only: bool
-    rebuild: bool
-    software: dict[str, Any] = field(default_factory=versions)
 
-    def write(self, dates: Sequence[Dated], solved: AdjustedStack, told: Told) -> dict[str, str]:
-        """Return the files of dates, relative to the folder of the stack."""
-        found = {}
-        for number, one in enumerate(dates):
-            if solved.determined[number]:
-                found[one.name] = self._one(one, solved, number)
-            told("writing", (number + 1) / len(dates))
-        return found
+    def write(
+        self, dates: Sequence[Dated], solved: AdjustedStack, crew: Crew, told: Callable[[float], None]
+    ) -> dict[str, str]:
+        """Return the names of files of dates."""
+        sets = [self._set(one, solved, number) for number, one in enumerate(dates) if solved.determined[number]]
+        self.folder.make_all(crew, sets, told)
+        return {one.name: next(iter(one.files.values())) for one in sets}
 
-    def _one(self, one: Dated, solved: AdjustedStack, number: int) -> str:
+    def _set(self, one: Dated, solved: AdjustedStack, number: int) -> FileSet:
+        self.folder.learn(one.name)
         part = self._part(one, solved, number)
-        place = self.folder / f"{one.name}.record.json"
-        files = [self.folder / f"{one.name}{ending}" for ending in (*part.endings, "_model.json")]
-        record = recorded_at(place, *files, rebuild=self.rebuild)
-        key = key_of(part.inputs, self._configuration(part), self.software)
-        if record is None or not record.is_of(key, self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            if part.endings:
-                part.write(files[0])
-            write_model_file(part.saved, files[-1])
-            outputs = tuple(FileState.of(file.suffix[1:], file, name=file.name) for file in files)
-            RunRecord(name=one.name, key=key, status="done", inputs=part.inputs, outputs=outputs).write(place)
-        return f"{self.folder.name}/{files[0].name}"
+        image, model = f"{one.name}{part.ending}", f"{one.name}_model.json"
+        names = [model] if part.write is None else [image, model]
+        write = None if part.write is None else functools.partial(part.write, image)
+        return FileSet(
+            one.name, part.inputs, self._configuration(part),
+            {Path(name).suffix[1:]: name for name in names}, functools.partial(_write, write, part.saved, model),
+        )  # fmt: skip
 
     def _part(self, one: Dated, solved: AdjustedStack, number: int) -> _Part:
         """Return how the files of a date are made."""
@@ -92,37 +86,29 @@ class Writer:
         return self._raw(one.raw, placement, corrected_model(placement, self.placed, solved, number))
 
     def _finished(self, one: Dated, model: ImageCorrection) -> _Part:
-        scene = one.scene
-
-        def write(path: Path) -> None:
-            if self.corrections_only:
-                write_moved(open_dataset(one.path, **self.scene.access), geotransform_of(model), path)
-            else:
-                write_resampled(scene, model, self.placed.grid, path, self.output, self.scene)
-
-        saved = SavedModel(model, scene.sensor, str(one.path), (scene.width, scene.height), {})
-        inputs = (FileState.of("ortho", one.path.absolute(), DIGESTS),)
-        return _Part(inputs, saved, ("_aligned.vrt" if self.corrections_only else "_aligned.tif",), write)
+        scene, access = one.scene, self.scene
+        write: WriteImage = (
+            functools.partial(_write_moved, scene, model, access)
+            if self.corrections_only
+            else functools.partial(_write_resampled, scene, model, self.placed.grid, self.output, access)
+        )
+        saved = SavedModel(model, scene.sensor, scene.model_source, (scene.width, scene.height), {})
+        inputs = (one.state(access.allow_network),)
+        return _Part(inputs, saved, "_aligned.vrt" if self.corrections_only else "_aligned.tif", write)
 
     def _raw(self, raw: RawScene, placement: Placement, model: ImageCorrection) -> _Part:
         scene = placement.scene
         saved = SavedModel(model, scene.sensor, scene.model_source, (scene.width, scene.height), {})
         if not self.corrections_only:
-
-            def write(path: Path) -> None:
-                write_placed(placement._replace(model=model, grid=self.placed.grid), path)
-
-            return _Part(raw.inputs, saved, ("_aligned.tif",), write, json_value(placement.surface.provenance))
+            corrected = placement._replace(model=model, grid=self.placed.grid)
+            write: WriteImage = functools.partial(write_in, corrected)
+            return _Part(raw.inputs, saved, "_aligned.tif", write, json_value(placement.surface.provenance))
         try:
             exported = export_rpc(model).rpc
         except InputError:
             # No RPC represents it: the model file is the only output.
-            return _Part(raw.inputs, saved, (), lambda path: None)
-
-        def write_rpc(path: Path) -> None:
-            write_vrt(open_dataset(scene.path, **self.scene.access), exported, path)
-
-        return _Part(raw.inputs, saved, ("_aligned.vrt",), write_rpc)
+            return _Part(raw.inputs, saved)
+        return _Part(raw.inputs, saved, "_aligned.vrt", functools.partial(_write_rpc, scene, exported, self.scene))
 
     def _configuration(self, part: _Part) -> dict[str, Any]:
         return {
@@ -132,3 +118,24 @@ class Writer:
             "corrections_only": self.corrections_only,
             "output": written_with(self.output),
         }
+
+
+def _write(image: Callable[[Path], None] | None, saved: SavedModel, model: str, folder: Path) -> None:
+    if image is not None:
+        image(folder)
+    write_model_file(saved, folder / model)
+
+
+def _write_moved(scene: Scene, model: ImageCorrection, access: SceneOptions, name: str, folder: Path) -> None:
+    write_moved(open_dataset(scene.path, **access.access), geotransform_of(model), folder / name)
+
+
+def _write_resampled(
+    scene: Scene, model: ImageCorrection, grid: Grid, output: OutputOptions, access: SceneOptions, name: str,
+    folder: Path,
+) -> None:  # fmt: skip
+    write_resampled(scene, model, grid, folder / name, output, access)
+
+
+def _write_rpc(scene: Scene, rpc: RPC, access: SceneOptions, name: str, folder: Path) -> None:
+    write_vrt(open_dataset(scene.path, **access.access), rpc, folder / name)

@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ortho_pipeline.cli.machine.browser import open_option
-from ortho_pipeline.cli.options import click_options, folder_option, grouped_options, json_option, stack_options
+from ortho_pipeline.cli.options import (
+    click_options,
+    executor_option,
+    folder_option,
+    grouped_options,
+    json_option,
+    scheduler_option,
+    shard_option,
+    stack_options,
+    workers_option,
+)
 from ortho_pipeline.cli.parsing import Command
 from ortho_pipeline.cli.printing import print_result, progress
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.options.option import RESAMPLING
+
+if TYPE_CHECKING:
+    from ortho_pipeline.commands.results import Result
 
 
 @click.command(cls=Command)
@@ -25,12 +38,19 @@ from ortho_pipeline.options.option import RESAMPLING
 @open_option
 @click_options("output", OutputOptions, "stac", "nodata", "creation_options", "memory", "threads")
 @click_options("scene", SceneOptions, "allow_network", "roots")
+@executor_option(
+    "How the work is distributed.  [default: this process; processes with --workers; dask with --scheduler]"
+)
+@workers_option
+@scheduler_option
+@shard_option("Match only the K-th of N parts of the pairs.")
 @json_option
 def stack(
     orthos: tuple[str, ...],
     stack: StackOptions,
     resampling: str,
     folder: str,
+    shard: tuple[int, int] | str | None,
     as_json: bool,
     **grouped: Any,
 ) -> None:
@@ -41,10 +61,16 @@ def stack(
     Raw scenes need heights; their pixels are resampled once, with the corrected model. A second run matches only new
     pairs. Dates come from a list with the columns file and date, file names, STAC items, reports or metadata.
     """
+    from ortho_pipeline.batch.shared.arrays import part_of_array
     from ortho_pipeline.batch.stack import command
 
     groups = grouped_options(grouped, "match", "surface", "scene", "output")
     groups["output"] = replace(groups["output"], resampling=resampling)
+    part = part_of_array() if isinstance(shard, str) else shard
+    groups |= {name: grouped[name] for name in ("executor", "workers", "scheduler")}
     with progress() as shown:
-        result = command.stack(orthos, folder, stack, progress=shown, **groups)
+        if part is None:
+            result: Result = command.stack(orthos, folder, stack, progress=shown, **groups)
+        else:
+            result = command.match_part(orthos, folder, part, stack, progress=shown, **groups)
     print_result(result, as_json)

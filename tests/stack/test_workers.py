@@ -1,0 +1,217 @@
+"""`ortho stack` by several workers: processes, parts of a job array, dask, a bucket; killed at any moment."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal
+from rasters import Rasters
+from servers import moto_server, serving
+from test_raw import delivered
+
+from ortho_pipeline.batch import freshness
+from ortho_pipeline.batch.stack.command import match_part, stack
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
+from ortho_pipeline.stores.objects import Objects
+
+gdal.UseExceptions()
+SETTINGS: dict[str, Any] = {
+    "match": MatchOptions(points=120),
+    "surface": SurfaceOptions(height=50.0),
+    "output": OutputOptions(resampling="cubic", threads=1, format="GTiff"),
+}
+WORDS = ["--match-points", "120", "--height", "50", "--threads", "1"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes]]:
+    """A raw scene and three orthos, and what one process makes of them."""
+    folder = tmp_path_factory.mktemp("workers")
+    delivered(folder / "in")
+    for path in Rasters(side=240, dates=4, error=4.0, interval=50.0).write(folder / "more")[2:]:
+        path.rename(folder / "in" / path.name)
+    stack([folder / "in"], folder / "out", **SETTINGS)
+    return folder, contents(folder / "out")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return all outputs without records of their making, which have dates."""
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and "record" not in path.name]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths if not path.name.endswith(".lock")}
+
+
+def test_two_processes_make_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    stack([made[0] / "in"], tmp_path / "out", executor="processes", workers=2, **SETTINGS)
+    assert contents(tmp_path / "out") == made[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--executor", "dask"], "--scheduler: dask needs the address"),
+        (["--executor", "processes", "--scheduler", "tcp://127.0.0.1:1"], "only dask has a scheduler"),
+        (["--shard", "auto"], "the environment describes no job array"),
+        (["--shard", "3/2"], "'3/2' is not K/N"),
+    ],
+)
+def test_workers_that_cannot_be_are_refused(
+    made: tuple[Path, dict[str, bytes]], tmp_path: Path, words: list[str], said: str
+) -> None:
+    result = CliRunner().invoke(cli, ["stack", str(made[0] / "in"), "-o", str(tmp_path / "out"), *WORDS, *words])
+    assert result.exit_code == 2
+    assert said in result.output
+
+
+def test_an_array_of_jobs_makes_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    for number in (2, 3, 1):
+        said = match_part([made[0] / "in"], tmp_path / "out", (number, 3), **SETTINGS)
+        assert said.document["pairs"] == 2
+        assert not (tmp_path / "out" / "stack.json").exists()
+    result = stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
+    assert "6 (6 from an earlier run)" in result.summary
+    assert contents(tmp_path / "out") == made[1]
+    with pytest.raises(InputError, match="no part 4 of 3"):
+        match_part([made[0] / "in"], tmp_path / "out", (4, 3), **SETTINGS)
+
+
+@pytest.mark.slow
+def test_dask_makes_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
+        stack([made[0] / "in"], tmp_path / "out", scheduler=cluster.scheduler_address, **SETTINGS)
+    assert contents(tmp_path / "out") == made[1]
+
+
+def killed(out: Path, images: Path, seconds: float, *words: str) -> None:
+    """Begin a run, and kill it after some time if it has not ended."""
+    command = [sys.executable, "-m", "ortho_pipeline", "stack", str(images), "-o", str(out), *WORDS, *words]
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        running.wait(seconds)
+    except subprocess.TimeoutExpired:
+        os.kill(running.pid, signal.SIGKILL)
+        running.wait()
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_any_moment_resumes(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    drawn = random.Random(4)
+    for words in ([], ["--workers", "2"], []):
+        killed(tmp_path / "out", made[0] / "in", drawn.uniform(1.5, 5.0), *words)
+    stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
+    assert contents(tmp_path / "out") == made[1]
+
+
+# -- object storage and servers ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A bucket, for us and for GDAL."""
+    with moto_server("stacks") as (host, port):
+        at = {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_S3_ENDPOINT": f"{host}:{port}", "AWS_HTTPS": "NO",
+              "AWS_VIRTUAL_HOSTING": "FALSE", "AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test",
+              "AWS_REGION": "us-east-1"}  # fmt: skip
+        for name, value in at.items():
+            monkeypatch.setenv(name, value)
+        yield "s3://stacks/run"
+
+
+FAR: dict[str, Any] = {**SETTINGS, "scene": SceneOptions(allow_network=True)}
+
+
+def test_a_bucket_gets_complete_files(made: tuple[Path, dict[str, bytes]], bucket: str, tmp_path: Path) -> None:
+    match_part([made[0] / "in"], bucket, (1, 2), **FAR)
+    result = stack([made[0] / "in"], bucket, **FAR)
+    assert "6 (3 from an earlier run)" in result.summary
+    assert result.files["json"] == f"{bucket}/stack.json"
+    store = Objects(bucket, allow_network=True)
+    assert fetched(store, tmp_path / "a") == made[1]
+    for name in (f"{name}_delivery.json" for name in ("stack", f"aligned/{result.dates[0].name}")):
+        for file in json.loads(store.read(name, 1 << 20)[0])["files"]:
+            folder = Objects(f"{bucket}/{name}".rpartition("/")[0], allow_network=True)
+            assert folder.read(file["name"], file["bytes"])[1].sha256 == file["sha256"]
+    cube = pytest.importorskip("xarray") and result.to_xarray(chunks=100)
+    assert cube.isel(band=0, y=120, x=120).compute().shape == (4,)
+    # Nothing is made again, and a damaged ortho is.
+    before = dict.fromkeys(store.names())
+    stack([made[0] / "in"], bucket, **FAR)
+    store.put(f"aligned/{result.dates[1].name}_aligned.tif", b"damaged")
+    again = stack([made[0] / "in"], bucket, **FAR)
+    assert "6 (6 from an earlier run)" in again.summary
+    assert dict.fromkeys(store.names()) == before
+    assert fetched(store, tmp_path / "b") == made[1]
+
+
+def fetched(store: Objects, folder: Path) -> dict[str, bytes]:
+    """Return the outputs in a store, without records."""
+    for name, size in store.names():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        store.fetch(name, folder / name, size)
+    found = contents(folder)
+    return {name: data for name, data in found.items() if not name.endswith("_delivery.json")}
+
+
+def test_images_by_url_give_the_same(made: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
+    """A raw scene with its RPC and finished orthos, by a list and one by one."""
+    with serving(made[0] / "in") as server:
+        images = [f"{server.address}/{path.name}" for path in sorted((made[0] / "in").glob("*.tif"))]
+        with pytest.raises(InputError, match="off by default"):
+            stack(images, tmp_path / "out", **SETTINGS)
+        (tmp_path / "list.csv").write_text("\n".join(["file", *images]))
+        stack([tmp_path / "list.csv"], tmp_path / "out", **FAR)
+    found = contents(tmp_path / "out")
+    same = [name for name in made[1] if name.endswith(".tif") or name.startswith("pairs")]
+    assert len(same) == 11
+    assert {name: found[name] for name in same} == {name: made[1][name] for name in same}
+
+
+def test_a_folder_of_a_bucket_is_a_stack(made: tuple[Path, dict[str, bytes]], bucket: str) -> None:
+    images = Objects("s3://stacks/in", allow_network=True)
+    for path in (made[0] / "in").iterdir():
+        images.put(path.name, path)
+    result = stack(["s3://stacks/in/"], bucket, StackOptions(corrections_only=True), **FAR)
+    store = Objects(bucket, allow_network=True)
+    names = {path.name for path in (made[0] / "in").glob("*.tif")}
+    for name, output in result.orthos.items():
+        text = store.read(output.removeprefix(f"{bucket}/"), 1 << 20)[0].decode()
+        assert f"/vsis3/stacks/in/{name}.tif" in text
+        names.remove(f"{name}.tif")
+    assert not names
+    with pytest.raises(InputError, match="cannot refer to an image on this machine"):
+        stack([made[0] / "in"], bucket, StackOptions(corrections_only=True), **FAR)
+
+
+def test_items_in_a_bucket_are_those_of_a_folder(made: tuple[Path, dict[str, bytes]], bucket: str) -> None:
+    output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
+    stack([made[0] / "in"], made[0] / "items", **{**SETTINGS, "output": output})
+    result = stack([made[0] / "in"], bucket, **{**FAR, "output": output})
+    assert result.files["stac"] == f"{bucket}/aligned/catalog.json"
+    aligned = Objects(f"{bucket}/aligned", allow_network=True)
+    names = [path.name for path in (made[0] / "items" / "aligned").glob("*_stac.json")]
+    assert len(names) == 4
+    for name in (*names, "catalog.json"):
+        assert aligned.read(name, 1 << 20)[0] == (made[0] / "items" / "aligned" / name).read_bytes()
+    stack([made[0] / "in"], bucket, **FAR)
+    assert not any("stac" in name or "catalog" in name for name, _ in aligned.names())
+
+
+def test_workers_with_other_software_are_refused(
+    made: tuple[Path, dict[str, bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(freshness, "versions", lambda: {"gdal": "1.0"})
+    with pytest.raises(InputError, match=r"different software versions: gdal 1\.0 instead of"):
+        stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
+    assert not list(tmp_path.rglob("*.record.json"))
