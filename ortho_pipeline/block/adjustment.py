@@ -36,7 +36,7 @@ from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
+from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
@@ -123,7 +123,11 @@ def adjust(
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
     stated_by = stated_accuracies(models) if accuracies is None else accuracies
     problem, gauge = with_datum(problem, state, selection, hold, stated_by)
-    refuse_too_few(problem, selection)
+    try:
+        refuse_too_few(problem, selection)
+    except TooFewPoints:
+        _refuse_many_outside(problem, nowhere, selection, whole)
+        raise
     if problem.unstated.any():
         problem = _started(problem, state, selection)
     common = BlockCommonError.of(problem, state, selection)
@@ -170,7 +174,9 @@ def _first(
     tolerance = NEAR if robust and not problem.unstated.any() else EXACT
     solved = attempt(problem, state, whole, tolerance)
     held = _held(solved, state, selection, whole) if robust else None
-    _refuse_many_outside(solved if held is None else held, whole)
+    near = solved if held is None else held
+    if near.astray is not None:
+        _refuse_many_outside(problem, near.astray, near.without_astray(whole), whole)
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
     if dem_heights is not None:
         solved, dem_heights = dem_heights.settled(solved, inside, _FIRST_ROUNDS)
@@ -195,13 +201,12 @@ def _held(solved: Solved, start: State, selection: Selection, whole: Selection) 
     return held if held.converged and lost < solved.astray.sum() else None
 
 
-def _refuse_many_outside(solved: Solved, whole: Selection) -> None:
+def _refuse_many_outside(problem: BlockProblem, outside: Mask, inside: Selection, whole: Selection) -> None:
     """Refuse a block without control whose rays mostly meet outside of the models: then their heights say nothing."""
-    problem = solved.problem
     of = problem.active(whole)
-    if solved.astray is None or (problem.active(solved.without_astray(whole)) & whole.ground).any():
+    if (problem.active(inside) & whole.ground).any():
         return
-    number = int((solved.astray & of).sum())
+    number = int((outside & of).sum())
     if number > _MOST * of.sum():
         low, high = (side(model.height_limits[k] for model in problem.models) for k, side in ((0, max), (1, min)))
         raise DegeneratePoints(

@@ -12,6 +12,7 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.intersection import Intersection, intersect
 from ortho_pipeline.block.local_frame import GroundFrame
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.base import Array
@@ -158,3 +159,12 @@ def test_sigmas_stated_too_large_do_not_move_heights(rpcs: dict[str, RPC]) -> No
     assert np.nanmedian(misses(found, ground)[:, 2]) == pytest.approx(
         np.nanmedian(misses(start, ground)[:, 2]), abs=0.3
     )
+
+
+def test_a_block_of_parallel_rays_says_so(rpcs: dict[str, RPC]) -> None:
+    """Its ties have no place; that they are too few would mislead."""
+    random = np.random.default_rng(3)
+    views = {"one": rpcs["down"], "other": rpcs["down"]}
+    points = ties(views, ground_of(60, random), bias=5.0, slow=0.0, noise=0.1, random=random)
+    with pytest.raises(DegeneratePoints, match="parallel or meet outside"):
+        adjust(starts(views, "shift"), points)
