@@ -115,6 +115,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
     },
     "More outputs": {
         "orthos": "You want the orthos of a block on one grid, ready for `mosaic`.",
+        "mosaic": "You want one raster of the block.",
         "export": "CARS, Ames Stereo Pipeline or s2p computes a surface from the block.",
         "accuracy-raster": "The accuracy differs over the scene: steep ground, or control in one part only.",
         "visibility": "The view is oblique. With a surface model, `nodata` makes a true ortho.",

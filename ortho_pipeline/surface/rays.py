@@ -107,7 +107,7 @@ def polynomials(values: Array) -> Array:
     values : (..., n, k)
         At the n `levels`.
     """
-    return np.einsum("kl,...la->...ka", _from_values(values.shape[-2]), values)
+    return np.asarray(np.einsum("kl,...la->...ka", _from_values(values.shape[-2]), values))
 
 
 @functools.cache

@@ -249,7 +249,7 @@ def test_a_reference_of_far_away_is_refused(tmp_path):
     left, step, *rest = dataset.GetGeoTransform()
     dataset.SetGeoTransform((left + 5000.0, step, *rest))
     dataset = None
-    assert "does not overlap the scene" in tried(case).refused
+    assert "does not overlap the image" in tried(case).refused
 
 
 def test_the_scene_itself_is_no_reference(tmp_path):

@@ -179,7 +179,7 @@ def test_ties_are_found_where_heights_are_wrong_by_more_than_a_chip(tmp_path):
 def test_scenes_without_common_ground_are_refused(tmp_path):
     _, views = looks(tmp_path, [-5.0, 5.0], side=280)
     away = ImageCorrection(views[1].model, "shift", (0.0, 0.0), np.array([5000.0, 0, 0, 0, 0, 0]))
-    with pytest.raises(InputError, match="no two scenes overlap"):
+    with pytest.raises(InputError, match="no two of these images overlap"):
         tie([views[0], replace(views[1], model=away)], TieSettings(search=25.0))
 
 

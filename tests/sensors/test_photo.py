@@ -305,4 +305,4 @@ def test_photos_that_do_not_overlap_are_an_error(tmp_path):
     words = ["--sensor-option", "vertical=ellipsoid", "--ties", "auto", "--height", "900", "-o", str(tmp_path / "out")]
     done = CliRunner().invoke(cli, ["adjust", *files, *words])
     assert done.exit_code == 2
-    assert "no two scenes overlap" in done.output
+    assert "no two of these images overlap" in done.output

@@ -246,7 +246,7 @@ def _descended(linear: Linear, tolerance: float) -> Solved:
         # Close to the minimum steps are rounding: they do not get shorter any more, or do not descend.
         small = promised <= EXACT * length or (promised <= 1e-6 * length and promised > before / 4)
         small |= promised <= tolerance * length and promised <= _SHRUNK * before
-        small |= promised <= 1e-4 * length and square >= (1 - 1e-8) * min(squares[:-_RESTS], default=math.inf)
+        small |= promised <= 1e-4 * length and square >= min(squares[:-_RESTS], default=math.inf)
         squares.append(square)
         if small and not damping:
             return Solved(linear, step, iteration)

@@ -96,7 +96,7 @@ class _Grid:
         self.of_rays = self._of_rays()
         self.centre = np.zeros(3)
         self._find_centre()
-        # So much better than stated that rounding of the equations drowns the ground: no better than they can tell.
+        # No better than the equations can tell, of the ground as well.
         while not np.isfinite(self.chances(self.centre[None])[0]) and self.centre[0] < 0.0:
             self.centre[0] = min(self.centre[0] + _COARSE, 0.0)
 
@@ -161,6 +161,9 @@ class _Grid:
                 centre[:] = logs[int(np.argmax(self.chances(logs)))]
             node = self._at(centre)
             redundancy = equations.redundancy(node)[0]
+            if not math.isfinite(redundancy):
+                # So much better than stated that rounding of the equations drowns them.
+                return
             if redundancy < _LEAST:
                 centre[0] = 0.0
                 return

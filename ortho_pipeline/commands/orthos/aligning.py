@@ -63,7 +63,7 @@ def align(
     *,
     match: MatchOptions,
     scene: SceneOptions = SceneOptions(),
-    output: OutputOptions = OutputOptions(resampling="cubic"),
+    output: OutputOptions | None = None,
     masks: Sequence[str | os.PathLike[str]] = (),
     band: int | None = None,
     shift_only: bool = False,
@@ -75,6 +75,8 @@ def align(
 
     Parameters
     ----------
+    output : OutputOptions, optional
+        By default cubic resampling, as a COG.
     shift_only : bool
         Correct a shift only. Default: the correction that the matches justify.
     bending : float
@@ -96,6 +98,7 @@ def align(
     'field'
     """
     _refuse_unusable(match, bending)
+    output = OutputOptions(resampling="cubic") if output is None else output
     hidden = [ClassMask.parse(text) for text in masks]
     measured = measure_ortho(ortho, match, scene=scene, masks=hidden, band=band, output=output)
     before = Verified.of(measured).relative().to_json(measured.pixel)
