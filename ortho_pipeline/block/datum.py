@@ -82,7 +82,8 @@ def with_datum(
     typical = float(np.sqrt(np.mean(sigmas**2)))
     slow = SLOW * typical / max(missed, _LEAST_WRONG) if by_ties else 0.0
     held = _held(linear, sigmas, slow)
-    of = f"sigma {_span(sigmas)} px in the image for each parameter ({len(held)} of {problem.size})"
+    assumed = "" if hold is not None or trusted.any() else "assumed "
+    of = f"{assumed}sigma {_span(sigmas)} px in the image, for {len(held)} of {problem.size} parameters"
     if trusted.any() and accuracies:
         stated_m = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
         who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"
@@ -121,11 +122,11 @@ def _why(control: int, by_ties: bool, of: str) -> str:
         return f"{counted(control, 'control point')}, and the orientation is held at its start values ({of})"
     if by_ties:
         return (
-            "no control points: heights and positions are as accurate as the delivered models, no more. "
-            f"Only what the ties show was corrected; the rest stays at its start values ({of})"
+            "no control points: positions and heights are only as accurate as the delivered models. Ties correct the "
+            f"images relative to each other; all else keeps its start value ({of})"
         )
     return (
-        "no control points: heights are those of the DEM, positions as accurate as the delivered models, no more "
+        "no control points: positions are only as accurate as the delivered models, and heights are those of the DEM "
         f"({of})"
     )
 

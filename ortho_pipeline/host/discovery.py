@@ -307,17 +307,18 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
     general = ", ".join(item.name for item in sensors if item.fallback)
     hint = f" (general ones: {general})" if general else ""
     on_map = dataset.GetProjection() and dataset.GetGeoTransform(can_return_null=True) is not None
-    finished = Text("")
+    found, finished = "", Text("")
     if on_map:
-        use = "For a finished ortho use the commands verify or align, or add "
-        finished = Text(". ", use, Setting("scene.ortho"))
+        found = ". It is on a map grid, as a finished ortho is"
+        use = "for a finished ortho use the commands verify or align, or add "
+        finished = Text(use, Setting("scene.ortho"), ". For a raw scene, ")
     return InputError(
-        "no sensor recognises this image: it has no RPC, and no metadata of a known product are next to it",
+        f"no sensor recognises this image: it has no RPC, and no metadata of a known product are next to it{found}",
         file=path,
         remedy=Text(
+            finished,
             "copy the other files of the delivery next to it, or give an RPC file with ",
             Setting("scene.rpc", "FILE"),
-            finished,
             ". To see what a sensor lacks, repeat with ",
             Setting("scene.sensor", "NAME"),
             hint,

@@ -339,7 +339,7 @@ def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) ->
     assert lines[first + 1].startswith("The images agree to 0.")
     assert "tests neither positions nor heights" in lines[first + 1]
     assert lines[first + 2].startswith(
-        "No control points: heights and positions are as accurate as the delivered models"
+        "No control points: positions and heights are only as accurate as the delivered models"
     )
     head = json.loads((tmp_path / "out" / "block_report.json").read_text())["headline"]
     assert (head["figure"], head["height"]) == ("Accuracy unknown", None)
