@@ -123,11 +123,7 @@ def adjust(
     selection, notes = whole.without(nowhere, stated.point), list[Notice]()
     stated_by = stated_accuracies(models) if accuracies is None else accuracies
     problem, gauge = with_datum(problem, state, selection, hold, stated_by)
-    try:
-        refuse_too_few(problem, selection)
-    except TooFewPoints:
-        _refuse_many_outside(problem, nowhere, selection, whole)
-        raise
+    _refuse_too_few(problem, nowhere, selection, whole)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
     common = BlockCommonError.of(problem, state, selection)
@@ -199,6 +195,15 @@ def _held(solved: Solved, start: State, selection: Selection, whole: Selection) 
     held = attempt(with_datum(problem, start, selection, HOLD)[0], start, whole, NEAR)
     lost = 0 if held.astray is None else int(held.astray.sum())
     return held if held.converged and lost < solved.astray.sum() else None
+
+
+def _refuse_too_few(problem: BlockProblem, nowhere: Mask, selection: Selection, whole: Selection) -> None:
+    """Refuse images with too few points, and if these are few because the others have no place, say so."""
+    try:
+        refuse_too_few(problem, selection)
+    except TooFewPoints:
+        _refuse_many_outside(problem, nowhere, selection, whole)
+        raise
 
 
 def _refuse_many_outside(problem: BlockProblem, outside: Mask, inside: Selection, whole: Selection) -> None:

@@ -25,6 +25,7 @@ from ortho_pipeline.cli.options import (
 )
 from ortho_pipeline.cli.parsing import Command, Megabytes
 from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_files, print_json, print_result, progress
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.options import MosaicOptions, SceneOptions
 
@@ -102,7 +103,14 @@ def run(
     from ortho_pipeline.batch.shared.arrays import part_of_array
     from ortho_pipeline.batch.shared.run import SharedFolder
     from ortho_pipeline.batch.summary import summarise
+    from ortho_pipeline.stores.delivery import address_of
 
+    if address is not None and address_of(address) is None:
+        raise InputError(
+            f"{address} is not in object storage",
+            field="output",
+            remedy=f"for a folder on this machine, write it into {pipeline_file}: `output: {address}`",
+        )
     if options["shard"] == "auto":
         options["shard"] = part_of_array()
     planned = batch.plan(pipeline_file, root, allow_network=options["allow_network"])
