@@ -20,8 +20,8 @@ from ortho_pipeline.commands.orthos.dependence import (
     without_heights,
 )
 from ortho_pipeline.commands.orthos.masks import ClassMask
-from ortho_pipeline.commands.orthos.measuring import MeasuredOrtho, measure_ortho, pixel_of
-from ortho_pipeline.commands.orthos.opening import open_ortho
+from ortho_pipeline.commands.orthos.measuring import CELLS, MeasuredOrtho, measure_ortho, pixel_of
+from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import FEWEST_POINTS, Accuracy, Verified, profile
 from ortho_pipeline.commands.resolved.request import Request
@@ -137,7 +137,8 @@ class _Job:
                 opened, self.match, scene=self.scene, masks=self.masks, band=self.band, output=self.output
             )
         errors = self._point_errors(opened)
-        document = document_of(measured or opened, self.match, self._heights(opened), errors)
+        filled = 1.0 if measured else float(filled_of(opened, self.scene, CELLS).mean())
+        document = document_of(measured or opened, self.match, self._heights(opened), errors, filled=filled)
         document["requirements"] = [one.judged(document) for one in self.required]
         return document, measured
 
@@ -172,11 +173,16 @@ def document_of(
     match: MatchOptions,
     surface: Surface | None = None,
     points: PointErrors | None = None,
+    *,
+    filled: float = 1.0,
 ) -> dict[str, Any]:
-    """Return what is published of an ortho: of its matches, or of points alone where it was not matched."""
+    """Return what is published of an ortho: of its matches, or of points alone where it was not matched.
+
+    `filled` is the share of pixels of a scene without matches that have a value.
+    """
     opened = found if isinstance(found, Scene) else found.scene
     pixel = pixel_of(opened)
-    filled = 1.0 if isinstance(found, Scene) else float(found.filled.mean())
+    filled = filled if isinstance(found, Scene) else float(found.filled.mean())
     middle = opened.model.image_to_ground(np.array([[opened.width / 2, opened.height / 2]]), 0.0)
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
