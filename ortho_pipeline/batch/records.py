@@ -159,10 +159,6 @@ class RunRecord(Record):
         complete = not record.facts or {state.role for state in record.outputs} >= _OUTPUTS
         return record if inside and complete else None
 
-    def is_of(self, key: str, folder: Path) -> bool:
-        """Return whether the record has this key, and all its outputs are unchanged."""
-        return self.key == key and self.intact(folder)
-
     def intact(self, folder: Path, checksums: bool = False) -> bool:
         """Return whether all outputs are unchanged; with `checksums` by content, ignoring timestamps."""
         if checksums:

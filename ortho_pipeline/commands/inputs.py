@@ -16,7 +16,7 @@ from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange import crop
 from ortho_pipeline.exchange.model_file import read_model_file
 from ortho_pipeline.files import allowed
-from ortho_pipeline.files.locations import located
+from ortho_pipeline.files.locations import Location, located
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import families
 from ortho_pipeline.options import PathLike, SceneOptions
@@ -72,7 +72,8 @@ def open_scene(image: str | os.PathLike[str], options: SceneOptions = SceneOptio
 
 def _refuse_family(model: PathLike) -> None:
     """Refuse the name of a model family (or a misspelt one) in place of a model file."""
-    if Path(model).suffix or os.path.exists(model):
+    name = os.fspath(model)
+    if Path(name).suffix or name.startswith("/vsi") or Location(name).is_address or os.path.exists(name):
         return
     raise InputError(
         f"there is no model file {os.fspath(model)!r}",

@@ -35,7 +35,7 @@ def metres(value: float) -> str:
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Return a value with some significant digits and without an exponent: 0.48, 14, 1,100."""
+    """Return a value with some significant digits: 0.48, 14, 1,100; with an exponent only below 0.0001."""
     return f"{float(f'{value:.{digits}g}'):,.15g}"
 
 

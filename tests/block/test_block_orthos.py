@@ -15,6 +15,10 @@ from osgeo import gdal
 from skimage.registration import phase_cross_correlation
 
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.block_results import orthos as orthos_of_blocks
+from ortho_pipeline.commands.results import Result
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import MosaicOptions
 from ortho_pipeline.surface.writing import write_dem
 
 
@@ -78,6 +82,17 @@ def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(cli, ["adjust", str(image), "-o", str(tmp_path / "out"), "--points", "x.csv", "--orthos"])
     assert done.exit_code == 2
     assert "--dem" in done.output + done.stderr
+
+
+def test_a_mosaic_that_fails_costs_no_ortho(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*given: Any) -> None:
+        raise InputError("the orthos differ in their bands", remedy="give orthos with the same bands")
+
+    monkeypatch.setattr(orthos_of_blocks, "mosaic_of", refuse)
+    orthos = {"a": {"ortho": tmp_path / "a_ortho.tif"}}
+    result = orthos_of_blocks.with_mosaic(Result(orthos, {}, "text"), orthos, tmp_path / "mosaic.tif", MosaicOptions())
+    assert result.files == orthos
+    assert "differ in their bands" in str(result.failure)
 
 
 # -- real images -----------------------------------------------------------------------------------------------------

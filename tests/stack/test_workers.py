@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from servers import moto_server, serving
 from test_raw import delivered
 
 from ortho_pipeline.batch import freshness
+from ortho_pipeline.batch.records import FileState, RunRecord
 from ortho_pipeline.batch.stack.command import match_part, stack
+from ortho_pipeline.batch.stack.recorded import FileSet
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
@@ -215,3 +218,14 @@ def test_workers_with_other_software_are_refused(
     with pytest.raises(InputError, match=r"different software versions: gdal 1\.0 instead of"):
         stack([made[0] / "in"], tmp_path / "out", **SETTINGS)
     assert not list(tmp_path.rglob("*.record.json"))
+
+
+def test_a_record_is_that_of_a_set_only_with_its_outputs(tmp_path: Path) -> None:
+    """Others can write into a shared folder, and a pair of far images may have failed by a denied access."""
+    near = FileSet("pair", (), {}, {"matches": "pair.json"}, lambda folder: None, may_fail=True)
+    failed = RunRecord(name="pair", key=near.key, status="failed", error={"message": "cannot match"})
+    assert near.is_in(failed)
+    assert not near.is_in(failed.replaced(status="done"))
+    state = FileState(role="image", path="s3://bucket/a.tif", bytes=1, mtime_ns=0, sha256="0" * 64, tag="1")
+    far = replace(near, inputs=(state,))
+    assert not far.is_in(failed.replaced(key=far.key, inputs=far.inputs))

@@ -313,10 +313,9 @@ def _write_documents(record: StackRecord, folder: Path) -> dict[str, Path]:
 
 def _retire_items(store: Objects, names: set[str]) -> None:
     """Remove the items of an earlier run from object storage: they would state its sigmas."""
-    delivery = f"{_ITEMS}_delivery.json"
-    if store.exists(delivery):
-        for name in (delivery, *(f"{_ALIGNED}/{name}" for name in sorted(names))):
-            store.delete(name)
+    # Without the record of their delivery some may be there, too: an upload was interrupted.
+    for name in (f"{_ITEMS}_delivery.json", *(f"{_ALIGNED}/{name}" for name in sorted(names))):
+        store.delete(name)
 
 
 def _with_datum(

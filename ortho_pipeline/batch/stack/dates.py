@@ -214,8 +214,9 @@ def _far_files(address: Location, options: SceneOptions) -> list[_Given]:
     ending = Path(address).suffix.lower()
     if ending in (".csv", ".txt"):
         return _listed(placed_at(address, options), options)
-    is_pattern = any(mark in address for mark in "*?[")
-    if not is_pattern and (address.is_on_web or ending):
+    # A web server has no patterns, and a query follows a question mark.
+    is_pattern = not address.is_on_web and any(mark in address for mark in "*?[")
+    if not is_pattern and (address.is_on_web or (ending and not address.endswith("/"))):
         return [_Given(placed_at(address, options))]
     pattern = address if is_pattern else f"{address.rstrip('/')}/*"
     paths = PipelinePaths(address, None, options.allow_network).matching(pattern, "orthos")

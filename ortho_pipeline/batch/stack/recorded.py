@@ -59,6 +59,14 @@ class FileSet:
         """The key of their record: the same while nothing that they depend on has changed."""
         return key_of(self.inputs, self.configuration, self.software)
 
+    def is_in(self, record: RunRecord) -> bool:
+        """Return whether a record is that of this set; a failure with far files may have been one of access."""
+        if record.key != self.key:
+            return False
+        if record.status == "done":
+            return {state.path for state in record.outputs} == set(self.files.values())
+        return self.may_fail and record.error is not None and not any(state.tag for state in self.inputs)
+
     def made(self, folder: Path) -> RunRecord:
         """Write the files into a folder, and return their record."""
         require_versions(self.software)
@@ -140,9 +148,11 @@ class RecordedFolder:
             found[name] = made
             told(len(found) / len(sets))
 
-        left = []
+        left, folder = [], Path(self.place)
         for one in sets:
-            kept = None if self.is_far else self._kept(one)
+            # Another worker may be writing it: this only reads.
+            record = None if self.is_far or self.rebuild else RunRecord.at(folder / _record_of(one.name))
+            kept = record if record is not None and one.is_in(record) and record.intact(folder) else None
             if kept is None:
                 left.append(one)
             else:
@@ -156,7 +166,7 @@ class RecordedFolder:
     def make(self, one: FileSet) -> Made:
         """Make a set of files unless they are as recorded; called in a worker.
 
-        Two workers that were given the same set make it once.
+        On a disk, two workers that were given the same set make it once. Object storage has no lock: both make it.
         """
         with one_blas_thread():
             if self.is_far:
@@ -174,13 +184,13 @@ class RecordedFolder:
         folder = Path(self.place)
         files = [folder / name for name in one.files.values()]
         record = recorded_at(folder / _record_of(one.name), *files, rebuild=self.rebuild)
-        return record if record is not None and record.is_of(one.key, folder) else None
+        return record if record is not None and one.is_in(record) and record.intact(folder) else None
 
     def _make_far(self, one: FileSet) -> Made:
         """Make the files on this machine and upload them; the record is removed first and written last."""
         store, name = self.store, _record_of(one.name)
         record = None if self.rebuild else _record_in(store, name)
-        if record is not None and record.key == one.key and not change_in_store(store, record):
+        if record is not None and one.is_in(record) and not change_in_store(store, record):
             return Made(record, True)
         store.delete(name)
         with delivered(self.place, one.name, allow_network=self.allow_network, keep=lambda path: True) as delivery:

@@ -151,8 +151,12 @@ def mosaic_of_orthos(
 
 
 def with_mosaic(result: Result, orthos: Mapping[str, Mapping[str, Path]], path: Path, options: MosaicOptions) -> Result:
-    """Return the result of a block with a mosaic of its orthos."""
-    made = mosaic_of([files["ortho"] for files in orthos.values()], path, options)
+    """Return the result of a block with a mosaic of its orthos, or with the reason why there is none."""
+    try:
+        made = mosaic_of([files["ortho"] for files in orthos.values()], path, options)
+    except InputError as error:
+        why = Text("the mosaic could not be made (", error.message, "); the other outputs are complete")
+        return Result(result.files, result.document, result.summary, ReportError(why, remedy=error.remedy))
     text = Text.joined("\n", [result.summary, made.summary])
     files, document = {**result.files, **made.files}, {**result.document, **made.document}
     return Result(files, document, text, result.failure or made.failure)
