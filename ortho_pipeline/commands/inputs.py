@@ -76,7 +76,7 @@ def _refuse_family(model: PathLike) -> None:
     if Path(name).suffix or name.startswith("/vsi") or Location(name).is_address or os.path.exists(name):
         return
     raise InputError(
-        f"there is no model file {os.fspath(model)!r}",
+        f"there is no model file {name!r}",
         field="scene.model",
         remedy=Text(
             "give a <stem>_model.json. To fit a model to points, use ",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -270,13 +270,8 @@ DIFFICULT = {22025: "renewed", 22159: "rounding", 22205: "rounding, silent"}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", DIFFICULT)
-def test_blocks_that_were_difficult_to_solve(tmp_path: Path, seed: int) -> None:
-    path = Path(__file__).parents[2] / "benchmarks" / "heights.py"
-    spec = importlib.util.spec_from_file_location("heights_benchmark", path)
-    assert spec is not None
-    assert spec.loader is not None
-    heights = sys.modules["heights_benchmark"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(heights)
+def test_blocks_that_were_difficult_to_solve(benchmark_module: Callable[[str], Any], tmp_path: Path, seed: int) -> None:
+    heights = benchmark_module("heights")
     block, source = heights.any_block(seed, tmp_path / "dem.tif")
     fit = adjust(block.start, block.points, heights=source, hold=heights.HOLD)
     np.testing.assert_allclose(fit.sigma0, 1.0, atol=0.2)

@@ -113,7 +113,8 @@ def test_a_deliberate_error_is_named(tmp_path, number):
     result = verify(ortho, match=match, surface=surface)
     causes = result.document["causes"]
     assert causes, "no cause"
-    assert kind in {one["code"] for one in causes}, causes
+    # A shift may explain more than the error that comes with it.
+    assert kind == next(one["code"] for one in causes if one["code"] != "shift" or kind == "shift"), causes
     shares = [one["share"] for one in causes]
     assert shares == sorted(shares, reverse=True)
     # The errors of a coarse DEM hardly follow the heights themselves.

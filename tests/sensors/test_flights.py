@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,14 +10,8 @@ import pytest
 
 
 @pytest.fixture(scope="module")
-def flights() -> Any:
-    path = Path(__file__).parents[2] / "benchmarks" / "flights.py"
-    spec = importlib.util.spec_from_file_location("flights", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["flights"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def flights(benchmark_module: Callable[[str], Any]) -> Any:
+    return benchmark_module("flights")
 
 
 @pytest.mark.parametrize("kind", ["exif", "datum"])

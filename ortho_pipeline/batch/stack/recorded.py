@@ -152,7 +152,7 @@ class RecordedFolder:
         for one in sets:
             # Another worker may be writing it: this only reads.
             record = None if self.is_far or self.rebuild else RunRecord.at(folder / _record_of(one.name))
-            kept = record if record is not None and one.is_in(record) and record.intact(folder) else None
+            kept = self._valid(one, record)
             if kept is None:
                 left.append(one)
             else:
@@ -183,8 +183,11 @@ class RecordedFolder:
     def _kept(self, one: FileSet) -> RunRecord | None:
         folder = Path(self.place)
         files = [folder / name for name in one.files.values()]
-        record = recorded_at(folder / _record_of(one.name), *files, rebuild=self.rebuild)
-        return record if record is not None and one.is_in(record) and record.intact(folder) else None
+        return self._valid(one, recorded_at(folder / _record_of(one.name), *files, rebuild=self.rebuild))
+
+    def _valid(self, one: FileSet, record: RunRecord | None) -> RunRecord | None:
+        """Return a record on this machine if it is that of a set, and the files are as it states."""
+        return record if record is not None and one.is_in(record) and record.intact(Path(self.place)) else None
 
     def _make_far(self, one: FileSet) -> Made:
         """Make the files on this machine and upload them; the record is removed first and written last."""
