@@ -294,7 +294,7 @@ class MatchOptions:
             "M",
             kind="number",
             above=0,
-            unset="three times the stated accuracy, else 100, or a quarter of a smaller image",
+            unset="three times the stated accuracy; else 100 (an ortho: or 30 pixels), at most a quarter of the image",
         ),
     ] = None
     search_rotation: Annotated[

@@ -21,7 +21,7 @@ def test_the_code_follows_the_text():
 def test_heights_that_are_off_are_the_remedy_of_a_weak_join():
     weak = {"code": "weak-join", "text": "the relative position is weak"}
     (given,) = signals([], [{**weak, "dem_unused": True}])
-    assert "Repeat without" in given.to_do
+    assert given.to_do.startswith("Use the heights of the DEM")
     (absent,) = signals([], [{**weak, "dem_unused": False}])
     assert absent.to_do.startswith("Give a DEM")
 

@@ -193,7 +193,7 @@ def _signal(notice: Mapping[str, Any]) -> tuple[Level, str, str, str]:
     if notice["code"] == "checks-apart":
         to_do = _about_checks(notice, to_do)
     if notice["code"] == "weak-join" and notice.get("dem_unused"):
-        to_do = Text("Repeat without ", Setting("points.dem_heights", "off"), ", or give control points.")
+        to_do = Text("Use the heights of the DEM (", Setting("points.dem_heights", "on"), "), or give control points.")
     return level, notice["code"], _sentence(notice["text"]), to_do
 
 
