@@ -288,7 +288,9 @@ class Heights:
         square, chance = float(np.mean(residuals[used] ** 2 / variances[used])), math.sqrt(2.0 / used.sum())
         if self.scale == 1.0 and square < 1.0 + _SIGNIFICANT * chance:
             return self
-        scale = max(self.scale * math.sqrt(square), 1.0)
+        # Residuals of little redundancy show little of the errors.
+        shown = float(np.mean(np.minimum(variances[used] / self.sigmas[used] ** 2, 1.0)))
+        scale = max(self.scale * math.sqrt(min(max(1.0 + (square - 1.0) / shown, 0.25), 4.0)), 1.0)
         if abs(scale / self.scale - 1.0) < 2 * _STABLE:
             return self
         return replace(self, scale=scale, spots=None if self.spots is None else replace(self.spots, scale=scale))
