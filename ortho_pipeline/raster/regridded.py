@@ -43,7 +43,13 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
     dataset = open_dataset(path, **access)
     left, dx, skew, top, other, dy = dataset.GetGeoTransform()
     if skew or other:
-        raise InputError("this raster is not north-up", field="geotransform")
+        raise InputError("this raster is not north-up", field="geotransform", remedy="resample it with gdalwarp")
+    if not dataset.GetProjection():
+        raise InputError(
+            "this raster has no coordinate system",
+            field="CRS",
+            remedy="rectify the image, or state its CRS: `gdal_edit.py -a_srs`",
+        )
     crs = parse_crs(dataset.GetProjection())
     return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)
 

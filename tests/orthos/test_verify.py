@@ -298,3 +298,10 @@ def test_a_datum_that_explains_a_shift_is_named():
     there = ground_transform("EPSG:4222", "EPSG:32735")([[27.0, -26.0, 0.0]])[0]
     here = ground_transform("EPSG:4326", "EPSG:32735")([[27.0, -26.0, 0.0]])[0]
     assert datum_of(parse_crs("EPSG:32735"), here, (here - there)[:2], 0.5) == "Cape"
+
+
+def test_a_damaged_ortho_is_not_an_error_of_the_reference(bent, tmp_path):
+    whole = bent[0].read_bytes()
+    (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
+    done = run("verify", tmp_path / "cut.tif", "--reference", bent[1], "-o", tmp_path / "out")
+    assert "cut.tif: the pixels cannot be read" in done.output

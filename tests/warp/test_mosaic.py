@@ -271,3 +271,11 @@ def test_the_most_accurate_ortho_has_each_pixel(tmp_path, landscape):
         write_vrt(lay_out(made, "most-accurate"), tmp_path / "m.vrt")
     with pytest.raises(InputError, match="no accuracy raster"):
         lay_out([made[0], dataclasses.replace(made[1], accuracy=None)], "most-accurate")
+
+
+def test_an_image_without_a_map_grid_is_no_part_of_a_mosaic(tmp_path):
+    path = tmp_path / "raw.tif"
+    gdal.GetDriverByName("GTiff").Create(str(path), 8, 8).FlushCache()
+    done = CliRunner().invoke(cli, ["mosaic", str(path), "-o", str(tmp_path / "mosaic.tif")])
+    assert "raw.tif: CRS: this raster has no coordinate system" in done.output
+    assert "rectify the image" in done.output

@@ -249,7 +249,7 @@ def match_scene(
         memory=memory,
         rotation_deg=rotation_of(scene, options),
     )
-    with _of_references():
+    with _of_references(scene):
         matches = match(view, references, settings)
     paths = tuple(reference.path for reference in references)
     notices = [
@@ -288,7 +288,7 @@ def open_reference_views(
             field="match.reference",
             remedy=Text("give measured control points with ", Setting("points.gcps")),
         )
-    with _of_references():
+    with _of_references(scene):
         references = open_references(options.reference, options.reference_bands or (), **opened.access)
     for reference in references:
         _refuse_scene(scene, reference)
@@ -297,12 +297,13 @@ def open_reference_views(
 
 
 @contextmanager
-def _of_references() -> Iterator[None]:
-    """Name the option that is refused, where that is known of the reference alone."""
+def _of_references(scene: Scene) -> Iterator[None]:
+    """Name the option of what is refused, if that is not the scene."""
     try:
         yield
     except InputError as error:
-        if error.field in (None, "reference"):
+        of_scene = error.file is not None and Path(error.file) in map(Path, scene.rasters or (scene.path,))
+        if error.field in (None, "reference") and not of_scene:
             error.field = "match.reference"
         raise
 
