@@ -72,7 +72,7 @@ def with_datum(
     known = bool(problem.pseudo) or any((~model.constraints().fictitious).any() for model in state.models)
     if hold is None and known and step_of(linear).condition <= CONDITION_LIMIT:
         dem = "" if problem.heights is None else ", the height also from the DEM"
-        return problem, f"no control points: position and height come from the models and their stated accuracy{dem}"
+        return problem, f"no control points: position and height come from the models as delivered{dem}"
     missed = 0.0 if control else _missed(linear)
     stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
     trusted = np.asarray(stated >= missed / _CONTRADICTED)
@@ -84,6 +84,7 @@ def with_datum(
     held = _held(linear, sigmas, slow)
     assumed = "" if hold is not None or trusted.any() else "assumed "
     of = f"{assumed}sigma {_span(sigmas)} px in the image, for {len(held)} of {problem.size} parameters"
+    of += "; other sigmas depend on it" if assumed else ""
     if trusted.any() and accuracies:
         stated_m = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
         who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"

@@ -151,7 +151,8 @@ def adjust(
         accuracies={label: start.accuracy for label, start in starts.items() if start.accuracy is not None},
     )
     # The block has the last word on the accuracy of the DEM.
-    notes = [notice for notice in notes if fit.heights is None or notice.code != "dem-sigma-by-default"]
+    unasked = fit.heights is not None or points.dem_heights == "off"
+    notes = [notice for notice in notes if not unasked or notice.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)

@@ -104,7 +104,7 @@ def summary(record: StackRecord, fresh: int = 0) -> str:
     if after.median_px is not None:
         before = record.closure_before
         lines.append(
-            f"Loops of three pairs close to {after.median_px:.3f} px (median; largest {after.largest_px:.2f} px, "
+            f"Loops of three pairs: misclosure {after.median_px:.3f} px (median; largest {after.largest_px:.2f} px, "
             f"with rejected pairs {before.largest_px:.2f} px)"
         )
     lines.append(f"Moving ground: {counted(len(record.moving), 'area')}; steps: {len(record.steps)}")
