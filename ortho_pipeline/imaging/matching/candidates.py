@@ -145,14 +145,19 @@ def _structure(pixels: NDArray[np.float32], size: int, saturated: float) -> Arra
     valid = np.isfinite(pixels)
     filled = np.where(valid, pixels, 0.0).astype(float)
     down, across = np.gradient(ndimage.gaussian_filter(filled, 1.0))
+    first = size // 2
 
     def mean(values: Array) -> Array:
-        means = ndimage.uniform_filter(values, size, mode="constant", origin=0)
-        first = size // 2
-        return means[first : first + values.shape[0] - size + 1, first : first + values.shape[1] - size + 1]
+        rows = ndimage.uniform_filter1d(values, size, axis=0, mode="constant")
+        rows = rows[first : first + len(values) - size + 1]
+        found = ndimage.uniform_filter1d(rows, size, axis=1, mode="constant")
+        return np.asarray(found[:, first : first + values.shape[1] - size + 1])
 
     xx, yy, xy = mean(across**2), mean(down**2), mean(across * down)
     value = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
-    complete = mean(valid.astype(float)) > 1 - 0.5 / size**2
-    bright = mean((filled >= saturated).astype(float)) > _SATURATED
-    return np.where(complete & ~bright & (value > 0), value, np.nan)
+    usable = value > 0
+    if not valid.all():
+        usable &= mean(valid.astype(float)) > 1 - 0.5 / size**2
+    if filled.max() >= saturated:
+        usable &= mean((filled >= saturated).astype(float)) <= _SATURATED
+    return np.where(usable, value, np.nan)
