@@ -3,10 +3,12 @@
     python benchmarks/stack.py network --seeds 0:20 --dates 40
     python benchmarks/stack.py network --seeds 0:1 --dates 300
     python benchmarks/stack.py images --dates 20 --side 500 --out images.jsonl
+    python benchmarks/stack.py images --dates 20 --side 500 --arosics aro/bin/python
 
 `network` draws edges (tests/stack/networks.py) and runs the network alone. `images` draws rasters
 (tests/stack/rasters.py), matches them and measures misfit, moving ground and time. Misfit is the length of the error
-between any two dates, in px.
+between any two dates, in px. The usual way matches each date with the middle one alone: with our matcher, and with
+AROSICS (the median of its tie points).
 """
 
 from __future__ import annotations
@@ -16,15 +18,19 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from osgeo import gdal
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path += [str(ROOT / "tests" / "matching"), str(ROOT / "tests" / "stack")]
+sys.path += [str(ROOT / "tests" / "matching"), str(ROOT / "tests" / "orthos"), str(ROOT / "tests" / "stack")]
 
 from networks import Truth  # noqa: E402
+from peers import AROSICS, PeerFailed, measured, result_of  # noqa: E402
 from rasters import Rasters  # noqa: E402
 
 from ortho_pipeline.batch.stack.command import stack  # noqa: E402
@@ -112,11 +118,13 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         seconds = time.process_time() - begin
         found = np.array([one["shift_px"] or (np.nan, np.nan) for one in document["dates"]])
         sigma = np.array([one["sigma_px"] or (np.nan, np.nan) for one in document["dates"]])
-        usual = _usual(paths, folder, output)
+        master = given.dates // 2
+        usual = {"usual": _each(paths, master, lambda path: _ours(path, paths[master], folder, output))}
+        if given.arosics:
+            usual["arosics"] = _each(paths, master, lambda path: _arosics(given.arosics, path, paths[master], folder))
     known = kept & np.isfinite(found).all(axis=1)
     errors = (found - true)[known]
     errors = errors - errors.mean(axis=0)
-    usual = (usual - (true - true[given.dates // 2]))[kept]
     cells = np.array([one["place"] for one in document["cells"]])
     moving, tested = (np.array([one[name] for one in document["cells"]]) for name in ("moving", "tested"))
     truth = rasters.moves(cells) & tested
@@ -127,29 +135,44 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         "known": int(known.sum()), "of": int(kept.sum()),
         "spread": float(np.sqrt(((errors / sigma[known]) ** 2).mean())),
         "median": float(np.median(misfit(errors))), "p95": float(np.quantile(misfit(errors), 0.95)),
-        "usual_known": int(np.isfinite(usual).all(axis=1).sum()),
-        "usual_median": float(np.median(misfit(usual[np.isfinite(usual).all(axis=1)]))),
-        "usual_p95": float(np.quantile(misfit(usual[np.isfinite(usual).all(axis=1)]), 0.95)),
+        **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},
         "moving": int(truth.sum()), "moving_found": int((truth & moving).sum()),
         "still_moving": int((~truth & moving).sum()), "steps": len(document["steps"]), "seconds": seconds,
     }  # fmt: skip
 
 
-def _usual(paths: list[Path], folder: Path, output: OutputOptions) -> np.ndarray:
-    """Return shifts of all dates relative to the middle one, each matched with it alone; NaN where that fails."""
+def _of(errors: np.ndarray, kept: np.ndarray) -> dict[str, float]:
+    """Return how many dates have an error ``(T, 2)``, and the misfit between these."""
+    known = errors[kept & np.isfinite(errors).all(axis=1)]
+    apart = misfit(known)
+    return {"known": len(known), "median": float(np.median(apart)), "p95": float(np.quantile(apart, 0.95))}
+
+
+def _each(paths: list[Path], master: int, shift: Callable[[Path], np.ndarray]) -> np.ndarray:
+    """Return shifts of all dates relative to one, each matched with it alone; NaN where that fails."""
     found = np.full((len(paths), 2), np.nan)
-    master = len(paths) // 2
     found[master] = 0.0
     for number, path in enumerate(paths):
-        if number == master:
-            continue
-        match = MatchOptions(reference=(str(paths[master]),), search=60.0)
-        try:
-            done = align(path, folder / "usual", match=match, output=output, resample=False)
-        except OrthoError:
-            continue
-        found[number] = done.document["correction"]["shift_px"]
+        if number != master:
+            with suppress(OrthoError, PeerFailed):
+                found[number] = shift(path)
     return found
+
+
+def _ours(path: Path, master: Path, folder: Path, output: OutputOptions) -> np.ndarray:
+    match = MatchOptions(reference=(str(master),), search=60.0)
+    done = align(path, folder / "usual", match=match, output=output, resample=False)
+    return np.array(done.document["correction"]["shift_px"])
+
+
+def _arosics(python: Path, path: Path, master: Path, folder: Path) -> np.ndarray:
+    """Return the median shift by AROSICS; pixels have one metre."""
+    step = max(8, gdal.Open(str(path)).RasterXSize // 20)
+    found = result_of(measured([python, "-c", AROSICS, master, path, str(step), "60"], folder))
+    if not found["shift"]:
+        raise PeerFailed("no tie points")
+    # Its shifts correct the ortho: the opposite of the displacement. Rows count to the south.
+    return np.array(np.median(found["shift"], axis=0) * (-1.0, 1.0))
 
 
 def main() -> None:
@@ -163,6 +186,7 @@ def main() -> None:
     parser.add_argument("--interval", type=float, default=50.0, help="mean days between images")
     parser.add_argument("--moving", type=float, default=0.2, help="share of the images that moves")
     parser.add_argument("--wrong", action="store_true", help="one date shows another place")
+    parser.add_argument("--arosics", type=Path, help="Python of an environment that has AROSICS")
     parser.add_argument("--out", type=Path, help="a line of JSON for each stack")
     given = parser.parse_args()
     seeds = range(*map(int, given.seeds.split(":")))
