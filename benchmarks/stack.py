@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import sys
 import tempfile
 import time
@@ -113,9 +114,11 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         paths = rasters.write(folder / "in")
-        begin = time.process_time()
-        document = stack([folder / "in"], folder / "out", match=MatchOptions(search=60.0), output=output).document
-        seconds = time.process_time() - begin
+        begin, wall = _cpu(), time.monotonic()
+        with_workers: Any = {"executor": "processes", "workers": given.workers} if given.workers > 1 else {}
+        match = MatchOptions(search=60.0)
+        document = stack([folder / "in"], folder / "out", match=match, output=output, **with_workers).document
+        seconds, wall = _cpu() - begin, time.monotonic() - wall
         found = np.array([one["shift_px"] or (np.nan, np.nan) for one in document["dates"]])
         sigma = np.array([one["sigma_px"] or (np.nan, np.nan) for one in document["dates"]])
         master = given.dates // 2
@@ -138,7 +141,14 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},
         "moving": int(truth.sum()), "moving_found": int((truth & moving).sum()),
         "still_moving": int((~truth & moving).sum()), "steps": len(document["steps"]), "seconds": seconds,
+        "wall": wall, "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }  # fmt: skip
+
+
+def _cpu() -> float:
+    """Return the seconds of processors that this process and its ended children took."""
+    both = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
+    return sum(one.ru_utime + one.ru_stime for one in both)
 
 
 def _of(errors: np.ndarray, kept: np.ndarray) -> dict[str, float]:
@@ -186,6 +196,7 @@ def main() -> None:
     parser.add_argument("--interval", type=float, default=50.0, help="mean days between images")
     parser.add_argument("--moving", type=float, default=0.2, help="share of the images that moves")
     parser.add_argument("--wrong", action="store_true", help="one date shows another place")
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--arosics", type=Path, help="Python of an environment that has AROSICS")
     parser.add_argument("--out", type=Path, help="a line of JSON for each stack")
     given = parser.parse_args()
