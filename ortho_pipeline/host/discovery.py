@@ -317,8 +317,10 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
         file=path,
         remedy=Text(
             finished,
-            "copy the other files of the delivery next to it, or give an RPC file with ",
+            "copy the other files of the delivery next to it, give an RPC file with ",
             Setting("scene.rpc", "FILE"),
+            ", or fit a model to control points with ",
+            Setting("points.fit_model", "NAME"),
             ". To see what a sensor lacks, repeat with ",
             Setting("scene.sensor", "NAME"),
             hint,
