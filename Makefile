@@ -127,7 +127,14 @@ peers: setup
 	given=()
 	for name in rasterio orthority arosics; do
 	    if [ ! -x out/peers/$$name/bin/python ]; then $(PYTHON) -m venv out/peers/$$name; fi
-	    if out/peers/$$name/bin/python -m pip install --quiet $$name; then given+=(--$$name out/peers/$$name/bin/python)
+	    packages=($$name)
+	    if [ $$name = arosics ] && command -v gdal-config > /dev/null; then
+	        # It needs the bindings of GDAL, whose newest release does not fit the system's library.
+	        packages+=("gdal==$$(gdal-config --version)" "numpy<2")
+	        out/peers/$$name/bin/python -m pip install --quiet "setuptools<72" wheel "numpy<2" &&
+	            out/peers/$$name/bin/python -m pip install --quiet --no-build-isolation "$${packages[1]}" || true
+	    fi
+	    if out/peers/$$name/bin/python -m pip install --quiet "$${packages[@]}"; then given+=(--$$name out/peers/$$name/bin/python)
 	    else echo "Skipped: $$name cannot be installed"; fi
 	done
 	$(BIN)/python benchmarks/peers_warp.py "$${given[@]}" --out out/peers/warp.json
