@@ -38,6 +38,7 @@ from ortho_pipeline.batch.stack.command import stack  # noqa: E402
 from ortho_pipeline.block.stack.adjustment import adjust  # noqa: E402
 from ortho_pipeline.commands.orthos.aligning import align  # noqa: E402
 from ortho_pipeline.errors import OrthoError  # noqa: E402
+from ortho_pipeline.imaging.matching.chip_search import SIDE  # noqa: E402
 from ortho_pipeline.options import MatchOptions, OutputOptions  # noqa: E402
 
 #: What `network` draws besides errors of up to 20 px.
@@ -122,7 +123,11 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         found = np.array([one["shift_px"] or (np.nan, np.nan) for one in document["dates"]])
         sigma = np.array([one["sigma_px"] or (np.nan, np.nan) for one in document["dates"]])
         master = given.dates // 2
-        usual = {"usual": _each(paths, master, lambda path: _ours(path, paths[master], folder, output))}
+        usual = (
+            {}
+            if given.alone
+            else {"usual": _each(paths, master, lambda path: _ours(path, paths[master], folder, output))}
+        )
         if given.arosics:
             usual["arosics"] = _each(paths, master, lambda path: _arosics(given.arosics, path, paths[master], folder))
     known = kept & np.isfinite(found).all(axis=1)
@@ -131,6 +136,7 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     cells = np.array([one["place"] for one in document["cells"]])
     moving, tested = (np.array([one[name] for one in document["cells"]]) for name in ("moving", "tested"))
     truth = rasters.moves(cells) & tested
+    still = _still(rasters, cells) & tested
     status = [one["status"] for one in document["pairs"]]
     return {
         "seed": seed, "dates": given.dates, "side": given.side, "pairs": len(status),
@@ -140,9 +146,17 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         "median": float(np.median(misfit(errors))), "p95": float(np.quantile(misfit(errors), 0.95)),
         **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},
         "moving": int(truth.sum()), "moving_found": int((truth & moving).sum()),
-        "still_moving": int((~truth & moving).sum()), "steps": len(document["steps"]), "seconds": seconds,
+        "still": int(still.sum()), "still_moving": int((still & moving).sum()),
+        "partly_moving": int((~truth & ~still & moving).sum()), "steps": len(document["steps"]), "seconds": seconds,
         "wall": wall, "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }  # fmt: skip
+
+
+def _still(rasters: Rasters, cells: np.ndarray) -> np.ndarray:
+    """Tell in which cells ``(n, 2)`` nothing moves, nor within half a chip of them."""
+    reach = np.diff(np.unique(cells[:, 0]))[0] / 2 + SIDE / 2
+    steps = np.stack(np.meshgrid(*2 * [np.linspace(-reach, reach, 21)]), axis=-1).reshape(-1, 2)
+    return np.array([not rasters.moves(cell + steps).any() for cell in cells])
 
 
 def _cpu() -> float:
@@ -196,6 +210,7 @@ def main() -> None:
     parser.add_argument("--interval", type=float, default=50.0, help="mean days between images")
     parser.add_argument("--moving", type=float, default=0.2, help="share of the images that moves")
     parser.add_argument("--wrong", action="store_true", help="one date shows another place")
+    parser.add_argument("--alone", action="store_true", help="without the usual way")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--arosics", type=Path, help="Python of an environment that has AROSICS")
     parser.add_argument("--out", type=Path, help="a line of JSON for each stack")
