@@ -135,6 +135,7 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     errors = errors - errors.mean(axis=0)
     cells = np.array([one["place"] for one in document["cells"]])
     moving, tested = (np.array([one[name] for one in document["cells"]]) for name in ("moving", "tested"))
+    steady = np.array([one["form"] == "steady" for one in document["cells"]])
     truth = rasters.moves(cells) & tested
     still = _still(rasters, cells) & tested
     status = [one["status"] for one in document["pairs"]]
@@ -147,6 +148,7 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},
         "moving": int(truth.sum()), "moving_found": int((truth & moving).sum()),
         "still": int(still.sum()), "still_moving": int((still & moving).sum()),
+        "still_steady": int((still & moving & steady).sum()),
         "partly_moving": int((~truth & ~still & moving).sum()), "steps": len(document["steps"]), "seconds": seconds,
         "wall": wall, "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }  # fmt: skip

@@ -57,12 +57,12 @@ def record_of(
         moving=tuple(_moving(stack, placed, metres)),
         cells=tuple(
             CellRecord(
-                place=_pair(place), tested=bool(tested), moving=bool(moving), rate_px_per_year=_pair(rate),
-                sigma_px_per_year=_pair(np.minimum(sigma, 1e6)),
+                place=_pair(place), tested=bool(tested), moving=bool(moving), form=str(form) if moving else None,
+                rate_px_per_year=_pair(rate), sigma_px_per_year=_pair(np.minimum(sigma, 1e6)),
             )
-            for place, tested, moving, rate, sigma in zip(
-                stack.cells.middles, stack.motion.tested, stack.motion.moving, stack.motion.rate, stack.motion.sigma,
-                strict=True,
+            for place, tested, moving, form, rate, sigma in zip(
+                stack.cells.middles, stack.motion.tested, stack.motion.moving, stack.motion.form, stack.motion.rate,
+                stack.motion.sigma, strict=True,
             )
         ),
         steps=tuple(

@@ -67,7 +67,9 @@ _LOOK: dict[str, str] = {
     "few-check-points": "Use at least 30 check points before you claim an accuracy class.",
     "no-redundancy": "Add points. Until then the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
-    "dem-shifted": Text("If control or check points confirm the images, add ", Setting("points.dem_shift", "estimate"), "."),
+    "dem-shifted": Text(
+        "If control or check points confirm the images, add ", Setting("points.dem_shift", "estimate"), "."
+    ),
     "weak-join": Text(
         "Give a DEM (",
         Setting("surface.dem"),

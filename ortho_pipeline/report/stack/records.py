@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from ortho_pipeline.files.json.records import Count, Pair, Record, Words
 
@@ -68,11 +68,15 @@ class MovingRecord(Record):
 
 
 class CellRecord(Record):
-    """A cell of the map of moving ground; `place` is its middle in pixels of the stack's grid."""
+    """A cell of the map of moving ground; `place` is its middle in pixels of the stack's grid.
+
+    How it moves: steadily, with a step, or yearly.
+    """
 
     place: Pair
     tested: bool
     moving: bool
+    form: Literal["steady", "step", "yearly"] | None
     rate_px_per_year: Pair
     sigma_px_per_year: Pair
 
