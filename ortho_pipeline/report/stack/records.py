@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 from ortho_pipeline.files.json.records import Count, Pair, Record, Words
 
@@ -76,7 +76,7 @@ class CellRecord(Record):
     place: Pair
     tested: bool
     moving: bool
-    form: Literal["steady", "step", "yearly"] | None
+    form: str | None
     rate_px_per_year: Pair
     sigma_px_per_year: Pair
 
