@@ -149,3 +149,13 @@ def test_clear_dates_are_preferred_and_all_stay_connected():
     assert partly[0] < 0.1
     assert partly[1] > 0.3
     np.testing.assert_array_equal(pairs_of(days, clouds=np.full(len(days), np.nan)), plain)
+
+
+@pytest.mark.parametrize(("dates", "least", "most"), [(40, 0.99, 1.05), (5, 1.1, 1.6)])
+def test_many_loops_show_that_edges_are_better_than_stated(dates, least, most):
+    """An error that a pair is said to have in common is believed as far as no loops tell."""
+    made = Truth(seed=3, dates=dates).made()
+    times = made.years.tolist()
+    none = np.median(adjust(made.truth.cells, made.edges, times).sigma)
+    stated = dataclasses.replace(made.edges, alike=np.full(len(made.edges), 0.05))
+    assert least < np.median(adjust(made.truth.cells, stated, times).sigma) / none < most

@@ -35,6 +35,8 @@ _LEAST = 0.1
 _LIMIT = float(chi2.isf(CHANCE, 2))
 #: The constant error of edges is settled if it changes by less than this part of their variance.
 _SMALL = 0.03
+#: What is stated of the error that all values of an edge share counts as much as so many loops.
+_STATED = 10
 #: An edge with a smaller redundancy is in no loop.
 _IN_LOOP = 1e-6
 
@@ -94,18 +96,28 @@ def accepted_edges(
     constant = np.zeros(2)
     if usable.any():
         constant = np.median(left[usable] ** 2, axis=0) / chi2.median(1) - np.median(total[usable], axis=0)
-    constant = np.maximum(constant, 0.0)
+    least = _least(edges, incidence, usable)
+    constant = np.maximum(constant, least)
     accepted = usable & ((left**2 / np.maximum(total + constant, 1e-12)).sum(axis=1) < _LIMIT)
     for _ in range(_ROUNDS):
         closures, more = _closed(edges, incidence, value, both, constant, accepted)
         again = usable & ~(closures.ratio > _LIMIT)
-        better = np.maximum(constant + more, 0.0)
+        better = np.maximum(constant + more, least)
         settled = (again == accepted).all() and (np.abs(better - constant) < _SMALL * total.mean(axis=0)).all()
         constant = better
         if settled:
             break
         accepted = again
     return replace(closures, accepted=accepted), replace(components, constant=constant)
+
+
+def _least(edges: Edges, incidence: sparse.csr_matrix, usable: NDArray[np.bool_]) -> float:
+    """Return the least constant variance of edges: many loops may show less than what is stated of it."""
+    if not usable.any():
+        return 0.0
+    dates = np.unique(np.concatenate([edges.first[usable], edges.second[usable]]))
+    loops = int(usable.sum()) - len(dates) + len(np.unique(_parts(incidence, usable)[dates]))
+    return -float(loops / (loops + _STATED) * edges.alike[usable].min() ** 2)
 
 
 def _shifts(trends: Trends) -> Trends:
