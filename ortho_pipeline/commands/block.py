@@ -140,19 +140,18 @@ def adjust(
     _check_paths(files, images, points, scenes, *models, match=match, surface=surface, further=written)
     scenes, placed = settled_scenes(images, labels, scenes, points, surface)
     gathered = gather(images, labels, scenes, points, match, surface)
-    table, notes = gathered.table, [*placed, *gathered.notices]
-    starts = _starts(images, labels, scenes, points, table)
+    starts = _starts(images, labels, scenes, points, gathered.table)
     fit = adjust_block(
         {label: start.model for label, start in starts.items()},
-        table,
+        gathered.table,
         priors={label: start.priors for label, start in starts.items()},
         hold=points.hold,
         heights=observed(points, surface, gathered.heights),
         accuracies={label: start.accuracy for label, start in starts.items() if start.accuracy is not None},
     )
     # The block has the last word on the accuracy of the DEM.
-    unasked = fit.heights is not None or points.dem_heights == "off"
-    notes = [notice for notice in notes if not unasked or notice.code != "dem-sigma-by-default"]
+    asked = fit.heights is None and points.dem_heights == "on"
+    notes = [one for one in (*placed, *gathered.notices) if asked or one.code != "dem-sigma-by-default"]
     notes += relative_to_reference(fit, points, match)
     plain = {label: _plain(fit.models[label]) for label in labels}
     exported, complaints = _exported(plain, files)

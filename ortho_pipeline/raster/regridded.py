@@ -20,6 +20,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.raster.ortho import Profile
@@ -43,12 +44,16 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
     dataset = open_dataset(path, **access)
     left, dx, skew, top, other, dy = dataset.GetGeoTransform()
     if skew or other:
-        raise InputError("this raster is not north-up", field="geotransform", remedy="resample it with gdalwarp")
+        raise InputError(
+            "this raster is not north-up",
+            field="geotransform",
+            remedy=f"resample it: `gdalwarp {converted(path, 'north_up')}`",
+        )
     if not dataset.GetProjection():
         raise InputError(
             "this raster has no coordinate system",
             field="CRS",
-            remedy="rectify the image, or state its CRS: `gdal_edit.py -a_srs`",
+            remedy=f"rectify the image, or state its CRS: `gdal_edit.py -a_srs CRS {typed(path)}`",
         )
     crs = parse_crs(dataset.GetProjection())
     return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)

@@ -398,7 +398,7 @@ def test_priors_define_the_datum_of_a_block_of_ties(rpcs: dict[str, RPC]) -> Non
         for name, model in truth.items()
     }
     found = adjust(starts(truth), points, priors=priors)
-    assert "stated accuracy" in found.gauge
+    assert "as delivered" in found.gauge
     wanted = np.concatenate([model.params for model in truth.values()])
     assert np.abs(found.values - wanted).max() < 0.5
 

@@ -35,6 +35,7 @@ from ortho_pipeline.commands.sharpening.sharpen import sharpen
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.opening import gate
+from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import RasterSource, open_dataset, open_pixels
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -261,6 +262,25 @@ def _overviews(printed: Printed, folder: Path) -> None:
     side_car.unlink()  # the first half of the remedy
     printed.paste(remedy)
     assert open_dataset(path).GetRasterBand(1).GetOverviewCount()
+
+
+@case("raster", "gdalwarp")
+def _north_up(printed: Printed, folder: Path) -> None:
+    path = tiff(folder / "turned.tif", GREY, dem=True)
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    dataset.SetGeoTransform((530000.0, 20.0, 2.0, 4124000.0, 2.0, -20.0))
+    dataset.FlushCache()
+    del dataset
+    printed.paste(refused(grid_of, path))
+    assert grid_of(folder / "turned_north_up.tif").width >= 200
+
+
+@case("raster", "gdal_edit.py -a_srs")
+def _stated_crs(printed: Printed, folder: Path) -> None:
+    path = tiff(folder / "grey.tif", GREY)
+    gdal.Open(str(path), gdal.GA_Update).SetGeoTransform((530000.0, 20.0, 0.0, 4124000.0, 0.0, -20.0))
+    printed.paste(refused(grid_of, path), CRS="EPSG:32636")
+    assert grid_of(path).crs.to_epsg() == 32636
 
 
 @case("raster", "gdal_edit.py -a_ullr")
