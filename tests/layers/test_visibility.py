@@ -9,7 +9,7 @@ import pyproj
 import pytest
 from blocks import FLOOR, NORTH, WEST, ZONE, City, Parallel, f1, towards
 from osgeo import gdal
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -18,7 +18,7 @@ from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.quality import visibility
 from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
-from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID, Course, find_bounds
 
 #: Streets, a tower, a low house next to it, a long block, and a cliff: half of the square lies 35 m higher.
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (130, 96, 142, 112, 8.0), (30, 150, 150, 162, 18.0)))
@@ -174,6 +174,50 @@ def test_lines_that_end_early_miss_nothing(azimuth, terrain, step, tmp_path, mon
     monkeypatch.setattr(visibility, "_bounds", unbounded)
     np.testing.assert_array_equal(found, Visibility(sight, surface, (60.0, 180.0), 2**30).look(0, 0, 256, 256))
     assert 0.05 < (found == HIDDEN).mean() < 0.9
+
+
+def followed(course: Course, tops: np.ndarray, floors: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Follow lines from the corners of each cell by small steps (rows).
+
+    Return the lowest height of a line that meets no steep cell, and the highest that lies below some floor on its way.
+    """
+    rows, columns = tops.shape
+    down, across = np.meshgrid(np.arange(rows) + 0.0, np.arange(columns), indexing="ij")
+    free, blocked = np.full(tops.shape, -np.inf), np.full(tops.shape, np.inf)
+    for turn in (-course.spread, course.spread):
+        for x, y in np.ndindex(2, 2):
+            met, under = np.full(tops.shape, -np.inf), np.full(tops.shape, -np.inf)
+            for way in np.arange(0, rows, step):
+                j = np.floor(down + np.clip(y, 1e-9, 1 - 1e-9) + course.forward * way).astype(int)
+                i = np.floor(across + np.clip(x, 1e-9, 1 - 1e-9) + (course.aside + turn) * way).astype(int)
+                inside = (0 <= j) & (j < rows) & (0 <= i) & (i < columns)
+                there = np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)
+                met = np.maximum(met, np.where(inside, tops[there] - course.least * way, -np.inf))
+                under = np.maximum(under, np.where(inside, floors[there] - course.most * way, -np.inf))
+            free, blocked = np.maximum(free, met), np.minimum(blocked, under)
+    return free, blocked
+
+
+@pytest.mark.parametrize("forward", [1, -1])
+@pytest.mark.parametrize(("aside", "spread"), [(0.0, 0.0), (0.45, 0.02), (-0.45, 0.02), (1.7, 0.3), (-1.3, 0.45)])
+def test_bounds_of_lines_hold_for_every_line_from_a_cell(forward, aside, spread):
+    """Above one bound no line meets a steep cell, below the other all run into terrain: lines are followed instead."""
+    random, step = np.random.default_rng(8), 1 / 12
+    heights = np.kron(random.uniform(0, 9, (6, 3)) ** 2, np.ones((5, 14)))
+    corners = heights[:-1, :-1], heights[:-1, 1:], heights[1:, :-1], heights[1:, 1:]
+    floors, highest = np.min(corners, axis=0), np.max(corners, axis=0)
+    tops = np.where(highest > floors, highest, -np.inf)
+    course = Course(forward, 0.9, 1.1, aside, spread, 0.0, 40)
+    above, below = np.empty(tops.shape), np.empty(tops.shape)
+    find_bounds(course, heights, tops, above, below)
+    free, blocked = followed(course, tops, floors, step)
+    assert (above >= free).all()
+    assert (below <= blocked + course.most * step).all()
+    # They are of use: no farther off than what lines from cells nearby meet.
+    assert (above <= maximum_filter(free, (3, 21)) + 1.0).mean() > 0.99
+    if aside == 0:
+        near = minimum_filter(blocked, (3, 5)) - 2 * course.most - 1e-9
+        assert (below >= near)[1:-1, 2:-2].all()
 
 
 @pytest.mark.slow
