@@ -18,7 +18,7 @@ from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.quality import visibility
 from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import Visibility
-from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID, Course, find_bounds
+from ortho_pipeline.warp.quality.visibility_kernel import HIDDEN, VOID
 
 #: Streets, a tower, a low house next to it, a long block, and a cliff: half of the square lies 35 m higher.
 TOWN = City(((60, 40, 90, 80, 30.0), (120, 100, 128, 110, 60.0), (130, 96, 142, 112, 8.0), (30, 150, 150, 162, 18.0)))
@@ -176,47 +176,49 @@ def test_lines_that_end_early_miss_nothing(azimuth, terrain, step, tmp_path, mon
     assert 0.05 < (found == HIDDEN).mean() < 0.9
 
 
-def followed(course: Course, tops: np.ndarray, floors: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Follow lines from the corners of each cell by small steps (rows).
+def followed(ends: np.ndarray, tops: np.ndarray, floors: np.ndarray, relief: float) -> tuple[np.ndarray, np.ndarray]:
+    """Follow lines of the extreme directions from the corners of each cell, by steps of a tenth of a metre upwards.
 
     Return the lowest height of a line that meets no steep cell, and the highest that lies below some floor on its way.
     """
     rows, columns = tops.shape
     down, across = np.meshgrid(np.arange(rows) + 0.0, np.arange(columns), indexing="ij")
     free, blocked = np.full(tops.shape, -np.inf), np.full(tops.shape, np.inf)
-    for turn in (-course.spread, course.spread):
-        for x, y in np.ndindex(2, 2):
-            met, under = np.full(tops.shape, -np.inf), np.full(tops.shape, -np.inf)
-            for way in np.arange(0, rows, step):
-                j = np.floor(down + np.clip(y, 1e-9, 1 - 1e-9) + course.forward * way).astype(int)
-                i = np.floor(across + np.clip(x, 1e-9, 1 - 1e-9) + (course.aside + turn) * way).astype(int)
-                inside = (0 <= j) & (j < rows) & (0 <= i) & (i < columns)
-                there = np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)
-                met = np.maximum(met, np.where(inside, tops[there] - course.least * way, -np.inf))
-                under = np.maximum(under, np.where(inside, floors[there] - course.most * way, -np.inf))
-            free, blocked = np.maximum(free, met), np.minimum(blocked, under)
+    for k, m, x, y in np.ndindex(2, 2, 2, 2):
+        met, under = np.full(tops.shape, -np.inf), np.full(tops.shape, -np.inf)
+        for rise in np.arange(0, relief, 0.1):
+            j = np.floor(down + np.clip(y, 1e-9, 1 - 1e-9) + ends[k, 1] * rise).astype(int)
+            i = np.floor(across + np.clip(x, 1e-9, 1 - 1e-9) + ends[m, 0] * rise).astype(int)
+            inside = (0 <= j) & (j < rows) & (0 <= i) & (i < columns)
+            there = np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)
+            met = np.maximum(met, np.where(inside, tops[there] - rise, -np.inf))
+            under = np.maximum(under, np.where(inside, floors[there] - rise, -np.inf))
+        free, blocked = np.maximum(free, met), np.minimum(blocked, under)
     return free, blocked
 
 
-@pytest.mark.parametrize("forward", [1, -1])
-@pytest.mark.parametrize(("aside", "spread"), [(0.0, 0.0), (0.45, 0.02), (-0.45, 0.02), (1.7, 0.3), (-1.3, 0.45)])
-def test_bounds_of_lines_hold_for_every_line_from_a_cell(forward, aside, spread):
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize(
+    ("across", "down"),
+    [((0.0, 0.0), (0.9, 1.1)), ((0.4, 0.45), (0.9, 0.95)), ((-0.2, 0.2), (0.9, 1.1)), ((-1.6, -1.2), (0.8, 0.9)),
+     ((1.0, 1.6), (0.9, 1.3))],
+)  # fmt: skip
+def test_bounds_of_lines_hold_for_every_line_from_a_cell(across, down, forward):
     """Above one bound no line meets a steep cell, below the other all run into terrain: lines are followed instead."""
-    random, step = np.random.default_rng(8), 1 / 12
-    heights = np.kron(random.uniform(0, 9, (6, 3)) ** 2, np.ones((5, 14)))
+    ends = np.column_stack([across, down if forward else (-down[1], -down[0])])
+    heights = np.kron(np.random.default_rng(8).uniform(0, 6, (6, 3)) ** 2, np.ones((5, 14)))
+    heights[13, ::9] += 12.0
     corners = heights[:-1, :-1], heights[:-1, 1:], heights[1:, :-1], heights[1:, 1:]
-    floors, highest = np.min(corners, axis=0), np.max(corners, axis=0)
+    floors, highest, relief = np.min(corners, axis=0), np.max(corners, axis=0), float(np.ptp(heights))
     tops = np.where(highest > floors, highest, -np.inf)
-    course = Course(forward, 0.9, 1.1, aside, spread, 0.0, 40)
-    above, below = np.empty(tops.shape), np.empty(tops.shape)
-    find_bounds(course, heights, tops, above, below)
-    free, blocked = followed(course, tops, floors, step)
+    above, below = visibility._bounds(heights, tops, highest.max(), (ends[0], ends[1]), relief, 0.0)
+    free, blocked = followed(ends, tops, floors, relief)
     assert (above >= free).all()
-    assert (below <= blocked + course.most * step).all()
+    assert (below <= blocked + 0.1).all()
     # They are of use: no farther off than what lines from cells nearby meet.
-    assert (above <= maximum_filter(free, (3, 21)) + 1.0).mean() > 0.99
-    if aside == 0:
-        near = minimum_filter(blocked, (3, 5)) - 2 * course.most - 1e-9
+    assert (above <= maximum_filter(free, (3, 21)) + 1.0).mean() > 0.98
+    if not any(across):
+        near = minimum_filter(blocked, (3, 5)) - 2 / down[0] - 0.2
         assert (below >= near)[1:-1, 2:-2].all()
 
 
