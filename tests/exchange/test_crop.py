@@ -85,6 +85,19 @@ def test_a_crop_by_gdal_is_not_moved_twice(tiny, tmp_path):
     assert not [text for text in scene.warnings if "crop" in text]
 
 
+@pytest.mark.parametrize("corner", [(0.0, 140.0), (190.0, 0.0)])
+def test_a_crop_along_an_edge_is_decided_in_the_other_direction(tiny, tmp_path, corner):
+    """In one direction the range of the RPC is possible for the crop and for the whole; in the other it is not."""
+    path = cut(tiny, tmp_path / "crop.tif", (corner[0], 1, 0, corner[1], 0, 1))
+    for model, belongs in ((tiny.model, True), (tiny.model.shifted(*corner), False)):
+        write_rpc_txt(model, tmp_path / "elsewhere_RPC.TXT")
+        scene = open_scene(path, SceneOptions(rpc=tmp_path / "elsewhere_RPC.TXT"))
+        expected = tiny.model.image_to_ground([[50.0 + corner[0], 30.0 + corner[1]]], 500.0)
+        np.testing.assert_allclose(ground_of(scene), expected, atol=1e-9)
+        shifted = [text for text in scene.warnings if "shifted to the crop (its range is too small" in text]
+        assert len(shifted) == belongs
+
+
 def test_the_place_by_hand_counts_more(tiny, whole, tmp_path):
     bare = cut(tiny, tmp_path / "bare.tif", None)
     scene = open_scene(bare, SceneOptions(rpc=whole, crop_offset=CORNER))

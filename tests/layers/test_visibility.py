@@ -189,7 +189,7 @@ def followed(ends: np.ndarray, tops: np.ndarray, floors: np.ndarray, relief: flo
         for rise in np.arange(0, relief, 0.1):
             j = np.floor(down + np.clip(y, 1e-9, 1 - 1e-9) + ends[k, 1] * rise).astype(int)
             i = np.floor(across + np.clip(x, 1e-9, 1 - 1e-9) + ends[m, 0] * rise).astype(int)
-            inside = (0 <= j) & (j < rows) & (0 <= i) & (i < columns)
+            inside = (j >= 0) & (j < rows) & (i >= 0) & (i < columns)
             there = np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)
             met = np.maximum(met, np.where(inside, tops[there] - rise, -np.inf))
             under = np.maximum(under, np.where(inside, floors[there] - rise, -np.inf))

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ortho_pipeline.models import RPC, Pieces
+from ortho_pipeline.models import RPC, FrameCamera, Pieces
+from ortho_pipeline.models.frame.camera import MAP
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.mosaicked import relative_scale
 from ortho_pipeline.testing import check_sensor_model
 
 
@@ -40,3 +43,17 @@ def test_slopes_at_a_seam_are_those_of_the_piece() -> None:
     assert np.allclose(partials[:, 0, 0], 1e5)
     assert np.allclose(partials[:, 1, 1], -1e5)
     assert np.isnan(pieces.ground_partials([[0.0, 80.0, 500.0]])).all()
+
+
+@pytest.mark.parametrize("side", [0.3, 5.0])
+def test_the_scale_of_a_model_is_that_of_its_pixels_in_metres(side: float) -> None:
+    """Frame cameras over one place, in a CRS of metres: an image with twice the focal length has half the pixels."""
+    fine, coarse = (
+        FrameCamera.from_map(
+            Interior(1000, 1000, focal, 1e-5, 1e-5), "EPSG:32633", [500e3, 4e6, side / 1e-5, 0.0, 0.0, 0.0],
+            frame=MAP, heights=(-5.0, 5.0),
+        )
+        for focal in (2.0, 1.0)
+    )  # fmt: skip
+    assert relative_scale(fine, coarse, (1000, 1000)) == pytest.approx(2.0, rel=1e-6)
+    assert relative_scale(coarse, fine, (1000, 1000)) == pytest.approx(0.5, rel=1e-6)

@@ -12,12 +12,13 @@ import shapely
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.exchange.rpc import export_rpc
+from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay
+from ortho_pipeline.surface.footprint import Footprint, choose_grid, ground_sample_distance, lay
 from ortho_pipeline.surface.writing import write_dem
 
 CRS, X, Y = "EPSG:32651", 300_000.0, 2_700_000.0
@@ -30,6 +31,15 @@ def drone(tilt: float = 0.0) -> FrameCamera:
     interior = Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5)
     exterior = [X, Y, FLYING, np.radians(tilt), 0.0, 0.0]
     return FrameCamera.from_map(interior, CRS, exterior, frame=MAP, heights=(-800.0, 100.0))
+
+
+@pytest.mark.parametrize("heading", [0.0, 20.0, 45.0, 120.0])
+def test_a_pixel_has_the_same_size_whichever_way_the_camera_is_turned(heading):
+    """Focal length 1000 pixels, 120 m above the ground: 0.12 m."""
+    interior = Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5)
+    exterior = [X, Y, FLYING, 0.0, 0.0, np.radians(heading)]
+    model = FrameCamera.from_map(interior, CRS, exterior, frame=MAP, heights=(-800.0, 100.0))
+    assert ground_sample_distance(model, parse_crs(CRS), WIDTH, HEIGHT, GROUND) == pytest.approx(0.12, rel=1e-9)
 
 
 def surface(folder: Path, heights: Any = GROUND, west: float = -450.0, **options: Any) -> Surface:
