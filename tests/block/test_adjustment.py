@@ -971,6 +971,11 @@ def test_document_is_json_and_holds_everything(rpcs: dict[str, RPC]) -> None:
     assert document["points"][11]["ground"] == [None, None, None]
     assert set(document["images"]) == set(rpcs)
     assert document["images"]["left"]["rms"]["residuals"]["control"]["n"] == 6
+    # Without p11, and without a ray that is wrong by 300 px.
+    wrong = (points.point == 10) & (points.image == points.images.index("left"))
+    spoiled = replace(points, measured=points.measured + 300.0 * wrong[:, None])
+    images = adjust(starts(truth), spoiled, exclude=["p11"]).to_json()["images"]
+    assert {name: image["rays"] for name, image in images.items()} == {"left": 10, "right": 11, "down": 11}
 
 
 def test_results_are_short_in_a_console_and_tables_in_a_notebook(rpcs: dict[str, RPC]) -> None:

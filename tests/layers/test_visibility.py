@@ -108,6 +108,23 @@ def test_rough_terrain_hides_what_a_dense_walk_finds(azimuth, tmp_path):
     np.testing.assert_array_equal((found[rows, columns] == HIDDEN)[clear], (above > 0)[clear])
 
 
+@pytest.mark.parametrize("lower", [130.0, 400.0])
+def test_terrain_below_the_ellipsoid_hides_as_terrain_above_it(lower, tmp_path):
+    """Parallel rays: what hides what depends on differences of heights alone."""
+    grid, path = City(()).grid(1.0), tmp_path / "dem.tif"
+    sight = Sight(Parallel(*towards(50, 100), 1.0, 256.0), grid)
+    rough(path, 5.0)
+    above = Visibility(sight, open_dem(path, "ellipsoid"), (40.0, 160.0), 2**30).look(0, 0, 256, 256)
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    dataset.WriteArray(dataset.ReadAsArray() - lower)
+    dataset = None
+    low = Visibility(sight, open_dem(path, "ellipsoid"), (40.0 - lower, 160.0 - lower), 2**30)
+    below = low.look(0, 0, 256, 256)
+    assert 0.05 < (above == HIDDEN).mean() < 0.9
+    # Heights are rounded to float32, so that a line that touches may not.
+    assert (above != below).mean() < 1e-3
+
+
 def test_nothing_is_hidden_where_no_slope_is_as_steep_as_the_rays(tmp_path):
     for off_nadir in (10, 30, 45):
         surface = rough(tmp_path / "dem.tif", 0.999 / np.tan(np.radians(off_nadir)))
