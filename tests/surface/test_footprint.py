@@ -16,9 +16,10 @@ from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.surface.footprint import Footprint, choose_grid, ground_sample_distance, lay
+from ortho_pipeline.surface.footprint import Footprint, choose_grid, ground_sample_distance, lay, scene_pixels
 from ortho_pipeline.surface.writing import write_dem
 
 CRS, X, Y = "EPSG:32651", 300_000.0, 2_700_000.0
@@ -65,6 +66,16 @@ def test_a_drone_lies_on_the_ground_and_not_between_guesses(tmp_path):
     assert grid.dx == pytest.approx(0.12)
     xmin, ymin, xmax, ymax = grid.extent
     assert (xmax - xmin, ymax - ymin) == pytest.approx((120.0, 668 * 0.12), abs=0.25)
+
+
+@pytest.mark.parametrize("pixel", [(1.0, 1.0), (0.5, 2.0), (2.0, 0.25)])
+def test_the_pixels_of_a_scene_are_its_ground_over_the_ground_of_a_pixel(tmp_path, pixel):
+    model = drone()
+    found = laid(model, surface(tmp_path))
+    grid = Grid.of_extent(parse_crs(CRS), (X - 200, Y - 200, X + 200, Y + 200), pixel)
+    assert scene_pixels(model, found, grid) == pytest.approx(120 * 668 * 0.12 / (pixel[0] * pixel[1]), rel=0.01)
+    half = Grid.of_extent(parse_crs(CRS), (X, Y - 200, X + 200, Y + 200), pixel)
+    assert scene_pixels(model, found, half) == pytest.approx(60 * 668 * 0.12 / (pixel[0] * pixel[1]), rel=0.01)
 
 
 @pytest.mark.parametrize(("west", "share"), [(-30.0, 0.75), (0.0, 0.5), (30.0, 0.25), (-2.0, 62 / 120)])
