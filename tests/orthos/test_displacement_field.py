@@ -120,3 +120,35 @@ def test_a_rate_is_found_beside_a_trend_with_its_sigma():
         np.testing.assert_allclose(level, (4.0, 1.0), atol=0.4)
         np.testing.assert_allclose(sigmas, 0.2 / np.sqrt(60) / (300 / np.sqrt(12)), rtol=0.5)
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+def test_fields_have_slopes_where_displacements_show_them():
+    """Beyond the last match a plane goes on as a plane, and a constant is as certain as a constant."""
+    random = np.random.default_rng(6)
+    place, noise = random.uniform(0, 1000, (60, 2)), random.normal(0, 0.1, (60, 2))
+    corners = np.array([[-600.0, -600.0], [1600.0, 1600.0]])
+    plane = np.array([[0.004, -0.003], [0.002, 0.005]])
+    draws = DisplacementField.of(place, place @ plane + noise).draws(corners)
+    np.testing.assert_allclose(draws.mean(axis=0), corners @ plane, atol=0.3)
+    constant = DisplacementField.of(place, noise).draws(corners)
+    assert np.abs(np.median(constant, axis=0)).max() < 0.05
+    assert (np.median(np.abs(constant), axis=0) < 0.05).all()
+    finer = DisplacementField.of(place, 1000 * noise).draws(corners)
+    np.testing.assert_allclose(finer, 1000 * constant, rtol=1e-6)
+
+
+def test_size_and_range_of_a_field_are_those_that_it_was_drawn_with():
+    """Means of fields with a standard deviation of 0.5 and an exponential correlation of 400 m; noise of 0.1."""
+    found = []
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        place = random.uniform(0, 5000, (150, 2))
+        distance = np.hypot(*(place[:, None] - place).T)
+        root = np.linalg.cholesky(0.25 * np.exp(-distance / 400.0) + 1e-9 * np.eye(150))
+        value = root @ random.normal(0, 1, (150, 2)) + random.normal(0, 0.1, (150, 2))
+        field = DisplacementField.of(place, value)
+        found.append([field.shared.mean(), field.range.mean(), np.sqrt((field.noise**2 + field.shared**2).mean())])
+    shared, reach, total = np.median(found, axis=0)
+    assert shared == pytest.approx(0.5, abs=0.1)
+    assert 250 < reach < 650
+    assert total == pytest.approx(np.hypot(0.5, 0.1), rel=0.2)
