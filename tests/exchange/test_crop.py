@@ -15,7 +15,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_own
-from ortho_pipeline.exchange.crop import moved, noted_offset
+from ortho_pipeline.exchange.crop import moved, nearer, noted_offset
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.host import open_scene as open_product
@@ -96,6 +96,14 @@ def test_a_crop_along_an_edge_is_decided_in_the_other_direction(tiny, tmp_path, 
         np.testing.assert_allclose(ground_of(scene), expected, atol=1e-9)
         shifted = [text for text in scene.warnings if "shifted to the crop (its range is too small" in text]
         assert len(shifted) == belongs
+
+
+@pytest.mark.parametrize(
+    ("kept", "shifted", "expected"),
+    [(0.0, 500.0, False), (500.0, 0.0, True), (124.0, 126.0, False), (126.0, 124.0, True), (126.0, 374.0, None)],
+)
+def test_evidence_within_a_quarter_of_the_offset_decides(kept, shifted, expected):
+    assert nearer(kept, shifted, (300.0, 400.0)) is expected
 
 
 def test_the_place_by_hand_counts_more(tiny, whole, tmp_path):
