@@ -199,8 +199,12 @@ def relative_scale(model: SensorModel, other: SensorModel, size: tuple[int, int]
     4.0
     """
     ground = other.image_to_ground([[size[0] / 2, size[1] / 2]], other.reference_height)
-    seen, wide, narrow = model.ground_to_image(ground), model.ground_partials(ground), other.ground_partials(ground)
-    areas = [abs(float(np.linalg.det(part[0, :, :2]))) for part in (wide, narrow)]
-    if not (np.isfinite(seen).all() and np.isfinite(areas).all() and min(areas) > 0):
+    if not np.isfinite(model.ground_to_image(ground)).all():
+        return None
+    partials = [one.ground_partials(ground)[0, :, :2] for one in (model, other)]
+    if not np.isfinite(partials).all():
+        return None
+    areas = [abs(float(np.linalg.det(part))) for part in partials]
+    if not min(areas) > 0:
         return None
     return math.sqrt(areas[0] / areas[1])

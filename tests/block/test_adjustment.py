@@ -933,6 +933,23 @@ def test_intersection_closes_and_its_sigmas_are_honest(rpcs: dict[str, RPC]) -> 
     np.testing.assert_allclose((apart / noisy.sigmas).std(axis=0), 1.0, atol=0.12)
 
 
+def test_towers_close_to_the_cameras_are_intersected() -> None:
+    """Cameras at 500 m, meant for heights of 0 to 400 m: a whole step from 200 m to 400 m ends behind the cameras."""
+    utm = "EPSG:32636"
+    plan = ground_transform("EPSG:4979", utm)(np.array([[LON, LAT, 0.0]]))[0]
+    truth: dict[str, SensorModel] = {
+        str(k): FrameCamera(
+            Interior(4000, 4000, 0.02, 1e-5, 1e-5), np.array([plan[0] + 30.0 * k, plan[1], 500.0, 0.0, 0.0, 0.1 * k]),
+            frame="map", ground_crs=utm, heights=(0.0, 400.0), free=(),
+        )
+        for k in range(3)
+    }  # fmt: skip
+    heights = np.linspace(0.0, 400.0, 21)
+    seen = np.column_stack([plan[0] + 30.0 + np.linspace(-40, 40, 21), plan[1] + np.linspace(-30, 30, 21), heights])
+    found = intersect(truth, measured(truth, ground_transform(utm, "EPSG:4979")(seen), "tie"))
+    np.testing.assert_allclose(ground_transform("EPSG:4979", utm)(found.ground), seen, atol=1e-5)
+
+
 def test_models_without_parameters_are_only_intersected(rpcs: dict[str, RPC]) -> None:
     """Direct georeferencing: the biased RPCs as they are, all points check (Table 3 of Willneff et al.)."""
     truth = biased({name: rpcs[name] for name in ("left", "right")}, size=30.0)
@@ -971,6 +988,11 @@ def test_document_is_json_and_holds_everything(rpcs: dict[str, RPC]) -> None:
     assert document["points"][11]["ground"] == [None, None, None]
     assert set(document["images"]) == set(rpcs)
     assert document["images"]["left"]["rms"]["residuals"]["control"]["n"] == 6
+    # Without p11, and without a ray that is wrong by 300 px.
+    wrong = (points.point == 10) & (points.image == points.images.index("left"))
+    spoiled = replace(points, measured=points.measured + 300.0 * wrong[:, None])
+    images = adjust(starts(truth), spoiled, exclude=["p11"]).to_json()["images"]
+    assert {name: image["rays"] for name, image in images.items()} == {"left": 10, "right": 11, "down": 11}
 
 
 def test_results_are_short_in_a_console_and_tables_in_a_notebook(rpcs: dict[str, RPC]) -> None:

@@ -240,6 +240,15 @@ def test_models_are_listed():
     assert all(f"\n{name} " in run("models").stdout for name in names)
 
 
+def test_a_model_needs_two_equations_for_two_parameters(tiny):
+    """A point gives a column and a row; a model without parameters needs one point to say how good it is."""
+    own = {name: least for name, (_, least, _) in available_models(tiny.model).items() if name.startswith("rpc")}
+    assert own == {"rpc": 1, "rpc+shift": 1, "rpc+shift-drift": 2, "rpc+affine": 3}
+    for name, (count, least, dimensions) in available_models().items():
+        assert 2 * least >= count, name
+        assert dimensions in (2, 3)
+
+
 @pytest.mark.parametrize("units", ["px", "m"])
 def test_the_table_has_a_line_per_model_and_a_recommendation(tiny, units):
     given = ["--gcps", tiny.gcps, "--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pyproj
 import pytest
@@ -61,6 +63,9 @@ def test_a_swap_is_named(model, hint):
     with pytest.raises(InputError, match=hint) as caught:
         refuse_swapped(model, points, int(ROWS))
     assert caught.value.remedy.startswith("give ")
+    # The model is 2 px off along both axes.
+    left = float(re.search(r"with this corrected, they are ([\d.]+) px off", str(caught.value))[1])
+    assert left == pytest.approx(2 * np.sqrt(2), abs=0.5)
 
 
 def test_right_points_pass(model):

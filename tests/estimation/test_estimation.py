@@ -12,6 +12,7 @@ import pytest
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation.fit import Prior, fit
 from ortho_pipeline.models import RPC, ImageCorrection
+from ortho_pipeline.models.base import Constraints
 from ortho_pipeline.points import Points
 
 TRUTH = {
@@ -155,6 +156,23 @@ def test_priors_are_observations(rpc):
     # Four observations of sigma 1 against one of sigma 0.5: equal weights.
     assert equal.values[0] == pytest.approx(free.values[0] / 2, abs=1e-9)
     assert equal.redundancy == free.redundancy + 1
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.5, 20.0])
+def test_constraints_of_a_model_are_observations(rpc, sigma):
+    """A shift that was observed as well is the mean of both, by their weights."""
+
+    class Observed(ImageCorrection):
+        def constraints(self) -> Constraints:
+            return Constraints(np.array([1.0 - self.params[0]]), np.array([[1.0, 0.0]]), np.array([sigma]))
+
+    points = make_points(rpc, count=4)
+    free = fit(start(rpc), points, robust=False)
+    found = fit(Observed(rpc, "shift", (500, 400), start(rpc).coefficients), points, robust=False)
+    weights = np.array([4.0, sigma**-2])
+    assert found.values[0] == pytest.approx(weights @ [free.values[0], 1.0] / weights.sum(), abs=1e-9)
+    assert found.values[1] == pytest.approx(free.values[1], abs=1e-9)
+    assert found.redundancy == free.redundancy + 1
 
 
 def test_a_prior_for_nothing_is_refused(rpc):

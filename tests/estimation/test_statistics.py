@@ -7,10 +7,22 @@ import json
 import numpy as np
 import pyproj
 import pytest
+from scipy.stats import f
 
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.family_fit import fit_family
-from ortho_pipeline.estimation.statistics import correlation_of, squared_distances, student_of, total_correlation_of
+from ortho_pipeline.estimation.statistics import (
+    basis_of,
+    chance_of,
+    correlation_of,
+    effective_parameters,
+    left_out,
+    rms,
+    squared_distances,
+    student_of,
+    total_correlation_of,
+    unit_weight,
+)
 from ortho_pipeline.points import Points
 from ortho_pipeline.points.selection import select_control
 
@@ -160,3 +172,52 @@ def test_squared_distances_are_those_in_whitened_coordinates():
     residuals = np.einsum("nij,nj->ni", root, standard)
     found = squared_distances(residuals, root @ root.transpose(0, 2, 1))
     np.testing.assert_allclose(found, (standard**2).sum(axis=1), rtol=1e-10)
+
+
+def test_parts_left_out_are_as_far_as_refits_without_them_predict():
+    """Pairs of a linear fit: the misfit of a pair is its distance from the fit to all others."""
+    random = np.random.default_rng(2)
+    design, value = random.normal(0, 1, (16, 5)), random.normal(0, 1, 16)
+    hat = design @ np.linalg.pinv(design)
+    residual = value - hat @ value
+    pairs = np.arange(16).reshape(8, 2)
+    redundancy = np.array([(np.eye(16) - hat)[np.ix_(pair, pair)] for pair in pairs])
+    found = left_out(redundancy, residual[pairs], known=1e-9)
+    for k, pair in enumerate(pairs):
+        rest = np.setdiff1d(np.arange(16), pair)
+        refit = np.linalg.lstsq(design[rest], value[rest], rcond=None)[0]
+        np.testing.assert_allclose(found.misfits[k], value[pair] - design[pair] @ refit, atol=1e-9)
+        # What the sum of squares loses without the pair.
+        lost = residual @ residual - ((value[rest] - design[rest] @ refit) ** 2).sum()
+        assert found.squares[k] == pytest.approx(lost)
+    assert found.known.all()
+    np.testing.assert_array_equal(found.rank, 2)
+    np.testing.assert_array_equal(found.whole, found.misfits)
+
+
+def test_directions_that_only_a_part_itself_determines_are_unknown():
+    redundancy = np.array([np.diag([0.5, 0.0]), np.zeros((2, 2)), np.diag([0.5, 0.05])])
+    found = left_out(redundancy, np.array([[1.0, 0.0], [0.0, 0.0], [1.0, 0.1]]), known=1e-6, testable=0.1)
+    np.testing.assert_allclose(found.misfits, [[2.0, 0.0], [np.nan, np.nan], [2.0, 2.0]])
+    np.testing.assert_array_equal(np.isnan(found.whole).all(axis=1), [True, True, False])
+    np.testing.assert_array_equal(found.rank, [1, 0, 1])
+    np.testing.assert_allclose(found.squares, [2.0, 0.0, 2.0])
+
+
+def test_small_figures_are_by_their_definitions():
+    assert rms(np.array([3.0, -4.0, np.nan])) == pytest.approx(np.sqrt(12.5))
+    assert rms(np.array([np.nan])) == 0.0
+    assert unit_weight(8.0, 2.0, 0.5) == 2.0
+    assert unit_weight(8.0, 0.5, 0.5) is None
+    np.testing.assert_allclose(chance_of([3.0, 8.0], [2, 3], [10, 4.5]), f.sf([1.5, 8 / 3], [2, 3], [10, 4.5]))
+    random = np.random.default_rng(1)
+    columns = random.normal(0, 1, (9, 3)) @ random.normal(0, 1, (3, 5))
+    basis = basis_of(columns)
+    assert basis.shape == basis_of(1e6 * columns).shape == basis_of(1e-6 * columns).shape == (9, 3)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(basis @ (basis.T @ columns), columns, atol=1e-12)
+    # A ridge that is as heavy as the observations halves what these determine.
+    design = np.linalg.qr(random.normal(0, 1, (9, 4)))[0]
+    rows = np.eye(4)
+    cofactors = np.linalg.inv(design.T @ design + rows.T @ rows)
+    assert effective_parameters(4, [(rows[:1], cofactors), (rows[1:], cofactors)]) == pytest.approx(2.0)

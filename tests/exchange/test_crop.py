@@ -15,7 +15,7 @@ from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_own
-from ortho_pipeline.exchange.crop import moved, noted_offset
+from ortho_pipeline.exchange.crop import moved, nearer, noted_offset
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.host import open_scene as open_product
@@ -83,6 +83,27 @@ def test_a_crop_by_gdal_is_not_moved_twice(tiny, tmp_path):
     scene = open_scene(crop)
     np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
     assert not [text for text in scene.warnings if "crop" in text]
+
+
+@pytest.mark.parametrize("corner", [(0.0, 140.0), (190.0, 0.0)])
+def test_a_crop_along_an_edge_is_decided_in_the_other_direction(tiny, tmp_path, corner):
+    """In one direction the range of the RPC is possible for the crop and for the whole; in the other it is not."""
+    path = cut(tiny, tmp_path / "crop.tif", (corner[0], 1, 0, corner[1], 0, 1))
+    for model, belongs in ((tiny.model, True), (tiny.model.shifted(*corner), False)):
+        write_rpc_txt(model, tmp_path / "elsewhere_RPC.TXT")
+        scene = open_scene(path, SceneOptions(rpc=tmp_path / "elsewhere_RPC.TXT"))
+        expected = tiny.model.image_to_ground([[50.0 + corner[0], 30.0 + corner[1]]], 500.0)
+        np.testing.assert_allclose(ground_of(scene), expected, atol=1e-9)
+        shifted = [text for text in scene.warnings if "shifted to the crop (its range is too small" in text]
+        assert len(shifted) == belongs
+
+
+@pytest.mark.parametrize(
+    ("kept", "shifted", "expected"),
+    [(0.0, 500.0, False), (500.0, 0.0, True), (124.0, 126.0, False), (126.0, 124.0, True), (126.0, 374.0, None)],
+)
+def test_evidence_within_a_quarter_of_the_offset_decides(kept, shifted, expected):
+    assert nearer(kept, shifted, (300.0, 400.0)) is expected
 
 
 def test_the_place_by_hand_counts_more(tiny, whole, tmp_path):

@@ -86,6 +86,17 @@ def test_on_the_same_grid_pixels_are_taken_over(town, tmp_path, nodata):
     assert result.valid_pixels == there.sum()
 
 
+@pytest.mark.parametrize(("wide", "high"), [(1, 2), (3, 1)])
+def test_pixels_that_differ_in_one_direction_are_another_grid(tmp_path, wide, high):
+    grid = Grid(TOWN.grid().crs, 500_000.0, 4_100_000.0, 1.0, 1.0, 36, 24)
+    own = Grid(grid.crs, grid.left, grid.top, wide * grid.dx, high * grid.dy, 36 // wide, 24 // high)
+    other = Regridded(other_ortho(tmp_path / "other.tif", own), grid, resampling="nearest")
+    pixels, valid = other.read(0, 0, 36, 24)
+    theirs, good = (np.kron(part, np.ones((high, wide), part.dtype)) for part in read(tmp_path / "other.tif"))
+    np.testing.assert_array_equal(valid[0], good)
+    np.testing.assert_array_equal(pixels[0][good], theirs[good])
+
+
 @pytest.mark.parametrize("step", [0.5, 0.21])
 def test_on_another_grid_pixels_are_gdals(town, tmp_path, step, monkeypatch):
     """An ortho in degrees, of the same size and of much smaller pixels: as GDAL's warper makes all of it at once."""

@@ -9,7 +9,7 @@ import pyproj
 import pytest
 from blocks import FLOOR, NORTH, WEST, ZONE, City, Parallel, f1, towards
 from osgeo import gdal
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -108,6 +108,23 @@ def test_rough_terrain_hides_what_a_dense_walk_finds(azimuth, tmp_path):
     np.testing.assert_array_equal((found[rows, columns] == HIDDEN)[clear], (above > 0)[clear])
 
 
+@pytest.mark.parametrize("lower", [130.0, 400.0])
+def test_terrain_below_the_ellipsoid_hides_as_terrain_above_it(lower, tmp_path):
+    """Parallel rays: what hides what depends on differences of heights alone."""
+    grid, path = City(()).grid(1.0), tmp_path / "dem.tif"
+    sight = Sight(Parallel(*towards(50, 100), 1.0, 256.0), grid)
+    rough(path, 5.0)
+    above = Visibility(sight, open_dem(path, "ellipsoid"), (40.0, 160.0), 2**30).look(0, 0, 256, 256)
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    dataset.WriteArray(dataset.ReadAsArray() - lower)
+    dataset = None
+    low = Visibility(sight, open_dem(path, "ellipsoid"), (40.0 - lower, 160.0 - lower), 2**30)
+    below = low.look(0, 0, 256, 256)
+    assert 0.05 < (above == HIDDEN).mean() < 0.9
+    # Heights are rounded to float32, so that a line that touches may not.
+    assert (above != below).mean() < 1e-3
+
+
 def test_nothing_is_hidden_where_no_slope_is_as_steep_as_the_rays(tmp_path):
     for off_nadir in (10, 30, 45):
         surface = rough(tmp_path / "dem.tif", 0.999 / np.tan(np.radians(off_nadir)))
@@ -174,6 +191,52 @@ def test_lines_that_end_early_miss_nothing(azimuth, terrain, step, tmp_path, mon
     monkeypatch.setattr(visibility, "_bounds", unbounded)
     np.testing.assert_array_equal(found, Visibility(sight, surface, (60.0, 180.0), 2**30).look(0, 0, 256, 256))
     assert 0.05 < (found == HIDDEN).mean() < 0.9
+
+
+def followed(ends: np.ndarray, tops: np.ndarray, floors: np.ndarray, relief: float) -> tuple[np.ndarray, np.ndarray]:
+    """Follow lines of the extreme directions from the corners of each cell, by steps of a tenth of a metre upwards.
+
+    Return the lowest height of a line that meets no steep cell, and the highest that lies below some floor on its way.
+    """
+    rows, columns = tops.shape
+    down, across = np.meshgrid(np.arange(rows) + 0.0, np.arange(columns), indexing="ij")
+    free, blocked = np.full(tops.shape, -np.inf), np.full(tops.shape, np.inf)
+    for k, m, x, y in np.ndindex(2, 2, 2, 2):
+        met, under = np.full(tops.shape, -np.inf), np.full(tops.shape, -np.inf)
+        for rise in np.arange(0, relief, 0.1):
+            j = np.floor(down + np.clip(y, 1e-9, 1 - 1e-9) + ends[k, 1] * rise).astype(int)
+            i = np.floor(across + np.clip(x, 1e-9, 1 - 1e-9) + ends[m, 0] * rise).astype(int)
+            inside = (j >= 0) & (j < rows) & (i >= 0) & (i < columns)
+            there = np.clip(j, 0, rows - 1), np.clip(i, 0, columns - 1)
+            met = np.maximum(met, np.where(inside, tops[there] - rise, -np.inf))
+            under = np.maximum(under, np.where(inside, floors[there] - rise, -np.inf))
+        free, blocked = np.maximum(free, met), np.minimum(blocked, under)
+    return free, blocked
+
+
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize(
+    ("across", "down"),
+    [((0.0, 0.0), (0.9, 1.1)), ((0.4, 0.45), (0.9, 0.95)), ((-0.2, 0.2), (0.9, 1.1)), ((-1.6, -1.2), (0.8, 0.9)),
+     ((1.0, 1.6), (0.9, 1.3))],
+)  # fmt: skip
+def test_bounds_of_lines_hold_for_every_line_from_a_cell(across, down, forward):
+    """Above one bound no line meets a steep cell, below the other all run into terrain: lines are followed instead."""
+    ends = np.column_stack([across, down if forward else (-down[1], -down[0])])
+    heights = np.kron(np.random.default_rng(8).uniform(0, 6, (6, 3)) ** 2, np.ones((5, 14)))
+    heights[13, ::9] += 12.0
+    corners = heights[:-1, :-1], heights[:-1, 1:], heights[1:, :-1], heights[1:, 1:]
+    floors, highest, relief = np.min(corners, axis=0), np.max(corners, axis=0), float(np.ptp(heights))
+    tops = np.where(highest > floors, highest, -np.inf)
+    above, below = visibility._bounds(heights, tops, highest.max(), (ends[0], ends[1]), relief, 0.0)
+    free, blocked = followed(ends, tops, floors, relief)
+    assert (above >= free).all()
+    assert (below <= blocked + 0.1).all()
+    # They are of use: no farther off than what lines from cells nearby meet.
+    assert (above <= maximum_filter(free, (3, 21)) + 1.0).mean() > 0.98
+    if not any(across):
+        near = minimum_filter(blocked, (3, 5)) - 2 / down[0] - 0.2
+        assert (below >= near)[1:-1, 2:-2].all()
 
 
 @pytest.mark.slow

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from ortho_pipeline.models import RPC, Pieces
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.models import RPC, FrameCamera, Pieces
+from ortho_pipeline.models.frame.camera import MAP
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.models.mosaicked import relative_scale
 from ortho_pipeline.testing import check_sensor_model
 
 
@@ -40,3 +46,51 @@ def test_slopes_at_a_seam_are_those_of_the_piece() -> None:
     assert np.allclose(partials[:, 0, 0], 1e5)
     assert np.allclose(partials[:, 1, 1], -1e5)
     assert np.isnan(pieces.ground_partials([[0.0, 80.0, 500.0]])).all()
+
+
+@pytest.mark.parametrize("side", [0.3, 5.0])
+def test_the_scale_of_a_model_is_that_of_its_pixels_in_metres(side: float) -> None:
+    """Frame cameras over one place, in a CRS of metres: an image with twice the focal length has half the pixels."""
+    fine, coarse = (
+        FrameCamera.from_map(
+            Interior(1000, 1000, focal, 1e-5, 1e-5), "EPSG:32633", [500e3, 4e6, side / 1e-5, 0.0, 0.0, 0.0],
+            frame=MAP, heights=(-5.0, 5.0),
+        )
+        for focal in (2.0, 1.0)
+    )  # fmt: skip
+    assert relative_scale(fine, coarse, (1000, 1000)) == pytest.approx(2.0, rel=1e-6)
+    assert relative_scale(coarse, fine, (1000, 1000)) == pytest.approx(0.5, rel=1e-6)
+
+
+def test_a_point_belongs_to_the_piece_that_it_is_in_or_nearest_to() -> None:
+    """Two rows of pieces, which disagree by some pixels, so that the owner shows."""
+    upper, lower = piece(0.0), dataclasses.replace(piece(0.0), lat_off=9.99, row_off=503.0)
+    pieces = Pieces((upper, lower), ((0.0, 0.0), (0.0, 1000.0)), ((1000, 1000),) * 2)
+    # Rows about the first row of the lower piece, in columns inside and left of both.
+    lat = 10.005 - 1e-5 * np.array([10.0, 990.0, 998.0, 1010.0, 1500.0])
+    for lon in (0.0, -0.00505):
+        ground = np.column_stack([np.full(5, lon), lat, np.full(5, 500.0)])
+        column = 500.0 + lon * 1e5
+        expected = np.array([10.0, 990.0, 998.0, 1013.0, 1503.0])
+        np.testing.assert_allclose(pieces.ground_to_image(ground), np.column_stack([np.full(5, column), expected]))
+
+
+def test_pieces_are_checked_and_copies_hold_them() -> None:
+    first, second = piece(0.0), piece(0.01)
+    made = Pieces([first, second], [(0.0, 0.0), (1000.0, 0.0)], [(1000, 1000)] * 2)
+    assert made.models == (first, second)
+    assert made.first is first
+    assert len(made.corners) == len(first.corners) + len(second.corners)
+    for wrong in (
+        ((), (), ()),
+        ((first, second), ((0.0, 0.0),), ((1000, 1000),) * 2),
+        ((first, second), ((0.0, 0.0),) * 2, ((1000, 1000),)),
+    ):
+        with pytest.raises(InputError, match="each piece needs"):
+            Pieces(*wrong)
+
+
+def test_another_model_that_sees_other_ground_has_no_scale() -> None:
+    seen, half, other = piece(0.0), dataclasses.replace(piece(0.0), col_scale=250.0, row_scale=250.0), piece(90.0)
+    assert relative_scale(seen, half, (500, 500)) == pytest.approx(2.0)
+    assert relative_scale(seen, other, (1000, 1000)) is None

@@ -65,7 +65,13 @@ def test_longitudes_are_counted_as_the_map_counts_them():
     np.testing.assert_allclose(model.ground_to_image([[-160.0, 9.0, 0.0]]), [[10.0, 10.0]], atol=1e-9)
 
 
-@pytest.mark.parametrize("transform", [(0.0, 1.0, 2.0, 0.0, 2.0, 4.0), (1e300, 1e-9, 0.0, 0.0, 0.0, -1e-9)])
+@pytest.mark.parametrize(
+    "transform",
+    [
+        (0.0, 1.0, 2.0, 0.0, 2.0, 4.0), (1e300, 1e-9, 0.0, 0.0, 0.0, -1e-9), (-1e300, 1e-9, 0.0, 0.0, 0.0, -1e-9),
+        (0.0, 1.0, 0.0, 4e6, 0.0, -1e-10), (5e5, 1e-10, 0.0, 4e6, 0.0, -1.0),
+    ],
+)  # fmt: skip
 def test_a_geotransform_that_cannot_be_inverted_is_refused(transform):
     with pytest.raises(InputError, match="cannot be inverted"):
         MapGrid("EPSG:32636", transform, (60, 40))

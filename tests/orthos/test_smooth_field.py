@@ -50,3 +50,39 @@ def test_the_spline_is_that_of_scipy():
 def test_a_field_that_folds_is_refused():
     with pytest.raises(InputError, match="per pixel"):
         field(60.0)
+
+
+def test_the_field_is_its_splines_times_its_coefficients():
+    model = field()
+    image = np.random.default_rng(4).uniform((-40, -40), (640, 440), (60, 2))
+    across, down = model.splines(0, image[:, 0]), model.splines(1, image[:, 1])
+    assert (across.shape, down.shape) == ((60, 9), (60, 7))
+    expected = np.einsum("nr,nc,rcd->nd", down, across, model.coefficients)
+    np.testing.assert_allclose(model.displacement(image), expected, atol=1e-12)
+    # A field of the same coefficients everywhere is constant: splines add up to one.
+    np.testing.assert_allclose(across.sum(axis=1), 1.0)
+    np.testing.assert_allclose(down.sum(axis=1), 1.0)
+
+
+def test_beyond_the_rim_the_field_is_that_of_the_rim():
+    model = field()
+    outside = np.array([[-50.0, 100.0], [700.0, 100.0], [300.0, -9.0], [300.0, 500.0], [900.0, 900.0]])
+    rim = np.clip(outside, 0.0, SIZE)
+    np.testing.assert_array_equal(model.displacement(outside), model.displacement(rim))
+    assert np.isnan(model.displacement([[np.nan, 3.0], [3.0, np.nan]])).all()
+
+
+def test_no_change_per_pixel_is_larger_than_the_bound():
+    model = field()
+    random, step = np.random.default_rng(5), 1e-3
+    image, angle = random.uniform((0, 0), SIZE, (3000, 2)), random.uniform(0, 2 * np.pi, 3000)
+    ahead = image + step * np.column_stack([np.cos(angle), np.sin(angle)])
+    change = np.hypot(*(model.displacement(ahead) - model.displacement(image)).T) / step
+    assert change.max() < model.bending < 4 * change.max()
+    assert model.detail == pytest.approx(400 / 6)
+
+
+@pytest.mark.parametrize("size", [(0, 400), (600, 0), (600,)])
+def test_an_image_without_pixels_has_no_field(size):
+    with pytest.raises(InputError, match="positive size"):
+        SmoothField(GRID, size, np.zeros((4, 4, 2)))

@@ -177,3 +177,26 @@ def test_the_order_of_blocks_does_not_depend_on_the_room_gdal_has(tmp_path, coun
     finally:
         gdal.SetCacheMax(room)
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("resolution", [(1e-10, 1.0), (1.0, 1e-10)])
+def test_an_extent_too_far_from_the_origin_for_its_pixels_is_none(resolution):
+    """2**52 pixels from the origin, a number does not tell one pixel from the next."""
+    crs, extent = parse_crs("EPSG:32633"), (500_000.0, 4_000_000.0, 500_000.0 + 1e-6, 4_000_000.0 + 1e-6)
+    with pytest.raises(InputError, match="is not an extent"):
+        Grid.of_extent(crs, extent, resolution)
+
+
+def test_an_extent_is_widened_to_multiples_of_the_resolution():
+    """Outwards on all sides, as -tap of GDAL; one that is aligned stays."""
+    crs = parse_crs("EPSG:32633")
+    grid = Grid.of_extent(crs, (-7.5, 12.0, 21.0, 30.5), (2.0, 5.0), align=True)
+    assert grid.extent == (-8.0, 10.0, 22.0, 35.0)
+    assert (grid.width, grid.height) == (15, 5)
+    assert Grid.of_extent(crs, grid.extent, (2.0, 5.0), align=True).extent == grid.extent
+    with pytest.raises(InputError, match="is not a pixel size"):
+        Grid.of_extent(crs, grid.extent, (2.0, 0.0))
+    for side in range(4):
+        turned = [value + 100.0 * (k == side) * (1 if side < 2 else -1) for k, value in enumerate(grid.extent)]
+        with pytest.raises(InputError, match="is not an extent"):
+            Grid.of_extent(crs, turned, (2.0, 5.0))

@@ -41,6 +41,19 @@ def test_sigmas_hold_and_dates_agree():
     assert np.quantile(misfit, 0.95) < 0.25
 
 
+@pytest.mark.parametrize(("noise", "of_date", "of_edge"), [(0.15, 0.0, 0.0), (0.15, 0.05, 0.05), (0.05, 0.1, 0.1)])
+def test_errors_of_dates_and_of_edges_are_told_apart(noise, of_date, of_edge):
+    """Half of the noise belongs to dates, half to edges; the smooth errors are as large as they were made."""
+    _, stack = solved(seed=3, dates=16, noise=noise, of_date=of_date, of_edge=of_edge)
+    found = stack.components
+    shared, own = found.shared * np.median(found.scale), found.own * np.median(found.factor)
+    np.testing.assert_allclose(shared.sum(axis=1), (noise / 2) ** 2 + of_date**2, rtol=0.25)
+    np.testing.assert_allclose(own.sum(axis=1), (noise / 2) ** 2 + of_edge**2, rtol=0.25)
+    if not of_date:
+        assert (shared[:, 0] > 0.8 * shared.sum(axis=1)).all()
+        assert (own[:, 0] > 0.8 * own.sum(axis=1)).all()
+
+
 def test_wrong_edges_are_rejected_and_right_ones_kept():
     made, stack = solved(seed=1, dates=20, wrong=0.1)
     assert made.wrong.sum() > 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -149,3 +150,29 @@ def test_masks_are_read_ahead_too(bucket: Path) -> None:
             pixels = source.read(40, 30, 250, 160)
             valid = source.read_valid(40, 30, pixels)
     np.testing.assert_array_equal(valid, truth.read_valid(40, 30, truth.read(40, 30, 250, 160)))
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_pixels_are_kept_up_to_the_memory_and_those_used_longest_ago_go(tmp_path: Path, along: int) -> None:
+    """Nine blocks in a row, of 256 x 256 pixels of two bytes and a byte of validity each; memory for four."""
+    size = [300, 300]
+    size[along] = 9 * 256
+    options = ["TILED=YES", "BLOCKXSIZE=256", "BLOCKYSIZE=256"]
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "row.tif"), *size, 1, gdal.GDT_UInt16, options)
+    made.WriteArray(np.random.default_rng(1).integers(0, 4000, size[::-1], dtype=np.uint16))
+    made = None
+    asked = []
+
+    class Counted(RasterSource):
+        def read(self, *window: int) -> Any:
+            asked.append(window[along] // 256)
+            return super().read(*window)
+
+    truth = RasterSource(tmp_path / "row.tif")
+    with ThreadPoolExecutor(1) as pool:
+        source = ReadAhead(Counted(tmp_path / "row.tif"), 4 * 256 * 256 * 3, pool)
+        for number in (*range(9), 8, 7, 5, 4, 8):
+            place = [10, 10]
+            place[along] = 256 * number + 20
+            np.testing.assert_array_equal(source.read(*place, 50, 60), truth.read(*place, 50, 60))
+    assert asked == [*range(9), 4], "5 to 8 were still there"

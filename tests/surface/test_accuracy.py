@@ -12,8 +12,9 @@ from osgeo import gdal, osr
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, parse_crs
-from ortho_pipeline.surface.accuracy import HeightErrors, check_dem, read_check_heights, slopes_at
+from ortho_pipeline.surface.accuracy import DemAccuracy, HeightErrors, check_dem, read_check_heights, slopes_at, summary
 from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.writing import write_dem
 
 UTM = "EPSG:32634"
 WEST, NORTH, STEP, SIDE = 500_000.0, 4_000_000.0, 10.0, 300
@@ -85,6 +86,54 @@ def test_statistics_are_by_their_definitions():
     # 1.4826 times the median distance is the standard deviation of normal errors, whatever their mean.
     normal = HeightErrors.of(np.random.default_rng(4).normal(7.0, 2.0, 20_000))
     assert normal.nmad == pytest.approx(2.0, rel=0.03)
+
+
+def test_what_is_far_from_the_median_is_gross_whatever_the_bias_is():
+    """Farther than five NMAD; the NMAD is 1.4826 times 0.5 m here, and the DEM is 20 m too high."""
+    usual = 20.0 + np.linspace(-1, 1, 101)
+    differences = np.r_[usual, 20.0 + np.array([3.6, -3.6, 3.9, -3.9]), np.nan]
+    ids = [f"p{k}" for k in range(len(differences))]
+    found = DemAccuracy(ids, differences, np.zeros(len(ids)))
+    assert found.overall.nmad == pytest.approx(1.4826 * 0.52, abs=0.02)
+    assert found.gross() == ["p103", "p104"]
+    assert DemAccuracy(ids[:2], np.array([0.0, 9.0]), np.zeros(2)).gross() == []
+
+
+@pytest.mark.parametrize(("count", "given"), [(1, ()), (2, ()), (3, ("nmad",)), (9, ("nmad",)), (10, ("nmad", "le90"))])
+def test_few_differences_have_few_statistics(count, given):
+    found = HeightErrors.of(np.arange(1.0, count + 1))
+    assert (found.count, found.mean, found.largest) == (count, (count + 1) / 2, count)
+    assert tuple(name for name in ("nmad", "le90") if getattr(found, name) is not None) == given
+
+
+def test_classes_of_slope_begin_at_their_lower_limit():
+    slopes = np.array([0.0, 4.9, 5.0, 9.9, 10.0, 20.0, 29.9, 30.0, 80.0, 5.0, np.nan])
+    differences = np.r_[np.ones(9), np.nan, 1.0]
+    rows = DemAccuracy([str(k) for k in range(11)], differences, slopes).by_slope()
+    limits = [(low, high, errors.count) for low, high, errors in rows]
+    assert limits == [(0.0, 5.0, 2), (5.0, 10.0, 2), (10.0, 20.0, 1), (20.0, 30.0, 2), (30.0, None, 2)]
+
+
+@pytest.mark.parametrize("towards", [0.0, 35.0, 90.0, 200.0])
+def test_a_plane_has_its_slope_whichever_way_it_rises(tmp_path, towards):
+    """A quarter: the tangent of the slope."""
+    east, north = np.sin(np.radians(towards)), np.cos(np.radians(towards))
+    x, y = np.meshgrid(10.0 * np.arange(60), -10.0 * np.arange(60))
+    write_dem(tmp_path / "dem.tif", 900 + 0.25 * (east * x + north * y), (WEST, NORTH), 10.0, UTM)
+    place = np.array([[WEST + 300.0, NORTH - 300.0, 0.0], [WEST + 100.0, NORTH - 450.0, 0.0]])
+    lonlat = ground_transform(parse_crs(UTM), "EPSG:4979")(place)[:, :2]
+    found = slopes_at(open_dem(tmp_path / "dem.tif", "ellipsoid"), lonlat)
+    np.testing.assert_allclose(found, np.degrees(np.arctan(0.25)), atol=0.01)
+
+
+def test_the_summary_counts_what_has_no_height():
+    errors = DemAccuracy(["a", "b", "c"], np.array([1.0, np.nan, -2.0]), np.array([3.0, 3.0, 40.0]))
+    lines = summary(errors.to_json()).splitlines()
+    assert "without a height in the DEM, or of their own: 1" in lines
+    assert [line.split()[:2] for line in lines[1:4]] == [["0-5°", "1"], ["over", "30°"], ["all", "2"]]
+    assert lines[3].split()[2:] == ["-0.50", "1.58", "-0.50", "-", "-", "-2.00"]
+    whole = summary(DemAccuracy(["a"], np.ones(1), np.ones(1)).to_json())
+    assert "without a height" not in whole
 
 
 def test_slopes_are_those_of_the_terrain(made):

@@ -12,12 +12,15 @@ import shapely
 
 from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.exchange.rpc import export_rpc
-from ortho_pipeline.models import FrameCamera, ImageCorrection
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.surface.footprint import Footprint, choose_grid, lay
+from ortho_pipeline.surface.flat import FlatSurface
+from ortho_pipeline.surface.footprint import Footprint, choose_grid, ground_sample_distance, lay, scene_pixels
 from ortho_pipeline.surface.writing import write_dem
 
 CRS, X, Y = "EPSG:32651", 300_000.0, 2_700_000.0
@@ -30,6 +33,15 @@ def drone(tilt: float = 0.0) -> FrameCamera:
     interior = Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5)
     exterior = [X, Y, FLYING, np.radians(tilt), 0.0, 0.0]
     return FrameCamera.from_map(interior, CRS, exterior, frame=MAP, heights=(-800.0, 100.0))
+
+
+@pytest.mark.parametrize("heading", [0.0, 20.0, 45.0, 120.0])
+def test_a_pixel_has_the_same_size_whichever_way_the_camera_is_turned(heading):
+    """Focal length 1000 pixels, 120 m above the ground: 0.12 m."""
+    interior = Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5)
+    exterior = [X, Y, FLYING, 0.0, 0.0, np.radians(heading)]
+    model = FrameCamera.from_map(interior, CRS, exterior, frame=MAP, heights=(-800.0, 100.0))
+    assert ground_sample_distance(model, parse_crs(CRS), WIDTH, HEIGHT, GROUND) == pytest.approx(0.12, rel=1e-9)
 
 
 def surface(folder: Path, heights: Any = GROUND, west: float = -450.0, **options: Any) -> Surface:
@@ -55,6 +67,16 @@ def test_a_drone_lies_on_the_ground_and_not_between_guesses(tmp_path):
     assert grid.dx == pytest.approx(0.12)
     xmin, ymin, xmax, ymax = grid.extent
     assert (xmax - xmin, ymax - ymin) == pytest.approx((120.0, 668 * 0.12), abs=0.25)
+
+
+@pytest.mark.parametrize("pixel", [(1.0, 1.0), (0.5, 2.0), (2.0, 0.25)])
+def test_the_pixels_of_a_scene_are_its_ground_over_the_ground_of_a_pixel(tmp_path, pixel):
+    model = drone()
+    found = laid(model, surface(tmp_path))
+    grid = Grid.of_extent(parse_crs(CRS), (X - 200, Y - 200, X + 200, Y + 200), pixel)
+    assert scene_pixels(model, found, grid) == pytest.approx(120 * 668 * 0.12 / (pixel[0] * pixel[1]), rel=0.01)
+    half = Grid.of_extent(parse_crs(CRS), (X, Y - 200, X + 200, Y + 200), pixel)
+    assert scene_pixels(model, found, half) == pytest.approx(60 * 668 * 0.12 / (pixel[0] * pixel[1]), rel=0.01)
 
 
 @pytest.mark.parametrize(("west", "share"), [(-30.0, 0.75), (0.0, 0.5), (30.0, 0.25), (-2.0, 62 / 120)])
@@ -138,6 +160,43 @@ def test_rough_ground_and_an_oblique_view(tmp_path, tilt):
     assert (seen[:, 1].min() > ymin, seen[:, 1].max() < ymax) == (True, True)
     # And the extent is not much larger than that.
     assert (xmax - xmin) * (ymax - ymin) < 1.35 * np.prod(np.ptp(seen[:, :2], axis=0))
+
+
+def test_a_scene_partly_far_from_all_heights_is_refused_with_the_reach(tmp_path):
+    """Nearest fill looks 512 samples of 2 m far; half of the scene of 12 km lies west of the DEM."""
+    model = FrameCamera.from_map(
+        Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5), CRS, [X, Y, 12_000.0, 0.0, 0.0, 0.0], frame=MAP, heights=(0.0, 500.0)
+    )
+    on = surface(tmp_path, west=30.0, fill="nearest")
+    found = laid(model, on)
+    assert found.unmet
+    with pytest.raises(CoverageError, match=r"more than 1\.02 km from the nearest height"):
+        found.require_coverage()
+    near = laid(drone(), on)
+    assert not near.unmet
+    near.require_coverage()
+
+
+def test_the_heights_of_a_scene_are_the_lowest_and_highest_under_it(tmp_path):
+    """A pit and a peak of one sample, between the rays, and a higher peak outside."""
+    heights = np.full((451, 451), GROUND)
+    heights[225, 230], heights[220, 210], heights[10, 10] = 61.0, 97.0, 150.0
+    found = laid(drone(), surface(tmp_path, heights))
+    assert found.heights == pytest.approx((61.0, 97.0), abs=1e-3)
+    assert found.middle == pytest.approx(GROUND, abs=1e-3)
+
+
+@pytest.mark.parametrize("middle", [179.99, -179.98, 10.1])
+def test_a_scene_across_the_antimeridian_has_a_narrow_grid(middle):
+    """A scene of 0.2 degrees: the grid goes from one side to the other, not around the Earth."""
+    column, row, one = np.eye(20)[1], -np.eye(20)[2], np.eye(20)[0]
+    model = RPC(500.0, 500.0, middle, 10.0, 500.0, 500.0, 500.0, 0.1, 0.1, 500.0, column, one, row, one)
+    found = lay(model, FlatSurface(500.0), 1000, 1000)
+    grid = choose_grid(model, found, (1000, 1000), crs=parse_crs("EPSG:4326"))
+    xmin, ymin, xmax, ymax = grid.extent
+    assert (xmax - xmin, ymax - ymin) == pytest.approx((0.2, 0.2), abs=2 * grid.dx)
+    assert (xmin - middle + 0.1 + 180.0) % 360.0 == pytest.approx(180.0, abs=2 * grid.dx)
+    assert scene_pixels(model, found, grid) == pytest.approx(1e6, rel=0.02)
 
 
 def test_models_are_meant_for_the_heights_under_their_scene(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -244,6 +246,24 @@ def test_the_same_for_any_windows_and_no_pixel_is_lost(tmp_path, monkeypatch):
     assert coarse.cell > 1
     write_cog(placed, tmp_path / "coarse.tif", owners=coarse)
     np.testing.assert_array_equal(read(tmp_path / "coarse.tif")[1], known)
+
+
+def test_cells_of_the_most_accurate_ortho_are_the_same_for_any_windows(tmp_path, monkeypatch):
+    """Two orthos, each more accurate in one half; without seams moved, each half has its own."""
+    placed, half = [], np.arange(32) < 16
+    for name, errors, left in (("a", (1.0, 4.0), 40), ("b", (2.0, 2.0), 40), ("c", (9.0, 9.0), 100)):
+        ortho = write(tmp_path, name, GROUND[30:190, left : left + 320], left, 30)
+        path = tmp_path / f"{name}_accuracy.tif"
+        grid = Grid(UTM, 500000 + 2.0 * left, 4e6 - 60.0, 20.0, 20.0, 32, 16)
+        with RasterWriter(path, grid, Profile(1, np.dtype("float32"), "nodata", math.nan), driver="GTiff") as writer:
+            writer.write(0, 0, np.where(half, *errors)[None, None].repeat(16, axis=1).astype(np.float32), None)
+        placed.append(dataclasses.replace(ortho, accuracy=path))
+    mosaic_of = lay_out(placed, "most-accurate")
+    for window in (1024, 61):
+        monkeypatch.setattr(seamlines, "_WINDOW", window)
+        owners = owners_of(mosaic_of, None, seamlines=False).owners
+        wanted = np.repeat([0, 1, 2], [160, 160, 60])
+        np.testing.assert_array_equal(owners, np.broadcast_to(wanted, owners.shape))
 
 
 def test_along_the_seams_less_differs_than_before(tmp_path):

@@ -213,7 +213,7 @@ class DisplacementField:
         return rates, sigmas, level
 
     def held_out(self, groups: NDArray[np.int_]) -> tuple[Array, Array]:
-        """Return squared errors ``(groups, 2)`` of field and trend where each group of displacements takes no part."""
+        """Return squared errors ``(groups,)`` of the field and of the trend where each group takes no part."""
         found = []
         for group in np.unique(groups):
             out = groups == group
