@@ -68,15 +68,17 @@ def posterior(solved: Solved) -> Posterior:
 def reweighed(solved: Solved, selection: Selection, variances: Variances, tolerance: float = EXACT) -> Solved:
     """Return the solution with these standard deviations; as it is if nothing much changes.
 
-    Where that does not converge, as with cameras that few points hardly determine, it stays as it is, too; `posterior`
-    then counts how far the solution is from the best.
+    Where that does not converge or leaves parameters open, as with cameras that few points hardly determine, it stays
+    as it is, too; `posterior` then counts how far the solution is from the best.
     """
     if not variances.estimated and abs(variances.image - 1.0) < _SAME:
         return solved
     try:
-        return solve(variances.applied(solved.problem), solved.state, selection, tolerance)
+        found = solve(variances.applied(solved.problem), solved.state, selection, tolerance)
     except NotConverged:
         return solved
+    # Next to nearly exact measurements, what holds the rest is lost in rounding.
+    return solved if found.undetermined else found
 
 
 class _Grid:
