@@ -123,11 +123,9 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         found = np.array([one["shift_px"] or (np.nan, np.nan) for one in document["dates"]])
         sigma = np.array([one["sigma_px"] or (np.nan, np.nan) for one in document["dates"]])
         master = given.dates // 2
-        usual = (
-            {}
-            if given.alone
-            else {"usual": _each(paths, master, lambda path: _ours(path, paths[master], folder, output))}
-        )
+        usual = {}
+        if not given.alone:
+            usual["usual"] = _each(paths, master, lambda path: _ours(path, paths[master], folder, output))
         if given.arosics:
             usual["arosics"] = _each(paths, master, lambda path: _arosics(given.arosics, path, paths[master], folder))
     known = kept & np.isfinite(found).all(axis=1)
@@ -142,9 +140,8 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     return {
         "seed": seed, "dates": given.dates, "side": given.side, "pairs": len(status),
         **{one.replace(" ", "_"): status.count(one) for one in ("accepted", "rejected", "not matched", "untested")},
-        "known": int(known.sum()), "of": int(kept.sum()),
+        **_of(found - true, kept), "of": int(kept.sum()),
         "spread": float(np.sqrt(((errors / sigma[known]) ** 2).mean())),
-        "median": float(np.median(misfit(errors))), "p95": float(np.quantile(misfit(errors), 0.95)),
         **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},
         "moving": int(truth.sum()), "moving_found": int((truth & moving).sum()),
         "still": int(still.sum()), "still_moving": int((still & moving).sum()),

@@ -166,7 +166,7 @@ def test_clear_dates_are_preferred_and_all_stay_connected():
 
 @pytest.mark.parametrize(("dates", "least", "most"), [(40, 0.99, 1.05), (5, 1.1, 1.6)])
 def test_many_loops_show_that_edges_are_better_than_stated(dates, least, most):
-    """An error that a pair is said to have in common is believed as far as no loops tell."""
+    """Many closed loops show how large the error of a pair is. With few loops, the stated error counts."""
     made = Truth(seed=3, dates=dates).made()
     times = made.years.tolist()
     none = np.median(adjust(made.truth.cells, made.edges, times).sigma)

@@ -51,8 +51,8 @@ class ErrorComponents:
     factor : (E,)
         Of the variances of each edge.
     constant : (2,)
-        Variance of an error that all values of an edge share, beyond what is stated of it; negative if loops show less.
-        Residuals within edges do not show it.
+        Variance of an error that all values of an edge share, in addition to the stated one; negative if loops show
+        less. Residuals within edges do not show it.
     """
 
     shared: Array

@@ -35,7 +35,7 @@ _LEAST = 0.1
 _LIMIT = float(chi2.isf(CHANCE, 2))
 #: The constant error of edges is settled if it changes by less than this part of their variance.
 _SMALL = 0.03
-#: What is stated of the error that all values of an edge share counts as much as so many loops.
+#: The stated error of an edge counts as much as this many loops.
 _STATED = 10
 #: An edge with a smaller redundancy is in no loop.
 _IN_LOOP = 1e-6
@@ -112,11 +112,11 @@ def accepted_edges(
 
 
 def _least(edges: Edges, incidence: sparse.csr_matrix, usable: NDArray[np.bool_]) -> float:
-    """Return the least constant variance of edges: many loops may show less than what is stated of it."""
+    """Return the least constant variance of edges: with many loops it may be less than stated."""
     if not usable.any():
         return 0.0
-    dates = np.unique(np.concatenate([edges.first[usable], edges.second[usable]]))
-    loops = int(usable.sum()) - len(dates) + len(np.unique(_parts(incidence, usable)[dates]))
+    part = _parts(incidence, usable)
+    loops = int(usable.sum()) - len(part) + len(np.unique(part))
     return -float(loops / (loops + _STATED) * edges.alike[usable].min() ** 2)
 
 
