@@ -74,7 +74,9 @@ def with_datum(
         dem = "" if problem.heights is None else ", the height also from the DEM"
         return problem, f"no control points: position and height come from the models as delivered{dem}"
     missed = 0.0 if control else _missed(linear)
-    stated = np.full(len(state.models), np.nan) if hold is not None else _stated(linear, accuracies or {})
+    per_metre = _pixels_per_metre(linear)
+    named = {} if hold is not None else accuracies or {}
+    stated = np.array([named.get(image, np.nan) for image in problem.points.images]) * per_metre
     trusted = np.asarray(stated >= missed / _CONTRADICTED)
     sigmas: Array = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
     # Heights of a DEM tell what ties leave to their slow errors.
@@ -83,7 +85,9 @@ def with_datum(
     slow = SLOW * typical / max(missed, _LEAST_WRONG) if by_ties else 0.0
     held = _held(linear, sigmas, slow)
     assumed = "" if hold is not None or trusted.any() else "assumed "
-    of = f"{assumed}sigma {_span(sigmas)} px in the image, for {len(held)} of {problem.size} parameters"
+    ground = sigmas[np.isfinite(per_metre)] / per_metre[np.isfinite(per_metre)]
+    on_ground = f" ({_span(ground)} m on the ground)" if len(ground) else ""
+    of = f"{assumed}sigma {_span(sigmas)} px in the image{on_ground}, for {len(held)} of {problem.size} parameters"
     of += "; other sigmas depend on it" if assumed else ""
     if trusted.any() and accuracies:
         stated_m = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
@@ -106,14 +110,14 @@ def _span(values: Array) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _stated(linear: Linear, accuracies: Mapping[str, float]) -> Array:
-    """Return the standard deviation ``(images,)``, px, of each image by its metadata; NaN where they state none."""
+def _pixels_per_metre(linear: Linear) -> Array:
+    """Return how many px ``(images,)`` a metre in plan is; NaN without points."""
     problem, found = linear.problem, np.full(len(linear.state.models), np.nan)
-    for image, (name, used) in enumerate(zip(problem.points.images, linear.ordering.rays_of_image, strict=True)):
-        if name in accuracies and len(used):
+    for image, used in enumerate(linear.ordering.rays_of_image):
+        if len(used):
             ground = problem.frame.geodetic(linear.state.local[problem.points.point[used]])
             square = (plan_partials(linear.state.models[image], ground) ** 2).sum(axis=(1, 2)) / 2
-            found[image] = accuracies[name] * np.sqrt(np.nanmean(square))
+            found[image] = np.sqrt(np.nanmean(square))
     return found
 
 

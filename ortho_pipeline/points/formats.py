@@ -126,10 +126,7 @@ def read_table(
         For anything that is not a table of finite numbers. The message names file, line and column.
     """
     text = load_text(path)
-    table = _read(_format_of(path, text), path, text)
-    if not table.rows:
-        raise InputError("this file has no points", file=path, remedy=f"give one of: {_NAMES}")
-    return _of_image(path, table, image_name, pieces or {})
+    return _of_image(path, _read(_format_of(path, text), path, text), image_name, pieces or {})
 
 
 def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BLOCK) -> Table:
@@ -149,16 +146,15 @@ def read_block_table(path: str | os.PathLike[str], expected: ColumnRules = OF_BL
             remedy="give CSV (id,image,col,row[,x,y,h,...]), GeoJSON with 'ji' by image, ODM gcp_list.txt or ASP .gcp",
         )
     # Only formats with named columns can hold ground points alone.
-    table = _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
-    if not table.rows:
-        raise InputError("this file has no points", file=path, remedy="add points to it")
-    return table
+    return _read(kind, path, text, *([expected] if OF_GROUND in kind.of_block else []))
 
 
 def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: ColumnRules) -> Table:
     """Read a file; an error without a remedy gets that of the format."""
     with completed(path, remedy=kind.wanted):
         table = kind.reader(path, text, *expected)
+        if not table.rows:
+            raise InputError(f"the format ({kind.name}) is recognised, but there are no points in this file", file=path)
     table.source = os.fspath(path)
     return table
 

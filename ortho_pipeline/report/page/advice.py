@@ -67,9 +67,7 @@ _LOOK: dict[str, str] = {
     "few-check-points": "Use at least 30 check points before you claim an accuracy class.",
     "no-redundancy": "Add points. Until then the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
-    "dem-shifted": Text(
-        "If control or check points confirm the images, add ", Setting("points.dem_shift", "estimate"), "."
-    ),
+    "dem-shifted": "Add control points: they show which of them is wrong.",
     "weak-join": Text(
         "Give a DEM (",
         Setting("surface.dem"),
