@@ -131,8 +131,8 @@ def _why(control: int, by_ties: bool, of: str) -> str:
             f"images relative to each other; all else keeps its start value ({of})"
         )
     return (
-        "no control points: positions are only as accurate as the delivered models, and heights are those of the DEM "
-        f"({of})"
+        "no control points: positions come from the delivered models and from the shape of the terrain in the DEM, "
+        f"heights from the DEM ({of})"
     )
 
 

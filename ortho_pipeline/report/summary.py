@@ -39,8 +39,7 @@ from ortho_pipeline.report.wording import NO_SCALE, NOTICED, evidence_of, fit_no
 
 #: Ground that stays this close (m) to its given coordinates was held, not tested.
 HELD = 0.0005
-#: Names of the axes on the ground.
-AXES = ("x (east)", "y (north)", "z (height)")
+_AXES = ("x (east)", "y (north)", "z (height)")
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class RoleErrors:
         """Return those of errors ``(N, 2)`` or ``(N, 3)`` in metres, of at least one point."""
         spread = errors.std(axis=0, ddof=1) if len(errors) > 1 else [None] * errors.shape[1]
         rmse = np.sqrt((errors**2).mean(axis=0))
-        rows = zip(AXES, errors.mean(axis=0).tolist(), spread, rmse.tolist(), strict=False)
+        rows = zip(_AXES, errors.mean(axis=0).tolist(), spread, rmse.tolist(), strict=False)
         axes = tuple(AxisErrors(axis, mean, None if std is None else float(std), rms) for axis, mean, std, rms in rows)
         le90 = ce90_of(errors[:, 2:]) if errors.shape[1] == 3 else None
         return cls(role, title, len(errors), axes, ce90_of(errors[:, :2]), le90)

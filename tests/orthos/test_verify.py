@@ -64,16 +64,6 @@ def test_the_accuracy_is_that_of_the_truth(verified):
     assert document["matches"]["tested_share"] > 0.9
 
 
-def test_the_table_by_axis_has_the_same_rmse(verified):
-    document, _ = verified
-    rows = document["field"]["errors"]
-    both = np.hypot(*[one["rmse_m"] for one in rows])
-    assert [one["axis"] for one in rows] == ["x", "y"]
-    assert both == pytest.approx(document["relative"]["rmse_m"]["value"], rel=0.02)
-    for one in rows:
-        assert np.hypot(one["mean_m"], one["std_m"]) == pytest.approx(one["rmse_m"], rel=0.02)
-
-
 def test_the_error_of_the_reference_is_part_of_the_absolute_accuracy(verified):
     document, _ = verified
     relative, absolute = document["relative"]["bias_east_m"], document["absolute"]["bias_east_m"]

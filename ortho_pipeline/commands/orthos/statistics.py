@@ -157,12 +157,6 @@ class Verified:
         """The likeliest displacement ``(m, 2)`` of the cells, metres."""
         return np.asarray(self.draws.mean(axis=0))
 
-    def errors(self) -> list[dict[str, Any]]:
-        """Return mean, standard deviation and RMSE of the displacement to east (x) and north (y), metres."""
-        parts = self.draws.mean(axis=1), self.draws.std(axis=1), np.sqrt((self.draws**2).mean(axis=1))
-        names = zip("xy", *(np.median(one, axis=0).tolist() for one in parts), strict=True)
-        return [{"axis": axis, "mean_m": mean, "std_m": std, "rmse_m": rmse} for axis, mean, std, rmse in names]
-
     def relative(self) -> Accuracy:
         """Return the accuracy relative to the references."""
         return Accuracy.of_fields(self.draws)

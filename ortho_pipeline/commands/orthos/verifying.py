@@ -239,12 +239,7 @@ def _of_matches(measured: MeasuredOrtho, surface: Surface | None, reference_sigm
         "relative": relative.to_json(pixel),
         "absolute": None if reference_sigma is None else verified.absolute(reference_sigma).to_json(pixel),
         "pixel_axes_m": measured.metres.tolist(),
-        "field": {
-            "shared_m": json_value(field.shared),
-            "range_m": json_value(field.range * pixel),
-            "errors": verified.errors(),
-            "cells": cells,
-        },
+        "field": {"shared_m": json_value(field.shared), "range_m": json_value(field.range * pixel), "cells": cells},
         "heights": None if heights is None else heights.to_json(pixel),
         "columns": profile(verified, 0),
         "rows": profile(verified, 1),

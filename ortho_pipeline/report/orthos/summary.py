@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.numbers import area_km2, metres, significant
-from ortho_pipeline.report.summary import AXES, AxisErrors, RoleErrors, acquired, error_lines, place_text, processed
+from ortho_pipeline.report.summary import RoleErrors, acquired, error_lines, place_text, processed
 
 #: Whose accuracy comes first, and what it is compared with.
 PARTS = {"points": "at the points", "absolute": "on the ground", "relative": "relative to the reference"}
@@ -54,20 +54,16 @@ def headline(document: Mapping[str, Any]) -> str:
 
 
 def errors_of(document: Mapping[str, Any]) -> list[RoleErrors]:
-    """Return the errors at points and the displacement of the tested area, by axis."""
-    found = []
+    """Return the errors at points and the likeliest displacements of the tested cells, by axis."""
+    kinds = []
     if document["points"] is not None:
-        errors = np.array([[one["east_m"], one["north_m"]] for one in document["points"]["residuals"]])
-        found.append(RoleErrors.of("check", "check points", errors))
+        kinds.append(("check", "check points", document["points"]["residuals"]))
     if document["relative"] is not None:
-        field, title = document["field"], "tested cells (relative to the reference)"
-        axes = tuple(
-            AxisErrors(name, one["mean_m"], one["std_m"], one["rmse_m"])
-            for name, one in zip(AXES, field["errors"], strict=False)
-        )
-        ce90 = document["relative"]["ce90_m"]["value"]
-        found.append(RoleErrors("matched", title, len(field["cells"]), axes, ce90, None))
-    return found
+        kinds.append(("matched", "cells (most likely displacement)", document["field"]["cells"]))
+    return [
+        RoleErrors.of(role, title, np.array([[one["east_m"], one["north_m"]] for one in places]))
+        for role, title, places in kinds
+    ]
 
 
 def explained(cause: Mapping[str, Any]) -> str:
