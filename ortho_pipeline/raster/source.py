@@ -135,6 +135,9 @@ def _opened(
     try:
         dataset, block = open_seen(place, roots, drivers, siblings)
     except (RuntimeError, UnicodeDecodeError) as error:
+        if not isinstance(place, VsiPath) and Path(name).is_dir():
+            remedy = "give the images in it by name, or a product folder that GDAL opens"
+            raise InputError("this is a folder, not an image", file=name, remedy=remedy) from error
         # What GDAL quotes of a damaged file need not be UTF-8.
         raise InputError(
             f"GDAL cannot open this as a raster ({first_line(error)})",
