@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.datum import HOLD, by_control, stated_accuracies, with_datum, with_start_errors
 from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
 from ortho_pipeline.block.equations.cofactors import Cofactors
@@ -22,7 +21,6 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selecti
 from ortho_pipeline.block.equations.solver import EXACT, NEAR, Solved, attempt
 from ortho_pipeline.block.equations.unknowns import Mask, Ordering
 from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.record import record_of
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights, starts
@@ -32,6 +30,9 @@ from ortho_pipeline.block.points import BlockPoints, Index
 from ortho_pipeline.block.reliability.blunders import find_blunders
 from ortho_pipeline.block.reliability.known_points import notices, outlying
 from ortho_pipeline.block.reliability.suspects import GrossError
+from ortho_pipeline.block.shared.common_error import BlockCommonError
+from ortho_pipeline.block.shared.priors import OWN, SharedPriors
+from ortho_pipeline.block.shared.unknowns import SharedUnknowns
 from ortho_pipeline.block.variances.components import Posterior
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
@@ -48,8 +49,6 @@ from ortho_pipeline.surface.base import Surface
 
 #: Parameters that move by more than this part of their sigma with the sigmas that were found are solved for again.
 _MOVED, _WEIGHINGS = 0.02, 3
-#: Heights of a DEM are renewed so often before the search for gross errors.
-_FIRST_ROUNDS = 1
 #: Part of the points that gross errors of their own may lead out of the models; where it is more, the block is tilted.
 _ASTRAY = 0.05
 #: Part of the points beyond which it is not they that are wrong, but where the images lie.
@@ -126,10 +125,10 @@ def adjust(
     _refuse_too_few(problem, nowhere, selection, whole)
     if problem.unstated.any():
         problem = _started(problem, state, selection)
-    common = BlockCommonError.of(problem, state, selection)
-    if common is not None:
-        problem = common.applied(problem)
-    solved, inside, dem_heights = _first(problem, state, selection, whole, dem_heights, robust)
+    error = BlockCommonError.of(problem, state, selection)
+    shared = SharedUnknowns(error, dem_heights, SharedPriors.of(problem, priors or {}))
+    problem = shared.applied(problem)
+    solved, inside, shared = _first(problem, state, selection, whole, shared, robust)
     rejected, near, searched = tuple[GrossError, ...](), solved.state, inside
     if robust and problem.size and solved.unit_weight()[1] >= 4:
         blunders = find_blunders(solved, inside)
@@ -138,22 +137,23 @@ def adjust(
             notes.append(_undecided(blunders.undecided))
         inside = blunders.kept
     if robust:
-        problem = replace(solved.problem, pseudo=problem.pseudo)
+        problem = shared.applied(replace(solved.problem, pseudo=problem.pseudo))
         again = attempt(problem, near, inside)
-        if dem_heights is not None and not again.converged:
+        if shared.heights is not None and not again.converged:
             # Heights that were renewed once may have no minimum in reach. Stable ones have. The search has taken the
             # partials of the solution along.
-            again, dem_heights = dem_heights.settled(attempt(solved.problem, solved.state, searched), inside)
+            again, dem_heights = shared.heights.settled(attempt(solved.problem, solved.state, searched), inside)
+            shared = replace(shared, heights=dem_heights)
         solved, inside = _checked(again, inside)
     gauge = gauge.replace(by_control(problem, selection), by_control(problem, inside))
     judged = _among(points, {one.point for one in rejected})
-    solved, found, common, dem_heights = _weighed(solved, inside, common, dem_heights)
+    solved, found, shared = _weighed(solved, inside, shared)
     inside = solved.without_astray(inside)
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
     notes += found.variances.notes()
     notes += marks_warning(points.select(problem.active(inside) & inside.ground))
     notes += uncertain_images(solved, stated)
-    fit = _result(solved, found, common, dem_heights, inside, points, order, chosen, gauge, rejected, notes)
+    fit = _result(solved, found, shared, inside, points, order, chosen, gauge, rejected, notes)
     return replace(fit, planes=solved.problem.heights, accuracies=stated_by)
 
 
@@ -162,10 +162,10 @@ def _first(
     state: State,
     selection: Selection,
     whole: Selection,
-    dem_heights: Heights | None,
+    shared: SharedUnknowns,
     robust: bool,
-) -> tuple[Solved, Selection, Heights | None]:
-    """Return the solution of everything, what takes part in it, and the heights of the DEM."""
+) -> tuple[Solved, Selection, SharedUnknowns]:
+    """Return the solution of everything, what takes part in it, and what is shared."""
     # The search for gross errors begins near the minimum as well as at it, but sigmas are found at it.
     tolerance = NEAR if robust and not problem.unstated.any() else EXACT
     solved = attempt(problem, state, whole, tolerance)
@@ -174,11 +174,10 @@ def _first(
     if near.astray is not None:
         _refuse_many_outside(problem, near.astray, near.without_astray(whole), whole)
     solved, inside = _checked(solved, whole) if held is None else (held, held.without_astray(whole))
-    if dem_heights is not None:
-        solved, dem_heights = dem_heights.settled(solved, inside, _FIRST_ROUNDS)
+    solved, shared = shared.near(solved, inside)
     if problem.unstated.any():
         solved = reweighed(solved, inside, estimate(solved), tolerance)
-    return solved, inside, dem_heights
+    return solved, inside, shared
 
 
 def _held(solved: Solved, start: State, selection: Selection, whole: Selection) -> Solved | None:
@@ -315,7 +314,9 @@ def pseudo_of(
                     field="priors",
                     remedy=f"its parameters are {', '.join(names) or 'none'}",
                 )
-            found.append(Pseudo(begin + names.index(name), prior.mean, prior.sigma))
+            # What images share is one unknown (`SharedPriors`).
+            sigma = OWN * prior.sigma if prior.shared else prior.sigma
+            found.append(Pseudo(begin + names.index(name), prior.mean, sigma))
         begin += len(names)
     return tuple(found)
 
@@ -329,14 +330,9 @@ def _started(problem: BlockProblem, state: State, selection: Selection) -> Block
     return replace(problem, assumed=(float(sigma), float(sigma)))
 
 
-def _weighed(
-    solved: Solved, selection: Selection, common: BlockCommonError | None, dem_heights: Heights | None
-) -> tuple[Solved, Posterior, BlockCommonError | None, Heights | None]:
-    """Return the solution with the sigmas that the observations have, what is known of these, and common errors."""
-    if common is not None:
-        solved, common = common.settled(solved, selection)
-    if dem_heights is not None:
-        solved, dem_heights = dem_heights.settled(solved, selection)
+def _weighed(solved: Solved, selection: Selection, shared: SharedUnknowns) -> tuple[Solved, Posterior, SharedUnknowns]:
+    """Return the solution with the sigmas that the observations have, what is known of these, and what is shared."""
+    solved, shared = shared.settled(solved, selection)
     settled, found = solved, posterior(solved)
     for _ in range(_WEIGHINGS):
         if found.moved <= _MOVED:
@@ -346,15 +342,11 @@ def _weighed(
         if solved is before:
             break
         found = posterior(solved)
-    if common is not None:
+    if solved is not settled or shared.error is not None:
         before = solved
-        solved, common = common.settled(solved, selection)
+        solved, shared = shared.settled(solved, selection)
         found = found if solved is before else posterior(solved)
-    if dem_heights is not None and solved is not settled:
-        before = solved
-        solved, dem_heights = dem_heights.settled(solved, selection)
-        found = found if solved is before else posterior(solved)
-    return solved, found, common, dem_heights
+    return solved, found, shared
 
 
 def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
@@ -380,8 +372,7 @@ def _checked(solved: Solved, selection: Selection) -> tuple[Solved, Selection]:
 def _result(
     solved: Solved,
     found: Posterior,
-    common: BlockCommonError | None,
-    dem_heights: Heights | None,
+    unknowns: SharedUnknowns,
     selection: Selection,
     points: BlockPoints,
     order: Index,
@@ -397,6 +388,7 @@ def _result(
     used = np.zeros(points.rays, dtype=bool)
     used[order] = selection.rays & active[points.point[order]]
     variances = replace(found.variances, image=found.variances.image * problem.factor_of(points.of_rays(order)))
+    common, heights = unknowns.error, unknowns.heights
     covariance, ground_covariance, shared = _covariances(solved, found, common)
     # Points that take no part still have a place where their rays meet, if they do.
     local = np.where(active[:, None], state.local, np.nan)
@@ -406,12 +398,11 @@ def _result(
     known = stated if common is None else common.corrected(stated)
     object_residuals = problem.frame.apart(known, local)
     used_ground = selection.ground & active
-    covariance, of_points = _with_common(covariance, common)
-    covariance, of_heights = _with_common(covariance, None if dem_heights is None else dem_heights.common)
-    taken = None if dem_heights is None else record_of(dem_heights, solved)
+    covariance, of_points, of_others = unknowns.added(covariance)
+    taken = None if heights is None else record_of(heights, solved)
     # Points that share an error lie to each other as if there were none.
     apart = (points.sigma_common == 0)[:, None, None]
-    ground_covariance = ground_covariance + of_heights
+    ground_covariance = ground_covariance + of_others
     doubts = outlying(solved, variances, object_residuals, ground_covariance + apart * of_points, used_ground)
     return BlockFit(
         models=dict(zip(points.images, state.models, strict=True)),
@@ -435,6 +426,7 @@ def _result(
         common_error=common,
         heights=taken,
         shared_errors=shared,
+        shared_priors=unknowns.priors,
         rejected=rejected,
         outlying=doubts,
         warnings=(*notices(doubts, points, object_residuals), *notes, *([] if taken is None else taken.notices())),
@@ -463,13 +455,6 @@ def _covariances(
     if covariance is not found.covariance:
         ground += solved.ground_covariance(covariance, found.image_square) - plain
     return covariance, ground, {} if shared is None else shared.images
-
-
-def _with_common(covariance: Cofactors, common: BlockCommonError | CommonHeights | None) -> tuple[Cofactors, Array]:
-    """Return the covariance of the parameters with the part of a common error, and its part in that of the ground."""
-    if common is None:
-        return covariance, np.zeros((1, 3, 3))
-    return covariance.mixed(1.0, common.by_params, common.left), common.of_points
 
 
 def _reprojected(frame: GroundFrame, points: BlockPoints, models: Sequence[SensorModel], ground: Array) -> Array:

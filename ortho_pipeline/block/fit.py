@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.heights.record import HeightsRecord
@@ -19,6 +18,8 @@ from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.known_points import ContradictedPoint
 from ortho_pipeline.block.reliability.suspects import GrossError
+from ortho_pipeline.block.shared.common_error import BlockCommonError
+from ortho_pipeline.block.shared.priors import SharedPriors
 from ortho_pipeline.block.variances.components import Variances, VariancesRecord
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
@@ -160,7 +161,8 @@ class BlockFit:
     common, `common_error` is that, covariances have its part, and residuals of known ground are without its estimate.
     `heights` is what was taken from a DEM, `planes` where it was; `accuracies` (m) are those that metadata
     state of images. Of images whose neighbouring measurements share errors,
-    `shared_errors` says what they do, and covariances have grown by it.
+    `shared_errors` says what they do, and covariances have grown by it. `shared_priors` are parameters that images
+    share, such as those of a camera.
     """
 
     models: dict[str, SensorModel]
@@ -189,6 +191,7 @@ class BlockFit:
     planes: Planes | None = None
     accuracies: Mapping[str, float] = field(default_factory=dict)
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)
+    shared_priors: SharedPriors | None = None
     condition: float = 1.0
     iterations: int = 0
 

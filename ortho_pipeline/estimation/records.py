@@ -12,7 +12,7 @@ import numpy as np
 import pydantic
 
 from ortho_pipeline.estimation.blunders import OutlyingPoint
-from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
+from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.spatial.shared_errors import SharedErrors
 from ortho_pipeline.files.json.records import Count, Pair, Record, Words
 from ortho_pipeline.models.base import Array
@@ -138,7 +138,7 @@ class CommonError(Record):
     estimate_sigma_m: Pair
 
     @classmethod
-    def of(cls, common: CommonUnknown) -> Self:
+    def of(cls, common: CommonGroundError) -> Self:
         """Return the published record of the unknown."""
         estimate, left = common.value * common.sigma, np.sqrt(np.diag(common.left)) * common.sigma
         return cls(points=common.points, sigma_m=common.sigma, estimate_m=tuple(estimate), estimate_sigma_m=tuple(left))

@@ -40,20 +40,13 @@ OPTIONS = {
     "pitch": "where the pitch of the camera is zero: horizon or nadir (default: as the maker's tags define it)",
     "sigmas": "standard deviations of position and angles: metres,degrees (default: as the tags state)",
     "heights": "lowest and highest ground, ellipsoidal metres: low,high",
-    "calibrate": "whether an adjustment estimates the focal length of photos with exact heights: yes (default) or no",
+    "calibrate": "whether an adjustment estimates the camera: yes (default) or no",
 }
 UNKNOWN = "unknown"
-#: All photos of a flight share the error of a focal length, but the height that it looks like is known of each. So each
-#: counts less by this: otherwise thirty would seem to know it better by the root of thirty.
-SHARED = 5.0
-#: The parameter of the interior orientation that an adjustment may change.
-FOCAL = "focal_length"
 #: Standard deviation (m) of heights of an unknown datum: geoid and ellipsoid are within twice of it nearly everywhere.
 DATUM_SIGMA = 50.0
 #: A camera that looks flatter than this (degrees from straight down) sees the horizon.
 FLATTEST_DEG = 85.0
-#: Height (m) above ground of a flight whose tags do not state it.
-_USUAL = 100.0
 #: Lowest and highest ground below a camera where nothing states its heights: m, and parts of the height above take-off.
 _BELOW, _OF_RELATIVE = (500.0, 20.0), (2.0, 0.2)
 
@@ -92,7 +85,7 @@ def open_scene(
     camera = camera_of(tags, *size, _width(sensor_width))
     stated = vertical or pose.datum or UNKNOWN
     model = _model(camera.interior, pose, stated, heights, tags)
-    priors = _priors(model, pose, camera, stated, sigmas, _above_ground(tags) if calibrate == "yes" else 0.0)
+    priors = _priors(model, pose, camera, stated, sigmas, calibrate == "yes")
     model = replace(model, free=tuple(priors))
     if not (model.sees_ground and pose.tilt_deg < FLATTEST_DEG):
         other = HORIZON if pose.convention == NADIR else NADIR
@@ -137,29 +130,21 @@ def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> 
 
 
 def _priors(
-    model: FrameCamera, pose: PhotoPose, camera: PhotoCamera, stated: str, sigmas: str | None, above_ground: float
+    model: FrameCamera, pose: PhotoPose, camera: PhotoCamera, stated: str, sigmas: str | None, calibrate: bool
 ) -> dict[str, Prior]:
-    """Return what is known of the pose, and of the focal length where an adjustment can tell it from the height.
-
-    Over flat ground a wrong focal length looks like a wrong height. So it is a parameter only if the height is known
-    better than it (`above_ground`, m, times its sigma); else its error is a part of that of the height.
-    """
+    """Return what is known of the pose and, to `calibrate`, of the camera, which all photos of a block share."""
     (plan, height), angle = pose.sigmas, ANGLE
     if sigmas is not None:
         plan, angle = pose_sigmas(sigmas)
         height = plan
-    known = exterior_sigmas(plan, math.radians(angle))
     height = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
-    if height < camera.sigma * above_ground:
-        focal = model.interior.focal_length
-        return {**priors_at(model, {**known, "Z_L": height}), FOCAL: Prior(focal, camera.sigma * focal)}
-    known["Z_L"] = math.hypot(height, SHARED * camera.sigma * above_ground)
-    return priors_at(model, known)
-
-
-def _above_ground(tags: Tags) -> float:
-    """Return about how high (m) a photo was taken."""
-    return tags.positive("drone-dji:RelativeAltitude") or _USUAL
+    priors = priors_at(model, {**exterior_sigmas(plan, math.radians(angle)), "Z_L": height})
+    if calibrate:
+        priors |= {
+            name: Prior(float(getattr(model.interior, name)), sigma, shared=True)
+            for name, sigma in camera.sigmas.items()
+        }
+    return priors
 
 
 def _unknown_datum(pose: PhotoPose) -> Notice:

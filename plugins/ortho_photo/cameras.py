@@ -6,7 +6,8 @@ sensors here, the resolution in the focal plane, DJI's nominal focal length in p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from ortho_photo.tags import Tags
 from ortho_pipeline.plugin import InputError, Interior
@@ -31,19 +32,27 @@ SENSOR_MM = {
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 #: Width (mm) of a frame of 35 mm film.
 _FILM_MM = 36.0
-#: Standard deviation of focal lengths, in parts: of a maker's calibration, and of a nominal length.
-CALIBRATED, NOMINAL = 0.005, 0.02
+#: Standard deviations of the focal length and principal point, in parts of the focal length, and of distortion: of a
+#: maker's calibration, and of a nominal camera without distortion.
+CALIBRATED = {"focal_length": 0.005, "x0": 0.003, "y0": 0.003, "k1": 0.01, "k2": 0.01}
+NOMINAL = {"focal_length": 0.02, "x0": 0.01, "y0": 0.01, "k1": 0.05, "k2": 0.05}
 _PIXEL = 1e-6
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
 
 
 @dataclass(frozen=True)
 class PhotoCamera:
-    """The camera of a photo, its source, and the standard deviation of its focal length in parts of it."""
+    """The camera of a photo, its source, and how exactly that knows it (in parts of the focal length; distortion)."""
 
     interior: Interior
     source: str
-    sigma: float = NOMINAL
+    known: Mapping[str, float] = field(default_factory=lambda: NOMINAL)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations of parameters of the interior orientation, in their units."""
+        metres = self.interior.focal_length
+        return {name: part if name in ("k1", "k2") else part * metres for name, part in self.known.items()}
 
 
 def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -> PhotoCamera:

@@ -20,7 +20,7 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import State
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
-from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
+from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.models.base import Array
 
 #: Modes are of the covariance of so many points at most, and are so many at most, of a block of `_MANY` points fewer.
@@ -32,7 +32,7 @@ _HELD = 0.99
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CommonHeights(CommonUnknown):
+class CommonHeights(CommonGroundError):
     """Errors that heights share, and what a block tells of them.
 
     Parameters
@@ -105,17 +105,22 @@ class CommonHeights(CommonUnknown):
         """Its part ``(N, 3, 3)`` of the covariance of the ground, m²."""
         return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))
 
+    def units(self, linear: Linear) -> tuple[Index, Array]:
+        """Return the points ``(n,)`` with a height, and what one standard deviation takes off its misfit ``(n, k)``."""
+        heights, grounded = linear.problem.heights, linear.ordering.grounded
+        assert heights is not None
+        rows = grounded[heights.on[grounded]]
+        weights = np.sqrt(linear.weights.ground_weights[rows]) / self._sigmas(linear, rows)
+        return rows, self.loads[rows] * weights[:, None]
+
     def moved_by(self, solved: Solved) -> tuple[CommonHeights, Array]:
         """Return them with what a solution tells of them, and the slope of half the sum of squares ``(k,)``."""
         linear, problem, ordering = solved.linear, solved.problem, solved.linear.ordering
-        assert problem.heights is not None
-        rows = ordering.grounded[problem.heights.on[ordering.grounded]]
+        rows, of_heights = self.units(linear)
         place = np.full(len(problem.points), -1)
         place[ordering.numbers] = np.arange(ordering.points)
-        # What one standard deviation takes off the misfits of heights; 0 of other points.
-        weights = np.sqrt(linear.weights.ground_weights[rows]) / self._sigmas(linear, rows)
         units, by_height = np.zeros((ordering.points, len(self.value))), np.zeros((ordering.points, 3))
-        units[place[rows]] = self.loads[rows] * weights[:, None]
+        units[place[rows]] = of_heights
         by_height[place[rows]] = linear.ground_by_point[rows, 2]
         inverse = np.linalg.inv(_normals(linear))
         met = (inverse @ by_height[:, :, None])[:, :, 0]

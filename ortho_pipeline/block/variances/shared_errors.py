@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ortho_pipeline.block.common_error import BlockCommonError
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import Index
+from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.estimation.spatial.shared_errors import (
     MATCHED_ALIKE,
     SharedErrors,

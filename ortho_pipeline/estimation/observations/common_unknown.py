@@ -1,6 +1,7 @@
 r"""An error common to many observations, as an unknown of an adjustment of one image or a block.
 
-It is one vector :math:`c \sim N(0, I)`, of known ground in plan, in units of its standard deviation. The adjustment
+It is one vector :math:`c \sim N(0, I)` in units of its standard deviation: an error of known ground in plan, of the
+heights of a DEM, or a parameter that images share. The adjustment
 gives the information :math:`T` (``told``) and the slope :math:`g` of half the sum of squares. A step is
 
 .. math:: (I + T)\, dc = g - c
@@ -33,18 +34,12 @@ class CommonUnknown:
 
     Parameters
     ----------
-    sigma : float
-        Standard deviation per axis, m; the largest if points state several.
-    points : int
-        Number of control points that share the error.
     value : (k,)
         Estimate in standard deviations, 0 without information. Of known ground: stated minus true, east and north.
     told : (k, k)
         Information from other points and from priors; that of its own standard deviation is I.
     """
 
-    sigma: float
-    points: int
     value: Array
     told: Array
 
@@ -52,15 +47,6 @@ class CommonUnknown:
     def left(self) -> Array:
         """Covariance ``(k, k)`` of the estimate, in standard deviations."""
         return np.asarray(np.linalg.inv(np.eye(len(self.value)) + self.told))
-
-    def started(self, each: Array) -> Self:
-        """Return the error started from single estimates ``(n, 2)``, by their median, which resists gross errors.
-
-        If the median is too large for the sigma, the value stays 0.
-        """
-        each = each[np.isfinite(each).all(axis=1)]
-        value = np.median(each, axis=0) if len(each) else np.zeros(2)
-        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self
 
     def step(self, slope: Array) -> Array:
         """Return how far ``(k,)`` its estimate is from its best, by the slope there."""
@@ -93,3 +79,28 @@ class CommonUnknown:
             error = replace(error, value=error.value + step)
             solution = again(error, solution)
         return solution, error
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CommonGroundError(CommonUnknown):
+    """An error that the known ground of many points shares.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation per axis, m; the largest if points state several.
+    points : int
+        Number of points that share the error.
+    """
+
+    sigma: float
+    points: int
+
+    def started(self, each: Array) -> Self:
+        """Return the error started from single estimates ``(n, 2)``, by their median, which resists gross errors.
+
+        If the median is too large for the sigma, the value stays 0.
+        """
+        each = each[np.isfinite(each).all(axis=1)]
+        value = np.median(each, axis=0) if len(each) else np.zeros(2)
+        return replace(self, value=value) if (np.abs(value) < _BELIEVED).all() else self

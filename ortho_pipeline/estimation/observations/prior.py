@@ -14,14 +14,21 @@ from ortho_pipeline.models.base import SensorModel
 class Prior:
     """Prior knowledge of a parameter: one more observation, with this mean and sigma in the unit of the parameter.
 
+    Parameters
+    ----------
+    mean, sigma : float
+    shared : bool
+        All images of a block with this prior have the same value of the parameter, as photos of one camera.
+
     Examples
     --------
     >>> Prior(0.0, sigma=0.01)
-    Prior(mean=0.0, sigma=0.01)
+    Prior(mean=0.0, sigma=0.01, shared=False)
     """
 
     mean: float
     sigma: float
+    shared: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and self.sigma > 0):
@@ -43,7 +50,7 @@ def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prio
     --------
     >>> model = op.ImageCorrection.identity(op.read_rpc("sample_data/scene_RPC.TXT"), "shift", (500, 500))
     >>> priors_at(model, {"col_shift": 2.0})
-    {'col_shift': Prior(mean=0.0, sigma=2.0)}
+    {'col_shift': Prior(mean=0.0, sigma=2.0, shared=False)}
     """
     values = dict(zip(model.param_names, model.params.tolist(), strict=True))
     return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}

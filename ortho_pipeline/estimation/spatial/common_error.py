@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
+from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.geodesy.distortion import map_from_enu
@@ -37,7 +37,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ImageCommonError(CommonUnknown):
+class ImageCommonError(CommonGroundError):
     """A common error of some points of an image, and the information on it from the others.
 
     Parameters

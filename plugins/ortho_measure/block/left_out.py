@@ -87,6 +87,8 @@ def _equations(fit: BlockFit, starts: Mapping[str, Start], hold: float | None) -
     local = problem.frame.of_geodetic(fit.ground)
     selection = Selection.of(fit.used_rays, fit.used_ground)
     problem = problem.with_heights(fit.planes)
+    if fit.shared_priors is not None:
+        problem = fit.shared_priors.applied(problem)
     problem, _ = with_datum(problem, State(begun, local), selection, hold, fit.accuracies)
     problem = fit.variances.applied(problem)
     problem = replace(problem, assumed=(max(problem.assumed[0], _LEAST), max(problem.assumed[1], _LEAST)))

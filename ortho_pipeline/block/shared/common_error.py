@@ -29,7 +29,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Select
 from ortho_pipeline.block.equations.solver import Solved, attempt, solve
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.errors import OrthoError
-from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
+from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array, solve_2x2
@@ -39,7 +39,7 @@ _STANDS = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class BlockCommonError(CommonUnknown):
+class BlockCommonError(CommonGroundError):
     """What known ground has in common, and what a block tells of it.
 
     Parameters
