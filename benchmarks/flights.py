@@ -5,8 +5,10 @@ python benchmarks/flights.py --photos 100        larger ones
 python benchmarks/flights.py --kinds rtk,focal   some kinds
 
 The truth is in ECEF, by PROJ and the formulas of this file; it shares no code with the sensor models. The estimator
-sees the photos' tags, the ties and the DEM only. "wrong" are flights that raise no error although neighbouring orthos
-do not fit, or the block is farther off than it claims; "naive" are the orthos by the tags alone, on the same DEM.
+sees the photos' tags, the ties and the DEM only. "naive" are the orthos by the tags alone, on the same DEM. "apart" are
+pairs of photos whose orthos are more than 1 px from each other on the mean; "warned" those of them with a sigma above
+0.5 px, which `ortho adjust` warns of; "silent" are not warned of and beyond chance. "beyond" is the share of pairs
+outside their 95 % ellipse (5 % is right). "wrong" are flights with a silent pair, or farther off than they claim.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.block.relative.joins import joins_of
+from ortho_pipeline.block.shared.priors import SharedPriors
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.hookspecs import Scene
@@ -44,9 +48,11 @@ MIDDLE, GROUND_HEIGHT = (33.1, 39.4), 900.0
 #: Standard deviation (px) of ties, share of ties with a gross error in one ray, its size (px), sigma of the DEM (m).
 TIE, OUTLIERS, GROSS, DEM_SIGMA = 0.3, 0.1, 30.0, 0.3
 PARTS = {"plan": ("X_L", "Y_L"), "up": ("Z_L",), "tilt": ("omega", "phi"), "head": ("kappa",)}
-#: A flight is wrong if its neighbouring orthos are apart by more than this (px, RMS), or its mean position by so many
-#: of the sigmas that it claims.
-WRONG, FAR = 1.0, 4.0
+#: Pairs are apart beyond this (px), and warned of above this sigma (px). A pair is beyond chance with this squared
+#: error in sigmas (0.1 %), and outside its 95 % ellipse with this. A flight is off by no more sigmas than `FAR`.
+APART, WEAK, CHANCE, ELLIPSE, FAR = 1.0, 0.5, 13.8, 5.99, 4.0
+#: Pairs are judged with so many common points or more.
+COMMON = 8
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_MAP = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:32636", always_xy=True)
 
@@ -55,13 +61,16 @@ TO_MAP = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:32636", always_xy=True)
 class Kind:
     """Errors of a flight: sigmas of positions (m) and angles (degrees), the focal length, and the tags that state them.
 
-    `datum` (m) is what the altitudes of all photos are off by.
+    `datum` (m) is what the altitudes of all photos are off by. The true lens has the distortion `k1` and its principal
+    point off the middle (px); tags do not tell them.
     """
 
     position: float = 3.0
     angle: float = 3.0
     focal: float = 1.0
     datum: float = 0.0
+    k1: float = 0.0
+    middle: tuple[float, float] = (0.0, 0.0)
     tags: dict[str, str] = field(default_factory=lambda: {"Camera:GPSXYAccuracy": "3", "Camera:GPSZAccuracy": "3"})
     options: dict[str, str] = field(default_factory=lambda: {"vertical": "ellipsoid"})
 
@@ -73,6 +82,8 @@ KINDS = {
     "focal": Kind(focal=1.02),
     "rtk-focal": Kind(position=0.02, focal=1.02, tags=_RTK),
     "datum": Kind(datum=30.0, options={}),
+    "lens": Kind(focal=1.02, k1=-0.03, middle=(8.0, -5.0)),
+    "rtk-lens": Kind(position=0.02, focal=1.02, k1=-0.03, middle=(8.0, -5.0), tags=_RTK),
 }
 
 
@@ -86,6 +97,7 @@ class Flight:
     scenes: dict[str, Scene]
     dem: DemSurface
     waves: Array
+    kind: Kind
 
 
 def height(waves: Array, lon: Array, lat: Array) -> Array:
@@ -115,10 +127,11 @@ def turn_of(place: Array, yaw: float, pitch: float, roll: float) -> Array:
     return np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]) @ body.T @ east_north_down(place[0], place[1])
 
 
-def seen(position: Array, turn: Array, ground: Array) -> Array:
+def seen(kind: Kind, position: Array, turn: Array, ground: Array) -> Array:
     """Return pixels of ground in ECEF; NaN outside the photo."""
     x, y, z = turn @ (ground - position).T
-    image = np.stack([COLUMNS / 2 + FOCAL * x / z, ROWS / 2 + FOCAL * y / z], axis=1)
+    scale = FOCAL * (1.0 + kind.k1 * (x**2 + y**2) / z**2) / z
+    image = np.stack([COLUMNS / 2 + kind.middle[0] + scale * x, ROWS / 2 + kind.middle[1] + scale * y], axis=1)
     inside = (z > 0) & (image > 0).all(axis=1) & (image < (COLUMNS, ROWS)).all(axis=1)
     image[~inside] = np.nan
     return image
@@ -148,8 +161,8 @@ def fly(kind: Kind, photos: int, seed: int, folder: Path) -> Flight:
         name: write_photo(folder / f"{name}.tif", place, angles, kind)
         for name, (place, angles) in zip(names, tags, strict=True)
     }
-    points = ties(positions, turns, waves, list(scenes), random)
-    return Flight(positions, turns, points, scenes, write_dem(folder / "dem.tif", waves, random), waves)
+    points = ties(kind, positions, turns, waves, list(scenes), random)
+    return Flight(positions, turns, points, scenes, write_dem(folder / "dem.tif", waves, random), waves, kind)
 
 
 def write_photo(path: Path, place: Array, angles: Array, kind: Kind) -> Scene:
@@ -174,12 +187,14 @@ def write_photo(path: Path, place: Array, angles: Array, kind: Kind) -> Scene:
     return open_scene(path, SceneOptions(sensor="photo", sensor_options=kind.options))
 
 
-def ties(positions: Array, turns: Array, waves: Array, names: list[str], random: np.random.Generator) -> BlockPoints:
+def ties(
+    kind: Kind, positions: Array, turns: Array, waves: Array, names: list[str], random: np.random.Generator
+) -> BlockPoints:
     """Return ties with errors, some of them gross; about 40 for each photo."""
     spread = 1.2 * np.abs(positions - positions.mean(axis=0)).max() + ABOVE / 2
     lonlat = np.array(MIDDLE) + random.uniform(-spread, spread, (60 * len(names), 2)) / (86_000.0, 111_000.0)
     ground = to_ecef(np.column_stack([lonlat, height(waves, *lonlat.T)]))
-    images = np.array([seen(position, turn, ground) for position, turn in zip(positions, turns, strict=True)])
+    images = np.array([seen(kind, position, turn, ground) for position, turn in zip(positions, turns, strict=True)])
     visible = np.isfinite(images).all(axis=2)
     shown = np.flatnonzero(visible.sum(axis=0) >= 2)[: 15 * len(names)]
     image, point = np.nonzero(visible[:, shown])
@@ -233,7 +248,7 @@ def off_by(flight: Flight, models: Any) -> Array:
     places = [np.column_stack([lonlat + step, height(flight.waves, *(lonlat + step).T)]) for step in steps]
     found = []
     for name, position, turn in zip(flight.scenes, flight.positions, flight.turns, strict=True):
-        at, east, north = (seen(position, turn, to_ecef(place)) for place in places)
+        at, east, north = (seen(flight.kind, position, turn, to_ecef(place)) for place in places)
         by_metre = np.stack([east - at, north - at], axis=2)
         away = models[name].ground_to_image(places[0]) - at
         away[~np.isfinite(by_metre).all(axis=(1, 2))] = np.nan
@@ -249,6 +264,25 @@ def figures(off: Array) -> tuple[float, float]:
     mean = np.nansum(off, axis=0) / np.maximum(counts, 1)[:, None]
     apart = (off - mean)[:, counts > 1] * np.sqrt(counts / np.maximum(counts - 1, 1))[None, counts > 1, None]
     return float(np.sqrt(np.nanmean(off**2))) / pixel, float(np.sqrt(2 * np.nanmean(apart**2))) / pixel
+
+
+def pairs_of(flight: Flight, fit: BlockFit, off: Array) -> dict[str, int]:
+    """Return how many pairs of photos there are, apart, warned of, silent, and outside their ellipse."""
+    names, counts = list(flight.scenes), dict.fromkeys(("pairs", "apart", "warned", "silent", "outside"), 0)
+    for join in joins_of(fit):
+        between = off[names.index(join.first)] - off[names.index(join.second)]
+        between = between[np.isfinite(between).all(axis=1)] / join.pixel
+        if len(between) < COMMON:
+            continue
+        mean = between.mean(axis=0)
+        size, square = float(np.hypot(*mean)), float(mean @ np.linalg.solve(join.covariance, mean))
+        weak = join.sigma > WEAK
+        counts["pairs"] += 1
+        counts["apart"] += size > APART
+        counts["warned"] += size > APART and weak
+        counts["silent"] += size > APART and not weak and square > CHANCE
+        counts["outside"] += square > ELLIPSE
+    return counts
 
 
 def of_block(flight: Flight, fit: BlockFit) -> float:
@@ -301,43 +335,63 @@ def trial(kind: Kind, photos: int, seed: int) -> dict[str, Any]:
             fit = adjust(models, flight.points, priors=priors, heights=DemHeights(flight.dem))
         except OrthoError as error:
             return {"naive": naive, "error": f"{type(error).__name__}: {error}"[:100].splitlines()[0]}
-        found, shift, spread = figures(off_by(flight, fit.models)), of_block(flight, fit), over_sigmas(flight, fit)
-        wrong = found[1] > WRONG or shift > FAR
-        return {"naive": naive, "found": found, "shift": shift, "wrong": wrong, "sigma0": fit.sigma0, "spread": spread}
+        off = off_by(flight, fit.models)
+        found, shift, pairs = figures(off), of_block(flight, fit), pairs_of(flight, fit, off)
+        shared = fit.shared_priors
+        return {
+            "naive": naive, "found": found, "shift": shift, "wrong": pairs["silent"] > 0 or shift > FAR,
+            "spread": over_sigmas(flight, fit), "pairs": pairs,
+            "camera": {} if shared is None else of_camera(kind, shared),
+        }  # fmt: skip
+
+
+def of_camera(kind: Kind, shared: SharedPriors) -> dict[str, float]:
+    """Return the errors of the parameters of the camera over their sigmas."""
+    pixel = 1e-6
+    truth = {"focal_length": FOCAL * pixel, "x0": kind.middle[0] * pixel, "y0": -kind.middle[1] * pixel, "k1": kind.k1}
+    sigmas = np.sqrt(np.diag(shared.left)) * shared.sigmas
+    rows = zip(shared.parameters, shared.means, sigmas, strict=True)
+    return {one.name: float((mean - truth.get(one.name, 0.0)) / sigma) for one, mean, sigma in rows}
+
+
+def told(good: list[dict[str, Any]]) -> str:
+    """Return what flights of a kind say together."""
+
+    def over(key: str, names: tuple[str, ...]) -> str:
+        values = [np.ravel(one[key][name]) for one in good for name in names if name in one[key]]
+        return f"{np.sqrt(np.mean(np.concatenate(values) ** 2)):.2f}" if values else "-"
+
+    ortho, apart, naive_ortho, naive_apart = (
+        np.median([one[key][k] for one in good]) for key in ("found", "naive") for k in (0, 1)
+    )
+    pairs = {key: sum(one["pairs"][key] for one in good) for key in good[0]["pairs"]}
+    spread = ", ".join(f"{part} {over('spread', of)}" for part, of in PARTS.items())
+    camera = ", ".join(f"{name} {over('camera', (name,))}" for name in good[0]["camera"])
+    return (
+        f"  orthos {ortho:.2f} px (naive {naive_ortho:.1f}), neighbours {apart:.2f} px (naive {naive_apart:.1f})\n"
+        f"  {pairs['pairs']} pairs: {pairs['apart']} apart, {pairs['warned']} warned, {pairs['silent']} silent; "
+        f"beyond {pairs['outside'] / max(pairs['pairs'], 1):.1%}\n"
+        f"  error over sigma: {spread}, "
+        f"block {np.sqrt(np.mean([one['shift'] ** 2 for one in good])):.2f} (worst of three axes); "
+        f"camera {camera}"
+    )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=int, default=30)
     parser.add_argument("--flights", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first flight")
     parser.add_argument("--kinds", default=",".join(KINDS))
     given = parser.parse_args()
-    print(
-        "kind       converged wrong  ortho px (naive)  neighbours px (naive)  sigma0  shift/sigma  plan, up, tilt, head"
-    )
     for name in given.kinds.split(","):
-        trials = [trial(KINDS[name], given.photos, seed) for seed in range(given.flights)]
+        trials = [trial(KINDS[name], given.photos, seed) for seed in range(given.first, given.first + given.flights)]
         good = [one for one in trials if "found" in one]
+        print(f"{name}: {len(good)} of {len(trials)} converged, {sum(one['wrong'] for one in good)} wrong")
         for message in sorted({one["error"] for one in trials if "error" in one}):
             print(f"  {message}")
-        if not good:
-            print(f"{name:10}  {0:4d}/{len(trials)}")
-            continue
-        spread = {
-            part: np.sqrt(np.mean([v**2 for one in good for parameter in of for v in one["spread"][parameter]]))
-            for part, of in PARTS.items()
-        }
-        ortho, apart, naive_ortho, naive_apart = (
-            np.median([one[key][k] for one in good]) for key in ("found", "naive") for k in (0, 1)
-        )
-        print(
-            f"{name:10} {len(good):4d}/{len(trials):<4d} {sum(one['wrong'] for one in good):5d}  "
-            f"{ortho:8.2f} ({naive_ortho:5.1f})"
-            f"  {apart:13.2f} ({naive_apart:5.1f})  {np.median([one['sigma0'] for one in good]):6.2f}"
-            f"  {np.sqrt(np.mean([one['shift'] ** 2 for one in good])):11.2f}  "
-            + ", ".join(f"{value:.2f}" for value in spread.values()),
-            flush=True,
-        )
+        if good:
+            print(told(good), flush=True)
     return 0
 
 

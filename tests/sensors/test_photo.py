@@ -138,7 +138,7 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     unknown = open_scene(path)
     assert [notice.code for notice in unknown.notices] == ["datum-unknown"]
     # The unknown datum, the height by air pressure, and five times a focal length within 2 % of 100 m.
-    assert unknown.priors["Z_L"].sigma == pytest.approx(math.sqrt(10.0**2 + DATUM_SIGMA**2 + 10.0**2))
+    assert unknown.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, DATUM_SIGMA))
     assert unknown.model.perspective_centre[2] == pytest.approx(ALTITUDE)
     above_geoid = opened(path, vertical="egm96")
     undulation = float(Vertical.parse("egm96").undulation(np.array([33.26]), np.array([39.5]))[0])
@@ -168,19 +168,18 @@ def test_sigmas_are_those_of_the_tags(tmp_path, tags, wanted):
     assert given.priors["kappa"].sigma == pytest.approx(math.radians(1.0))
 
 
-def test_the_focal_length_is_a_parameter_where_the_height_is_known_better(tmp_path):
-    rtk = {"drone-dji:RtkStdLon": "0.02", "drone-dji:RtkStdLat": "0.02", "drone-dji:RtkStdHgt": "0.03"}
-    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, **rtk}), calibrate="yes")
-    assert scene.model.param_names[-1] == "focal_length"
-    assert scene.priors["focal_length"].sigma == pytest.approx(0.02 * scene.model.interior.focal_length)
-    assert scene.priors["Z_L"].sigma == pytest.approx(0.03)
+def test_photos_share_the_camera_with_sigmas_of_its_source(tmp_path):
     data = "2018-09-07;400,400,0,0,0,0,0,0,0"
-    calibrated = opened(photo(tmp_path / "b.tif", xmp={**DJI, **rtk, "drone-dji:DewarpData": data}), calibrate="yes")
-    assert calibrated.priors["focal_length"].sigma == pytest.approx(0.005 * 400e-6)
-    # A height within 10 m says less than a focal length within 2 % of 100 m; the height has both errors.
-    plain = opened(photo(tmp_path / "c.tif"), calibrate="yes")
-    assert plain.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
-    assert plain.priors["Z_L"].sigma == pytest.approx(math.hypot(10.0, 10.0))
+    nominal = opened(photo(tmp_path / "a.tif"), calibrate="yes")
+    calibrated = opened(photo(tmp_path / "b.tif", xmp={**DJI, "drone-dji:DewarpData": data}), calibrate="yes")
+    lens = ("focal_length", "x0", "y0", "k1", "k2")
+    for scene, focal, k1 in ((nominal, 0.02, 0.05), (calibrated, 0.005, 0.01)):
+        assert scene.model.param_names[6:] == lens
+        assert all(scene.priors[name].shared == (name in lens) for name in scene.model.param_names)
+        assert scene.priors["focal_length"].sigma == pytest.approx(focal * scene.model.interior.focal_length)
+        assert scene.priors["k1"].sigma == k1
+    fixed = opened(tmp_path / "a.tif", calibrate="no")
+    assert fixed.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
 
 
 # -- cameras ---------------------------------------------------------------------------------------------------------
