@@ -19,7 +19,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability.known_points import ContradictedPoint
 from ortho_pipeline.block.reliability.suspects import GrossError
 from ortho_pipeline.block.shared.common_error import BlockCommonError
-from ortho_pipeline.block.shared.priors import SharedPriors
+from ortho_pipeline.block.shared.priors import SharedParameterRecord, SharedPriors
 from ortho_pipeline.block.variances.components import Variances, VariancesRecord
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors import InputError
@@ -130,6 +130,7 @@ class BlockAdjustment(Record):
     common_error: CommonErrorRecord | None = None
     shared_errors: dict[str, SharedErrors] | None = None
     heights: HeightsRecord | None = None
+    shared_parameters: tuple[SharedParameterRecord, ...] = ()
 
 
 def merged(*parts: Rmse | None) -> Rmse | None:
@@ -277,6 +278,8 @@ class BlockFit:
             shared["shared_errors"] = dict(self.shared_errors)
         if self.heights is not None:
             shared["heights"] = self.heights
+        if self.shared_priors is not None:
+            shared["shared_parameters"] = self.shared_priors.records
         return BlockAdjustment(
             gauge=self.gauge,
             sigma0=self.sigma0,

@@ -11,6 +11,7 @@ import numpy as np
 from ortho_pipeline.block.fit import BlockAdjustment, BlockFit, BlockPoint, Ray, merged
 from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.network import NetworkRecord
+from ortho_pipeline.block.shared.priors import SharedParameterRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
@@ -220,7 +221,8 @@ def summary_text(report: BlockReport) -> str:
     sigma0 = "unknown" if adjustment.sigma0 is None else f"{adjustment.sigma0:.3g}"
     lines += variance_lines(adjustment.variances)
     expected, unknown = sigma_lines(report), head.figure == UNKNOWN
-    lines += [*height_lines(adjustment.heights), *([] if unknown else expected)]
+    lines += [*height_lines(adjustment.heights), *camera_lines(adjustment.shared_parameters)]
+    lines += [] if unknown else expected
     lines.append(
         f"Redundancy {adjustment.redundancy}, sigma0 {sigma0}, {counted(len(adjustment.rejected), 'gross error')}"
     )
@@ -267,6 +269,21 @@ def height_lines(heights: HeightsRecord | None) -> list[str]:
         f"sigma {significant(heights.sigma_m)} m ({heights.sigma_is}), "
         f"bias {heights.bias_m:+.2f} m (sigma {significant(heights.bias_sigma_m)} m)"
     ]
+
+
+def camera_lines(parameters: Sequence[SharedParameterRecord]) -> list[str]:
+    """Say what the block found of cameras: focal lengths, and which parameters changed significantly."""
+    if not parameters:
+        return []
+    found = []
+    for one in parameters:
+        if one.name == "focal_length":
+            change, sigma = (100 * part / one.prior.value for part in (one.value - one.prior.value, one.sigma))
+            found.append(
+                f"Camera of {counted(one.images, 'image')}: focal length {change:+.2f} % (sigma {sigma:.2f} %)"
+            )
+    changed = ", ".join(dict.fromkeys(one.name for one in parameters if one.significant)) or "none"
+    return [*found, f"Parameters of the camera that changed significantly: {changed}"]
 
 
 def sigma_lines(report: BlockReport) -> list[str]:

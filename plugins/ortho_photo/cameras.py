@@ -34,8 +34,17 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FILM_MM = 36.0
 #: Standard deviations of the focal length and principal point, in parts of the focal length, and of distortion: of a
 #: maker's calibration, and of a nominal camera without distortion.
-CALIBRATED = {"focal_length": 0.005, "x0": 0.003, "y0": 0.003, "k1": 0.01, "k2": 0.01}
-NOMINAL = {"focal_length": 0.02, "x0": 0.01, "y0": 0.01, "k1": 0.05, "k2": 0.05}
+CALIBRATED = {
+    "focal_length": 0.005,
+    "x0": 0.003,
+    "y0": 0.003,
+    "k1": 0.01,
+    "k2": 0.01,
+    "k3": 0.01,
+    "p1": 1e-3,
+    "p2": 1e-3,
+}
+NOMINAL = {"focal_length": 0.02, "x0": 0.01, "y0": 0.01, "k1": 0.05, "k2": 0.05, "k3": 0.05, "p1": 2e-3, "p2": 2e-3}
 _PIXEL = 1e-6
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
 
@@ -52,7 +61,9 @@ class PhotoCamera:
     def sigmas(self) -> dict[str, float]:
         """Standard deviations of parameters of the interior orientation, in their units."""
         metres = self.interior.focal_length
-        return {name: part if name in ("k1", "k2") else part * metres for name, part in self.known.items()}
+        return {
+            name: part * metres if name in ("focal_length", "x0", "y0") else part for name, part in self.known.items()
+        }
 
 
 def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -> PhotoCamera:

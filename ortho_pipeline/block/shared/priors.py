@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from ortho_pipeline.block.equations.elimination import Elimination
 from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Selection
@@ -28,10 +29,16 @@ from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.errors import NotConverged
 from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
 from ortho_pipeline.estimation.observations.prior import Prior
+from ortho_pipeline.estimation.records import Parameter
+from ortho_pipeline.files.json.records import Count, Record
 from ortho_pipeline.models.base import Array
 
 #: Standard deviation of what images have of their own of a shared parameter, over that of the prior.
 OWN = 1e-3
+#: A change of a parameter is significant if one as large by chance is less probable than this.
+SIGNIFICANT = 0.001
+#: Less information than this part is none.
+_TOLD = 0.05
 #: The estimate is stable if it changes by less than this (standard deviations).
 _STABLE, _ROUNDS = 0.01, 8
 
@@ -44,6 +51,27 @@ class SharedParameter:
     images: tuple[str, ...]
     prior: Prior
     columns: tuple[int, ...]
+
+
+class SharedParameterRecord(Record):
+    """A shared parameter as it is published: prior and estimate in its unit, in so many `images`.
+
+    `determined` is the part of its information that comes from the block. `chance` is the probability of so large a
+    change if the prior were exact; None if the block does not determine it.
+    """
+
+    name: str
+    images: Count
+    prior: Parameter
+    value: float
+    sigma: float
+    determined: float
+    chance: float | None
+
+    @property
+    def significant(self) -> bool:
+        """Whether the block contradicts the value before the adjustment."""
+        return self.chance is not None and self.chance < SIGNIFICANT
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,6 +123,30 @@ class SharedPriors(CommonUnknown):
     def of_points(self) -> Array:
         """Their part ``(N, 3, 3)`` of the covariance of the ground, m²."""
         return np.asarray(self.by_points @ self.left @ self.by_points.swapaxes(1, 2))
+
+    @property
+    def records(self) -> tuple[SharedParameterRecord, ...]:
+        """What is published of them."""
+        left = self.left
+        # The covariance of the estimate if the priors are exact.
+        alone = np.diag(left - left @ left)
+        found = []
+        for one, mean, value, own, variance in zip(
+            self.parameters, self.means, self.value, np.diag(left), alone, strict=True
+        ):
+            told = float(1.0 - own)
+            found.append(
+                SharedParameterRecord(
+                    name=one.name,
+                    images=len(one.images),
+                    prior=Parameter(value=one.prior.mean, sigma=one.prior.sigma),
+                    value=float(mean),
+                    sigma=float(np.sqrt(own)) * one.prior.sigma,
+                    determined=told,
+                    chance=float(chi2.sf(value**2 / variance, 1)) if told > _TOLD else None,
+                )
+            )
+        return tuple(found)
 
     def applied(self, problem: BlockProblem) -> BlockProblem:
         """Return the problem with the estimates as means of the images' priors."""
