@@ -392,7 +392,6 @@ def _result(
     covariance, ground_covariance, shared = _covariances(solved, found, common)
     # Points that take no part still have a place where their rays meet, if they do.
     local = np.where(active[:, None], state.local, np.nan)
-    ground = problem.frame.geodetic(local)
     # What is a tie is not compared with anything, whatever the file says of its ground.
     stated = np.where(points.tie[:, None], np.nan, points.known_in(GEODETIC))
     known = stated if common is None else common.corrected(stated)
@@ -408,7 +407,7 @@ def _result(
         models=dict(zip(points.images, state.models, strict=True)),
         start=dict(zip(points.images, start, strict=True)),
         points=points,
-        ground=ground,
+        ground=problem.frame.geodetic(local),
         ground_covariance=ground_covariance + of_points,
         residuals=points.measured - predict(problem.frame, state.models, points, local),
         back_projected=_reprojected(problem.frame, points, state.models, known),
