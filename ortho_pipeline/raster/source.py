@@ -135,15 +135,12 @@ def _opened(
     try:
         dataset, block = open_seen(place, roots, drivers, siblings)
     except (RuntimeError, UnicodeDecodeError) as error:
-        if not isinstance(place, VsiPath) and Path(name).is_dir():
-            remedy = "give the images in it by name, or a product folder that GDAL opens"
-            raise InputError("this is a folder, not an image", file=name, remedy=remedy) from error
         # What GDAL quotes of a damaged file need not be UTF-8.
-        raise InputError(
-            f"GDAL cannot open this as a raster ({first_line(error)})",
-            file=name,
-            remedy="give a raster in an allowed format ('ortho doctor' lists them)",
-        ) from error
+        fault = f"GDAL cannot open this as a raster ({first_line(error)})"
+        remedy = "give a raster in an allowed format ('ortho doctor' lists them)"
+        if not isinstance(place, VsiPath) and Path(name).is_dir():
+            fault, remedy = "this is a folder, not an image", "give its images by name, or a product that GDAL opens"
+        raise InputError(fault, file=name, remedy=remedy) from error
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
     return dataset, block
