@@ -256,7 +256,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows.append(
         (
             "ASPRS 2023, horizontal class",
-            "RMSE including the error of the check points, rounded up to 1 cm",
+            "RMSE including the error of the check points, rounded up to whole centimetres",
             f"{found.rmse:.2f} m{survey}",
             f"{class_size(found.class_cm)}{needs}",
         )
