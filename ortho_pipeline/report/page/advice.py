@@ -108,6 +108,9 @@ _LOOK: dict[str, str] = {
 _KNOW: dict[str, str] = {
     "control-without-height": "Add heights if you have them.",
     "unstated-sigma": Text("State the accuracy of the points with ", Setting("points.ground_sigma"), "."),
+    "parameters-not-justified": Text(
+        "Use a simpler correction (", Setting("points.correction", "shift"), "), or add ", Setting("points.prune"), "."
+    ),
     "parameters-removed": "Nothing to do: the points did not justify these parameters.",
     "relative-to-reference": "Measure check points if the absolute position matters.",
     "ortho-relative": Text("State the accuracy of the reference with ", Setting("match.reference_sigma"), "."),
