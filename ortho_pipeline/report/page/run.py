@@ -114,10 +114,13 @@ def _headline(states: Mapping[str, int], count: int) -> str:
     """Say how many orthos there are, how many of them are tested, and how many scenes failed."""
     failed = states.get("failed", 0)
     kinds = {"ready": "tested", "stop": STATES["stop"], "untested": STATES["untested"]}
-    which = ", ".join(f"{states[state]} {what}" for state, what in kinds.items() if states.get(state))
-    parts = [f"{counted(count - failed, 'ortho')} ({which})"] if which else []
+    which = {what: states[state] for state, what in kinds.items() if states.get(state)}
+    orthos = counted(count - failed, "ortho")
+    parts = [f"{orthos} ({', '.join(f'{number} {what}' for what, number in which.items())})"] if len(which) > 1 else []
+    if len(which) == 1:
+        parts = [counted(count - failed, "tested ortho") if "tested" in which else f"{orthos} {next(iter(which))}"]
     parts += [f"{failed} failed"] if failed else []
-    return f"{counted(count, 'scene')}: {', '.join(parts)}"
+    return f"{counted(count, 'scene')}: {'; '.join(parts)}"
 
 
 def _summary(rows: Sequence[SceneRow]) -> str:
