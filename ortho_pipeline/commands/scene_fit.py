@@ -148,7 +148,8 @@ class Adjusted:
             or len(weak) < 2
         ):
             return []
-        text = f"the points do not justify {len(weak)} of {len(names)} parameters of the correction: {', '.join(weak)}"
+        number = f"{len(weak)} of {counted(len(names), 'parameter')}"
+        text = f"the points do not justify {number} of the correction: {', '.join(weak)}"
         return [Notice("parameters-not-justified", text, parameters=list(weak))]
 
     def _elsewhere(self) -> list[Notice]:

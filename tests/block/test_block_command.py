@@ -302,7 +302,11 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     rms = report["adjustment"]["object_rms"]["check"]
     assert notice["rmse_m"] == pytest.approx({"plan": rms["plan"], "height": rms["h"]})
     page = (out / "block_report.html").read_text()
-    assert page.index('<li class="stop">') < page.index("p9: its given height differs by") < page.index('<li class="look">')
+    assert (
+        page.index('<li class="stop">')
+        < page.index("p9: its given height differs by")
+        < page.index('<li class="look">')
+    )
     # Near enough that the RMSE still says how accurate the others are: named first, and the claim stands.
     stereo.ground[9] = truth + np.array([0.0, 0.0, 20.0])
     said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "near")
