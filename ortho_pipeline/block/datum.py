@@ -84,10 +84,11 @@ def with_datum(
     typical = float(np.sqrt(np.mean(sigmas**2)))
     slow = SLOW * typical / max(missed, _LEAST_WRONG) if by_ties else 0.0
     held = _held(linear, sigmas, slow)
-    assumed = "" if hold is not None or trusted.any() else "assumed "
+    assumed = hold is None and not trusted.any()
     ground = sigmas[np.isfinite(per_metre)] / per_metre[np.isfinite(per_metre)]
     on_ground = f" ({_span(ground)} m on the ground)" if len(ground) else ""
-    of = f"{assumed}sigma {_span(sigmas)} px in the image{on_ground}, for {len(held)} of {problem.size} parameters"
+    of = f"{'Assumed accuracy' if assumed else 'Accuracy'} of the delivered models: sigma {_span(sigmas)} px in the "
+    of += f"image{on_ground}, for {len(held)} of {problem.size} parameters"
     of += "; other sigmas depend on it" if assumed else ""
     if trusted.any() and accuracies:
         stated_m = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
@@ -124,15 +125,15 @@ def _pixels_per_metre(linear: Linear) -> Array:
 def _why(control: int, by_ties: bool, of: str) -> str:
     """Return the datum of a block whose orientation is held with a sigma."""
     if control:
-        return f"{counted(control, 'control point')}, and the orientation is held at its start values ({of})"
+        return f"{counted(control, 'control point')}, and the orientation is held at its start values. {of}"
     if by_ties:
         return (
             "no control points: positions and heights are only as accurate as the delivered models. Ties correct the "
-            f"images relative to each other; all else keeps its start value ({of})"
+            f"images relative to each other; all else keeps its start value. {of}"
         )
     return (
-        "no control points: positions come from the delivered models and from the shape of the terrain in the DEM, "
-        f"heights from the DEM ({of})"
+        "no control points. Positions come from the delivered models and from the terrain in the DEM; heights come "
+        f"from the DEM. {of}"
     )
 
 

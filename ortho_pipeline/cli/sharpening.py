@@ -56,8 +56,9 @@ def sharpen(
 ) -> None:
     """Pan-sharpen MS_ORTHO with PAN_ORTHO.
 
-    Both orthos show one acquisition. GDAL sharpens the multispectral bands (weighted Brovey). The command measures how
-    well the orthos agree, and compares the quality with upsampling at reduced resolution.
+    Both orthos show one acquisition; the result covers where they overlap. GDAL sharpens the multispectral bands
+    (weighted Brovey). The command measures how well the orthos agree. At reduced resolution it compares the sharpened
+    image with one that is only upsampled.
     """
     from ortho_pipeline.commands.sharpening import sharpen as sharpening
 

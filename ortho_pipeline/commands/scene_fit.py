@@ -100,7 +100,7 @@ class Adjusted:
             outside = np.array(points.ids)[~inside].tolist()
             text = f"points outside the image, but used: {', '.join(outside)}"
             notices.append(Notice("outside-of-image", text, points=outside))
-        notices += self._elsewhere()
+        notices += self._elsewhere() + self._too_many_parameters()
         if len(adjusted.param_names):
             notices += uncovered(points.image[adjusted.used], (self.scene.width, self.scene.height))
         if adjusted.used.any() and len(adjusted.param_names) and adjusted.redundancy == 0:
@@ -136,6 +136,21 @@ class Adjusted:
             for notice in self.fit.outlying
             if notice.role == "control" or notice.id not in named
         ]
+
+    def _too_many_parameters(self) -> list[Notice]:
+        """Return a notice if several parameters of a correction beyond a shift are not significant."""
+        adjusted = self.fit
+        names, weak = adjusted.param_names, adjusted.not_justified
+        if (
+            not isinstance(adjusted.model, ImageCorrection)
+            or adjusted.redundancy < 1
+            or len(names) < 3
+            or len(weak) < 2
+        ):
+            return []
+        number = f"{len(weak)} of {counted(len(names), 'parameter')}"
+        text = f"the points do not justify {number} of the correction: {', '.join(weak)}"
+        return [Notice("parameters-not-justified", text, parameters=list(weak))]
 
     def _elsewhere(self) -> list[Notice]:
         """Return a warning if the delivered model shows another place than the points."""

@@ -321,7 +321,7 @@ def _not_one(candidates: list[Sensor], sensors: Iterable[Sensor], dataset: Any) 
             Setting("scene.rpc", "FILE"),
             ", or fit a model to control points with ",
             Setting("points.fit_model", "NAME"),
-            ". To see what a sensor lacks, repeat with ",
+            " ('ortho compare' recommends one). To see which files a sensor needs and does not find, repeat with ",
             Setting("scene.sensor", "NAME"),
             hint,
         ),

@@ -39,29 +39,39 @@ def ground_of(
     """
     ground = np.array([row.ground for row in table.rows], dtype=float).reshape(-1, 3)
     wheres = [row.where for row in table.rows]
-    full = _crs_of(path, table, crs)
+    heights = bool(np.isfinite(ground[:, 2]).any())
+    full = _crs_of(path, table, crs, vertical, heights)
     if full.is_geocentric:
         return _from_geocentric(path, table, full, vertical, ground, wheres)
     plane = horizontal(full)
     _check_kind(path, table, plane)
     _check_places(path, plane, wheres, ground)
-    datum, unit = _vertical_of(path, table, full, vertical, bool(np.isfinite(ground[:, 2]).any()))
+    datum, unit = _vertical_of(path, table, full, vertical, heights)
     ground[:, 2] *= unit
     return _ellipsoidal(path, wheres, ground, plane, datum), plane
 
 
-def _crs_of(path: str | os.PathLike[str], table: Table, option: str | pyproj.CRS | None) -> pyproj.CRS:
+def _crs_of(
+    path: str | os.PathLike[str],
+    table: Table,
+    option: str | pyproj.CRS | None,
+    vertical: str | Vertical | None,
+    heights: bool,
+) -> pyproj.CRS:
     try:
         stated = None if table.crs is None else parse_crs(table.crs)
     except CrsError as error:
         raise CrsError(error.message, file=path, field="CRS", remedy=error.remedy) from error
     wanted = None if option is None else parse_crs(option)
     if stated is None and wanted is None:
+        # The CRS may declare the height datum too.
+        unknown = heights and vertical is None and table.vertical is None and table.assumed_vertical is None
+        datum = (", and ", Setting("points.vertical", "DATUM"), f" ({VERTICAL_FORMS})") if unknown else ()
         raise CrsError(
-            "the CRS of these points is unknown",
+            f"the CRS of these points is unknown{', and so is their height datum' if unknown else ''}",
             file=path,
             field="points.crs",
-            remedy=Text("give ", Setting("points.crs", "EPSG:n")),
+            remedy=Text("give ", Setting("points.crs", "EPSG:n"), *datum),
         )
     if stated is None or wanted is None:
         return wanted if stated is None else stated  # type: ignore[return-value]

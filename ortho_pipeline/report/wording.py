@@ -13,9 +13,10 @@ from ortho_pipeline.display.numbers import (
     px,
     size_m,
 )
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
 from ortho_pipeline.estimation.records import Adjustment, Rmse, RmseOnGround, RmsesOnGround
+from ortho_pipeline.models import families
 from ortho_pipeline.report.map_scale import PIXEL, POSITION, scale_text, usual_scale
 from ortho_pipeline.report.matching import MatchingRecord, Tested, is_relative
 from ortho_pipeline.report.records import UNKNOWN, Headline, MapScaleRecord, SceneReport
@@ -185,6 +186,16 @@ def unsettled(report: SceneReport) -> str | None:
     return None
 
 
+def option_of_choice(report: SceneReport) -> Text | None:
+    """Return the option with which other commands use the recommended model."""
+    if report.comparison is None or report.comparison.recommendation.model is None:
+        return None
+    model = report.comparison.recommendation.model
+    if model in {family.name for family in families()}:
+        return Text(Setting("points.fit_model", model))
+    return Text(Setting("points.correction", model.partition("+")[2] or "none"))
+
+
 def runner_up(report: SceneReport) -> str | None:
     """Say how a recommended model compares to the others, and how far points that chose it are a test of it."""
     comparison = report.comparison
@@ -256,7 +267,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows.append(
         (
             "ASPRS 2023, horizontal class",
-            "RMSE including the error of the check points, rounded up to 1 cm",
+            "RMSE including the error of the check points, rounded up to whole centimetres",
             f"{found.rmse:.2f} m{survey}",
             f"{class_size(found.class_cm)}{needs}",
         )

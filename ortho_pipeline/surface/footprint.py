@@ -406,15 +406,34 @@ def choose_grid(
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     if (np.array(step) > (high - low)[:2]).all():
-        unit = crs.axis_info[0].unit_name
-        usual = f"{two_digits(ground_sample_distance(model, crs, width, height, footprint.middle)):.12f}".rstrip("0")
         raise InputError(
-            f"a resolution of {step[0]:g} means {step[0]:g} {unit}s in {crs.name!r}; "
+            f"a resolution of {step[0]:g} means {step[0]:g} {crs.axis_info[0].unit_name}s in {crs.name!r}; "
             "the whole scene is smaller than one pixel",
             field="output.resolution",
-            remedy=Text("did you mean ", Setting("output.resolution", usual), "?"),
+            remedy=_finer(model, crs, size, footprint.middle, step[0]),
         )
     return Grid.of_extent(crs, (low[0], low[1], high[0], high[1]), step, align=True)
+
+
+def _finer(model: SensorModel, crs: pyproj.CRS, size: tuple[int, int], level: float, step: float) -> Text:
+    """Return the remedy for a pixel larger than the scene; in degrees, `step` is probably metres."""
+    own = ground_sample_distance(model, crs, *size, level)
+    usual = f"the scene's own pixel is {_plain(own)}"
+    if not crs.is_geographic:
+        return Text("give a smaller ", Setting("output.resolution"), f": {usual}")
+    in_metres = output_crs(model, *size)
+    metres = ground_sample_distance(model, in_metres, *size, level)
+    return Text(
+        f"for {step:g} m give ",
+        Setting("output.resolution", _plain(step * own / metres)),
+        f" ({usual}, {two_digits(metres):g} m), or choose a CRS in metres with ",
+        Setting("output.crs", f"EPSG:{in_metres.to_epsg()}"),
+    )
+
+
+def _plain(value: float) -> str:
+    """Write two significant digits without an exponent."""
+    return f"{two_digits(value):.12f}".rstrip("0").rstrip(".")
 
 
 def scene_pixels(model: SensorModel, footprint: Footprint, grid: Grid) -> float:

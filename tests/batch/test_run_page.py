@@ -45,7 +45,7 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
     assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
-    assert ">2 of 4 scenes ready; 1 failed, 1 of unknown accuracy</p>" in page
+    assert ">4 scenes: 3 orthos (2 tested, 1 of unknown accuracy); 1 failed</p>" in page
     assert "2 tested at check points: RMSE 0.40 to 6.00 m." in page
     # What to look at stands in the row, gravest first, and that nothing tests a scene is the first of all.
     assert "No point tests the accuracy of this result." in rows[1]
@@ -83,8 +83,20 @@ def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_pat
     # Before what nothing tests, and out of the span of RMSEs.
     assert ["untested" in rows[1], '<li class="look">' in rows[2], "6 check points<" in rows[2]] == [True] * 3
     page = (tmp_path / "index.html").read_text()
-    assert ">1 of 3 scenes ready; 1 with errors, 1 of unknown accuracy</p>" in page
+    assert ">3 scenes: 3 orthos (1 tested, 1 with errors, 1 of unknown accuracy)</p>" in page
     assert "1 tested at check points: RMSE 0.40 m." in page
+
+
+def test_the_headline_counts_orthos_and_not_scenes(tmp_path):
+    untested, failed = scene("untested"), scene("failed", error="no DEM")
+    untested["facts"]["rmse_px"]["loo"] = None
+    for scenes, head in (
+        ([scene("one", 0.2), scene("two", 0.3), failed], "3 scenes: 2 tested orthos; 1 failed"),
+        ([untested], "1 scene: 1 ortho of unknown accuracy"),
+        ([failed], "1 scene: 1 failed"),
+    ):
+        write_run_page(tmp_path / "index.html", "june", scenes)
+        assert f">{head}</p>" in (tmp_path / "index.html").read_text()
 
 
 def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):

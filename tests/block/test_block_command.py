@@ -302,7 +302,11 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     rms = report["adjustment"]["object_rms"]["check"]
     assert notice["rmse_m"] == pytest.approx({"plan": rms["plan"], "height": rms["h"]})
     page = (out / "block_report.html").read_text()
-    assert page.index('<li class="stop">') < page.index("p9: its height is") < page.index('<li class="look">')
+    assert (
+        page.index('<li class="stop">')
+        < page.index("p9: its given height differs by")
+        < page.index('<li class="look">')
+    )
     # Near enough that the RMSE still says how accurate the others are: named first, and the claim stands.
     stereo.ground[9] = truth + np.array([0.0, 0.0, 20.0])
     said = run("adjust", *stereo.images, "--points", stereo.write(), "-o", tmp_path / "near")
@@ -310,7 +314,7 @@ def test_the_verdict_leads_with_known_points_that_contradict_the_block(stereo: S
     assert "Good enough for maps at 1:" in verdict_of(tmp_path / "near")
     assert verdict_of(tmp_path / "near").endswith("This does not cover heights.")
     assert (tmp_path / "near" / "block_report.html").read_text().count('class="doubted"') == 1
-    assert "Warning: Check point p9: its height is" in said
+    assert "Warning: Check point p9: its given height differs by" in said
 
 
 def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:

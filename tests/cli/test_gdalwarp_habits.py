@@ -352,7 +352,8 @@ def test_metres_given_as_degrees_are_refused_with_the_usual_size(refused, tmp_pa
     said = refused("-t_srs", "EPSG:4326", "-tr", 30, 30, "-o", tmp_path / "out")
     assert "a resolution of 30 means 30 degrees" in said
     # 400 x 300 pixels cover 0.02 x 0.013 degrees.
-    assert "did you mean --resolution 0.000047?" in said
+    assert "for 30 m give --resolution 0.00029 (the scene's own pixel is 0.000047, 4.8 m)" in said
+    assert "or choose a CRS in metres with --output-crs EPSG:" in said
 
 
 def test_outputs_named_as_a_file_are_refused(refused, tmp_path):

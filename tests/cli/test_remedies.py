@@ -300,6 +300,16 @@ def _formats(printed: Printed, folder: Path) -> None:
     assert "GTiff" in printed.paste(refused(open_dataset, folder / "text.tif"))
 
 
+@case("host", "ortho compare")
+def _without_a_model(printed: Printed, folder: Path) -> None:
+    bare = tiff(folder / "bare.tif", np.zeros((1000, 1000), np.uint8))
+    said = printed.paste(
+        refused(open_scene, bare),
+        str(bare), "--gcps", str(SAMPLE / "gcps.geojson"), "--dem", str(SAMPLE / "dem.tif"), "--models", "affine3d,dlt",
+    )  # fmt: skip
+    assert "Recommended: " in said
+
+
 # -- heights ---------------------------------------------------------------------------------------------------------
 
 

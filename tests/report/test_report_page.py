@@ -60,6 +60,25 @@ def run(tmp_path_factory) -> Path:
     return folder / "out" / "index.html"
 
 
+def test_the_page_of_a_comparison_tells_the_next_command(made):
+    page = made["compare"].files["html"].read_text(encoding="utf-8")
+    assert (
+        "run <code>ortho rectify</code> with the same image, points and heights, and <code>--correction shift</code>"
+        in page
+    )
+
+
+def test_a_correction_with_parameters_that_the_points_do_not_justify_is_noted(made):
+    document = json.loads(made["rectify"].files["report"].read_text())
+    (notice,) = [one for one in document["notices"] if one["code"] == "parameters-not-justified"]
+    assert notice["parameters"] == document["adjustment"]["statistics"]["not_justified"]
+    assert {"row_per_row", "col_per_col"} <= set(notice["parameters"])
+    page = made["rectify"].files["html"].read_text(encoding="utf-8")
+    assert "Use a simpler correction (<code>--correction shift</code>), or add <code>--prune</code>." in page
+    shift = json.loads(made["compare"].files["report"].read_text())
+    assert "parameters-not-justified" not in {one["code"] for one in shift["notices"]}
+
+
 @pytest.mark.parametrize("which", ["rectify", "compare", "bare"])
 def test_report_has_its_published_schema(made, which):
     schema = json.loads((ROOT / "docs" / "report.schema.json").read_text())

@@ -261,5 +261,5 @@ def test_the_page_shows_figure_4(reproduced):
     for name, letter in zip(ikonos.TABLE_2, "abcdef", strict=True):
         assert f"Figure 4 ({letter}): {ikonos.NAMES[name]}" in html
     assert html.count('class="check-head"') > 60
-    assert "over the tangent" in html
+    assert "divided by the tangent" in html
     assert "Table 2" in text(document)

@@ -248,7 +248,7 @@ def test_what_is_not_reproduced_is_said_to_be_so(document):
 
     for start in ("The slow-down", "DLT is not", "Discrepancies at"):
         assert verdict(start) == "reproduced"
-    for start in ("Height to base", "Scene 471890", "Points closer", "Pixels are"):
+    for start in ("Height to base", "Scene 471890", "Points closer", "A detector element"):
         assert verdict(start) == "by settings"
     # Neighbours with 0.1, not 0.2 to 0.3; edges of 1.6 px; other parameters; changes beyond what cannot be seen.
     for start in ("Neighbouring points", "Edges do not", "In scene 471890", "Without them", "Without control"):

@@ -39,17 +39,14 @@ class ContradictedPoint(Record):
     def notice(self) -> Notice:
         """Say it to people."""
         kept = "the accuracy still counts it" if self.role == "check" else "the adjustment still uses it"
-        text = (
-            f"{self.role} point {self.point}: {self.place} from where the block puts it; {kept}: check its "
-            "coordinates and measurements"
-        )
+        text = f"{self.role} point {self.point}: {self.place}; {kept}: check its coordinates and measurements"
         return Notice("contradicting-point", text, point=self.point, role=self.role)
 
     @property
     def place(self) -> str:
         """How far which part of it is off."""
-        where = {"plan": "its place in plan is", "height": "its height is", "ground": "its ground is"}[self.what]
-        return f"{where} {self.metres:.2f} m ({self.sigmas:.1f} sigma)"
+        what = {"plan": "position in plan", "height": "height", "ground": "position"}[self.what]
+        return f"its given {what} differs by {self.metres:.2f} m ({self.sigmas:.1f} sigma) from that of the block"
 
 
 def outlying(
@@ -125,9 +122,7 @@ def notices(doubts: Sequence[ContradictedPoint], points: BlockPoints, residuals:
         return [one.notice() for one in doubts]
     who = contradicting(int(off.sum()), int(tested.sum()), names, "the block")
     without = "" if not (tested & ~off).any() else f", {_both(rest)} without {'it' if off.sum() == 1 else 'them'}"
-    places = "; ".join(
-        f"{one.point}: {one.place} from where the block puts it" for one in doubts if one.point in names[:3]
-    )
+    places = "; ".join(f"{one.point}: {one.place}" for one in doubts if one.point in names[:3])
     text = f"{who}: RMSE {_both(every)} over all {tested.sum()}{without}; {places}"
     fields = {
         "count": int(tested.sum()),

@@ -136,8 +136,8 @@ def export(
 ) -> None:
     """Write the model of IMAGE for other programs.
 
-    With --gcps or --reference the command adjusts the model first. It writes an RPC as text, RPB, VRT or tag of a
-    copy, control points (measured ones, otherwise a grid) as VRT and copy, and geolocation arrays.
+    With --gcps or --reference the command adjusts the model first. It writes an RPC (text, RPB, XML, VRT, or tag in a
+    copy of the image), GCPs (VRT, or tags in a copy; measured points, otherwise a grid), or geolocation arrays.
     """
     from ortho_pipeline import commands
 

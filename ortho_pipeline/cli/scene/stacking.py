@@ -59,7 +59,7 @@ def stack(
     Each date is matched with earlier dates and with the same season of earlier years. One network of all pairs gives
     the smallest correction of each date that the matches justify. Wrong pairs and moving ground are found and left out.
     Raw scenes need heights; their pixels are resampled once, with the corrected model. A second run matches only new
-    pairs. Dates come from a list with the columns file and date, file names, STAC items, reports or metadata.
+    pairs. Dates come from a CSV list (columns file and date), from file names, STAC items, reports or metadata.
     """
     from ortho_pipeline.batch.shared.arrays import part_of_array
     from ortho_pipeline.batch.stack import command

@@ -27,7 +27,11 @@ from ortho_pipeline.surface.flat import FlatSurface
 GIVE_HEIGHTS = Text(
     "give ",
     Setting("surface.dem", "FILE"),
-    ", or ",
+    ", ",
+    Setting("surface.dem", "auto"),
+    " with ",
+    Setting("scene.allow_network"),
+    " to download one, or ",
     Setting("surface.height", "METRES"),
     " above the ellipsoid for flat ground",
 )

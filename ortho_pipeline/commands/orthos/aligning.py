@@ -215,7 +215,8 @@ def _justified(kept: MeasuredOrtho, field: DisplacementField, cells: Array) -> t
     better = 1.0 - float(with_field.sum() / max(without.sum(), 1e-300))
     bends = float(np.sqrt((field.mean(cells) ** 2).sum(axis=1).mean()))
     if chance < _CHANCE and better > _BETTER and bends > _BENDS:
-        return "field", f"it predicts held-out matches with {better:.0%} less variance than the simpler correction"
+        less = f"its mean square error is {100 * better:.0f} % smaller than that of an affine transformation"
+        return "field", f"at matches that took no part, {less}"
     points = kept.matched.matches.points
     inside = np.isin(np.round(points.image, 6).view("c16").ravel(), np.round(kept.image, 6).view("c16").ravel())
     correction, _ = by_matches(kept.scene, points.select(inside))

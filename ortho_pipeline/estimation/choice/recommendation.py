@@ -106,8 +106,8 @@ def _but(
             text += "but these points do not support it"
         else:
             better = errors[chosen] / errors[smallest]
-            text += f"but its expected error over the scene, {significant(errors[smallest], 3)} px, is "
-            text += "larger" if better < 1 else "less than 2 % smaller" if better <= _WORTH else "not clearly smaller"
+            text += f"but its expected error over the scene ({significant(errors[smallest], 3)} px) is "
+            text += "larger" if better < 1 else "better by less than 2 %" if better <= _WORTH else "not clearly smaller"
     fit = rows[chosen].fit
     weak = ", ".join(fit.reservations) if fit else ""
     return text + (f". {chosen} is {weak}: measure points there" if weak else "")

@@ -459,10 +459,13 @@ def _sentences(analysis: Covariance) -> list[str]:
             f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
-    chance = f"by chance alone it would exceed {analysis.critical:+.2f} only once in {round(1 / SIGNIFICANCE)} scenes"
+    chance = (
+        f"by chance alone, the larger of the two exceeds {analysis.critical:+.2f} in one of {round(1 / SIGNIFICANCE)}"
+    )
     result = "Systematic errors remain" if analysis.verdict == "systematic" else "No systematic error was found"
     sentences = [
-        f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) are correlated by {alike}; {chance}."
+        f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}; "
+        f"{chance} scenes."
     ]
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")

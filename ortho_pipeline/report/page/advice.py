@@ -108,6 +108,9 @@ _LOOK: dict[str, str] = {
 _KNOW: dict[str, str] = {
     "control-without-height": "Add heights if you have them.",
     "unstated-sigma": Text("State the accuracy of the points with ", Setting("points.ground_sigma"), "."),
+    "parameters-not-justified": Text(
+        "Use a simpler correction (", Setting("points.correction", "shift"), "), or add ", Setting("points.prune"), "."
+    ),
     "parameters-removed": "Nothing to do: the points did not justify these parameters.",
     "relative-to-reference": "Measure check points if the absolute position matters.",
     "ortho-relative": Text("State the accuracy of the reference with ", Setting("match.reference_sigma"), "."),
@@ -127,8 +130,8 @@ _KNOW: dict[str, str] = {
     "part-left-out": "Rectify the other parts separately.",
     "radar-on-a-plane": Text("Give a DEM (", Setting("surface.dem"), ")."),
     "no-rpc-text": "Nothing to do.",
-    "gcps-beside-rpc": "Tell users of other programs: these may use the points instead of the RPC.",
-    "piece-left-out": "Nothing to do, if you want this piece.",
+    "gcps-beside-rpc": "If you open the file in other programs: they may use the GCPs instead of the RPC.",
+    "piece-left-out": "Nothing to do, if you want only the file that you opened.",
 }
 _LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _LOOK), ("know", _KNOW))
 _NOTHING = "Nothing to do"

@@ -38,7 +38,7 @@ EVIDENCE = {
 }
 
 
-#: What a scene may be other than ready, the worst first.
+#: What a scene may be other than tested, the worst first.
 STATES = {"failed": "failed", "stop": "with errors", "untested": "of unknown accuracy"}
 
 
@@ -111,14 +111,20 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
 
 
 def _headline(states: Mapping[str, int], count: int) -> str:
-    """Say how many scenes are ready, and how many are not; every scene counts once."""
-    others = [f"{states[state]} {what}" for state, what in STATES.items() if states.get(state)]
-    ready = f"{states.get('ready', 0)} of {counted(count, 'scene')} ready"
-    return f"{ready}; {', '.join(others)}" if others else f"{counted(count, 'scene')}, all ready"
+    """Say how many orthos there are, how many of them are tested, and how many scenes failed."""
+    failed = states.get("failed", 0)
+    kinds = {"ready": "tested", "stop": STATES["stop"], "untested": STATES["untested"]}
+    which = {what: states[state] for state, what in kinds.items() if states.get(state)}
+    orthos = counted(count - failed, "ortho")
+    parts = [f"{orthos} ({', '.join(f'{number} {what}' for what, number in which.items())})"] if len(which) > 1 else []
+    if len(which) == 1:
+        parts = [counted(count - failed, "tested ortho") if "tested" in which else f"{orthos} {next(iter(which))}"]
+    parts += [f"{failed} failed"] if failed else []
+    return f"{counted(count, 'scene')}: {'; '.join(parts)}"
 
 
 def _summary(rows: Sequence[SceneRow]) -> str:
-    """Say how accurate the scenes are that are ready, and from which points."""
+    """Say how accurate the tested orthos are, and from which points."""
     ready = [row for row in rows if row.state == "ready"]
     parts = []
     for kind, (_, name) in EVIDENCE.items():
@@ -126,7 +132,7 @@ def _summary(rows: Sequence[SceneRow]) -> str:
         if sizes:
             span = metres(sizes[0]) if len(sizes) == 1 else f"{min(sizes):.2f} to {metres(max(sizes))}"
             parts.append(f"{len(sizes)} tested at {name}: RMSE {span}")
-    return f"{'; '.join(parts)}." if parts else "no scene is ready."
+    return f"{'; '.join(parts)}." if parts else "no ortho is tested."
 
 
 def _about(rows: Sequence[SceneRow]) -> dict[str, str]:

@@ -31,7 +31,7 @@ from ortho_pipeline.report.summary import (
     first_notes,
     signals_of,
 )
-from ortho_pipeline.report.wording import fit_notes, runner_up, scale_rules, unsettled, verdict
+from ortho_pipeline.report.wording import fit_notes, option_of_choice, runner_up, scale_rules, unsettled, verdict
 
 if TYPE_CHECKING:
     from ortho_pipeline.imaging.matching import Matches
@@ -79,6 +79,7 @@ def write_report_html(
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         unsettled=unsettled(report),
         runner_up=runner_up(report),
+        option_of_choice=option_of_choice(report),
         doubted=doubted(adjustment.notices) & {one.id for one in adjustment.points},
         of_fit=not adjustment.rmse.check and bool(adjustment.rmse.loo) and bool(adjustment.parameters),
         too_short=_too_short(report),

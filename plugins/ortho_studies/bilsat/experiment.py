@@ -102,7 +102,7 @@ KNOBS = (
         PLACES,
         "places in a cell",
         "chosen",
-        "The lowest of this many places in each cell is measured, because road crossings are in plains and "
+        "In each cell so many places are drawn, and the lowest is measured, because road crossings are in plains and "
         "valleys. With one place, 3 % fewer predictions are within 1.5; with six, the same number.",
     ),
     Knob(
@@ -123,8 +123,8 @@ KNOBS = (
 )
 NAIVE = (
     "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for "
-    "the check points, for p unknowns and k points. It uses the noise of each model from the paper, which the "
-    "simulation must predict, and no geometry."
+    "the check points, for p unknowns and k points. It uses no geometry. It takes the noise of each model from "
+    "the paper; the simulation must predict this noise."
 )
 
 

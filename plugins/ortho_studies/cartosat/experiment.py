@@ -231,8 +231,9 @@ KNOBS = (
         simulated.CELLS,
         "places for each point",
         "fitted",
-        "The lowest of this many places are measured, because roundabouts are in settlements. It affects the "
-        "columns of the 3D affine model, whose parallel rays ignore the effect of height towards the sides.",
+        "So many places are drawn for each point on average, and the lowest ones are measured, because roundabouts "
+        "are in settlements. It affects the columns of the 3D affine model, whose parallel rays ignore the effect of "
+        "height towards the sides.",
         ("2|affine3d UTM|fore x", "2|affine3d UTM|aft x"),
     ),
     Knob(

@@ -93,8 +93,9 @@ KNOBS = (
         "",
         "published",
         "The slope of the city, through published heights: the railway station 1117 m, the centre (35.696 "
-        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. With these heights, 2D affine and "
-        "projective are a third too small. A tilt of 27 degrees would explain this, but there is no evidence for it.",
+        "degrees north) 1191 m, the northern limit (35.82 degrees) 1700 m. With these heights, the errors of 2D affine "
+        "and projective are a third smaller than in the paper. A tilt of 27 degrees would explain this, but there is "
+        "no evidence for it.",
     ),
     Knob(
         "REVERSED",
@@ -394,8 +395,8 @@ def _relief_note(relief: Array) -> str:
     expected, estimated = np.median(relief, axis=0)
     spread = np.percentile(relief[:, 1] / relief[:, 0], (5, 95))
     return (
-        "A check that needs no adjustment: the error of 2D affine should be what a plane does not explain of the "
-        f"heights, over the tangent of the satellite’s elevation. That is {expected:.2f} m; the adjustment has "
+        "A check without adjustment: fit a plane to the heights. The RMS of what remains, divided by the tangent of "
+        f"the satellite’s elevation, should be the error of 2D affine. That is {expected:.2f} m; the adjustment has "
         f"{estimated:.2f} m (ratio {spread[0]:.2f} to {spread[1]:.2f} in 90 % of the realisations)."
     )
 

@@ -73,8 +73,8 @@ GUESSED = {
 }
 GUESSED_QUICKBIRD = {SHIFT: "affine12", "affine12": SHIFT, "affine3d": SHIFT}
 NAIVE = (
-    "the paper’s own number in the same column for the model with the nearest number of unknowns (that of the improved "
-    "3D affine transformation for DLT and the other way round), for RPC with another correction, and on QuickBird."
+    "another number of the paper in the same column. For a fitted model, it is that of a model with about as many "
+    "unknowns; for an RPC, that with another correction; for QuickBird, that of another model."
 )
 #: Strengths of edge enhancement whose effect on an edge is measured.
 ENHANCEMENTS = (0.0, 0.5, 1.0, 1.5)

@@ -28,7 +28,7 @@ KNOBS = (
         simulated.LINES,
         "",
         "paper",
-        "Length of a scene, from the 11 m between the middle of a scene and its linear width.",
+        "Length of a scene, from the 11 m between its width in the middle and the mean of its widths at both ends.",
     ),
     Knob(
         "TURNING, YAW_RATE",

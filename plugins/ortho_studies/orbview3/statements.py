@@ -84,7 +84,7 @@ def _on_geometry(ours: Medians, findings: Findings, geometry: Mapping[str, float
         "The slow-down factor is 1.42.", abs(factor - 1.42) < 0.03, f"{factor:.2f}, from the altitude and 5000 lines/s"
     )
     yield Statement(
-        "Height to base is 1.4, and the middle of a scene is 11 m from the linear width.",
+        "Height to base is 1.4, and in the middle of a scene the width differs by 11 m from the mean of both ends.",
         abs(geometry["height_to_base"] - 1.4) < 0.05 and abs(geometry["sagitta_m"] - 11) < 1,
         f"{geometry['height_to_base']:.2f}, {geometry['sagitta_m']:.1f} m",
         "Times and length of the scenes were set from these.",
@@ -195,7 +195,7 @@ def _on_parameters(findings: Findings) -> Iterator[Statement]:
 def _on_edges() -> Iterator[Statement]:
     raw, enhanced = (edges(strength)["fwhm"] for strength in (0.0, rendering.ENHANCEMENT))
     yield Statement(
-        "Pixels are two pixels of the image wide.",
+        "A detector element covers two pixels of the delivered image.",
         min(raw) > 1.7,
         f"width of an edge along line and scan {raw[0]:.2f} and {raw[1]:.2f} px",
         "The simulated camera has this property by construction.",
