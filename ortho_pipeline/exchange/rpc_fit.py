@@ -89,8 +89,9 @@ def fit_rpc(
     ground, image = _samples(model, box, height_range, (nx + 1, ny + 1, nh + 1))
     worst = float(np.abs(rpc.ground_to_image(ground) - image).max())
     if not worst <= REFUSE_ERROR and not force:
+        fault = f"an RPC represents this model only to {significant(worst, 3)} px"
         raise InputError(
-            f"an RPC represents this model only to {significant(worst, 3)} px",
+            fault if math.isfinite(worst) else "an RPC cannot represent this model over its heights",
             remedy="fit it over a smaller box or height range, or accept the error (force)",
         )
     message = Notice(

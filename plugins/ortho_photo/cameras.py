@@ -44,7 +44,7 @@ CALIBRATED = {
     "p1": 1e-3,
     "p2": 1e-3,
 }
-NOMINAL = {"focal_length": 0.02, "x0": 0.01, "y0": 0.01, "k1": 0.05, "k2": 0.05, "k3": 0.05, "p1": 2e-3, "p2": 2e-3}
+NOMINAL = {"focal_length": 0.02, "x0": 0.005, "y0": 0.005, "k1": 0.03, "k2": 0.02, "k3": 0.01, "p1": 1e-3, "p2": 1e-3}
 _PIXEL = 1e-6
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
 
