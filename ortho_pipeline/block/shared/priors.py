@@ -19,7 +19,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from ortho_pipeline.block.equations.elimination import Elimination
 from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Selection
@@ -127,6 +126,8 @@ class SharedPriors(CommonUnknown):
     @property
     def records(self) -> tuple[SharedParameterRecord, ...]:
         """What is published of them."""
+        from scipy.special import chdtrc
+
         left = self.left
         # The covariance of the estimate if the priors are exact.
         alone = np.diag(left - left @ left)
@@ -143,7 +144,7 @@ class SharedPriors(CommonUnknown):
                     value=float(mean),
                     sigma=float(np.sqrt(own)) * one.prior.sigma,
                     determined=told,
-                    chance=float(chi2.sf(value**2 / variance, 1)) if told > _TOLD else None,
+                    chance=float(chdtrc(1, value**2 / variance)) if told > _TOLD else None,
                 )
             )
         return tuple(found)
