@@ -136,11 +136,11 @@ def _opened(
         dataset, block = open_seen(place, roots, drivers, siblings)
     except (RuntimeError, UnicodeDecodeError) as error:
         # What GDAL quotes of a damaged file need not be UTF-8.
-        fault = f"GDAL cannot open this as a raster ({first_line(error)})"
-        remedy = "give a raster in an allowed format ('ortho doctor' lists them)"
-        if not isinstance(place, VsiPath) and Path(name).is_dir():
-            fault, remedy = "this is a folder, not an image", "give its images by name, or a product that GDAL opens"
-        raise InputError(fault, file=name, remedy=remedy) from error
+        raise InputError(
+            f"GDAL cannot open this as a raster ({first_line(error)})",
+            file=name,
+            remedy="give a raster in an allowed format ('ortho doctor' lists them)",
+        ) from error
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
     return dataset, block

@@ -184,6 +184,7 @@ def test_a_format_that_this_gdal_was_built_without_is_named(tmp_path):
     for name, (_, content) in files.items():
         if content is None:
             (tmp_path / name).mkdir()
+            (tmp_path / name / "DIM_A.XML").touch()
         else:
             (tmp_path / name).write_bytes(content)
     program = (

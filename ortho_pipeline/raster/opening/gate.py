@@ -190,7 +190,7 @@ class _Gate:
 
     def _product_in(self, folder: Any) -> Any:
         """Return the DIMAP 2 metadata in a folder, which GDAL does not look for; None where it finds its own."""
-        names = [name for name in listing(folder).names if re.match(r"(dim_|vol_|metadata\.dim)", name.lower())]
+        names = _product_files(folder)
         volumes = [name for name in names if re.fullmatch(r"vol_.*\.xml", name.lower())]
         if len(volumes) == 1:
             return self._product_of(folder / volumes[0])
@@ -409,3 +409,12 @@ def _is_below(path: VsiPath, folder: AnyPath) -> bool:
     """Return whether a path is in a folder, by its text without dots."""
     rest = str(path).removeprefix(f"{os.fspath(folder)}/")
     return rest != str(path) and not {"", ".", ".."} & set(rest.split("/"))
+
+
+def _product_files(folder: Any) -> list[str]:
+    """Return the files in a folder that describe a DIMAP product."""
+    names = [name for name in listing(folder).names if re.match(r"(dim_|vol_|metadata\.dim)", name.lower())]
+    if not names:
+        remedy = "give its images by name, or the folder of a product that GDAL opens (DIMAP)"
+        raise InputError("this is a folder, not an image", file=folder, remedy=remedy)
+    return names
