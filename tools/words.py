@@ -32,7 +32,7 @@ LONGER = {
     "docs/notices.md": "a table of all notices",
     "docs/plugin-reference.md": "tables of all fields and names",
 }
-GENERATED = ("docs/reference/", "docs/commands/", "docs/notebooks/")
+GENERATED = ("docs/reference/", "docs/commands/")
 #: Wordings that the language guide of this project replaces; each has two words or more.
 PHRASES = (
     "an indication, no claim",
