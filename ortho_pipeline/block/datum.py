@@ -76,7 +76,8 @@ def with_datum(
     missed = 0.0 if control else _missed(linear)
     per_metre = _pixels_per_metre(linear)
     named = {} if hold is not None else accuracies or {}
-    stated = np.array([named.get(image, np.nan) for image in problem.points.images]) * per_metre
+    stated_m = np.array([named.get(image, np.nan) for image in problem.points.images])
+    stated = stated_m * per_metre
     trusted = np.asarray(stated >= missed / _CONTRADICTED)
     sigmas: Array = np.where(trusted, stated, max(HOLD, missed) if hold is None else hold)
     # Heights of a DEM tell what ties leave to their slow errors.
@@ -90,10 +91,9 @@ def with_datum(
     of = f"{'Assumed accuracy' if assumed else 'Accuracy'} of the delivered models: sigma {_span(sigmas)} px in the "
     of += f"image{on_ground}, for {len(held)} of {problem.size} parameters"
     of += "; other sigmas depend on it" if assumed else ""
-    if trusted.any() and accuracies:
-        stated_m = np.array([accuracies.get(image, np.nan) for image in problem.points.images])[trusted]
+    if trusted.any():
         who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"
-        of += f"; {who} {_span(stated_m)} m"
+        of += f"; {who} {_span(stated_m[trusted])} m"
     elif np.isfinite(stated).any():
         of += f"; not the accuracy of the metadata, because rays miss each other by {significant(missed, 3)} px"
     return problem.with_pseudo(held), _why(control, by_ties, of)

@@ -183,8 +183,7 @@ class SharedPriors(CommonUnknown):
         linear, problem, ordering = solved.linear, solved.problem, solved.linear.ordering
         units, right = self._units(problem), np.zeros((problem.size, len(self.value)))
         columns = np.array([one.column for one in problem.pseudo])
-        roots = np.sqrt(problem.firmness) / np.array([one.sigma for one in problem.pseudo])
-        np.add.at(right, columns, roots[:, None] * units)
+        np.add.at(right, columns, _roots(problem)[:, None] * units)
         step = solved.cofactors.times(right)
         rays, ground = np.zeros_like(linear.misfits.rays), np.zeros_like(linear.misfits.ground)
         pseudo = np.zeros_like(linear.misfits.pseudo)
@@ -216,5 +215,10 @@ class SharedPriors(CommonUnknown):
             of |= dict.fromkeys(one.columns, k)
         for row, pseudo in enumerate(problem.pseudo):
             if pseudo.column in of and not pseudo.held:
-                found[row, of[pseudo.column]] = self.sigmas[of[pseudo.column]] / pseudo.sigma
-        return found * np.sqrt(problem.firmness)[:, None]
+                found[row, of[pseudo.column]] = self.sigmas[of[pseudo.column]]
+        return found * _roots(problem)[:, None]
+
+
+def _roots(problem: BlockProblem) -> Array:
+    """Return the roots ``(n,)`` of the weights of the pseudo-observations."""
+    return np.sqrt(problem.firmness) / np.array([one.sigma for one in problem.pseudo])
