@@ -16,10 +16,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from ortho_studies import hookspecs as of_studies
+
 import ortho_pipeline as op
 from ortho_pipeline import plugin
 
 FOLDER = Path(__file__).resolve().parent / "reference"
+#: The classes for authors of plugins whose fields have a page.
+FIELDS = (
+    *(plugin.Sensor, plugin.Scene, plugin.Piece, plugin.Prior),
+    *(plugin.Format, plugin.Export, plugin.BlockFormat, plugin.BlockExport, plugin.Subcommand),
+    *(of_studies.Study, of_studies.StudyOption, of_studies.Simulated, of_studies.Reproduced),
+)
 _SECTION = re.compile(r"^(Parameters|Attributes|Returns|Raises|Examples|Notes)\n-{3,}\n", re.MULTILINE)
 _ENTRY = re.compile(r"^(?P<name>\S.*)$\n?(?P<text>(?:^[ \t]+.*\n?|^\n(?=[ \t]))*)", re.MULTILINE)
 #: What a type is called in a signature, without its module.
@@ -29,7 +37,8 @@ _MODULE = re.compile(r"\b(?:[a-z_]\w*\.)+(?=[A-Za-z_])")
 def main(folder: Path = FOLDER) -> None:
     """Write all pages, and remove those of names that are no more."""
     folder.mkdir(exist_ok=True)
-    pages = {f"{name}.md": page(name) for name in op.__all__} | {"plugin-names.md": plugin_names()}
+    pages = {f"{name}.md": page(name) for name in op.__all__}
+    pages |= {"plugin-fields.md": plugin_fields(), "plugin-names.md": plugin_names()}
     for old in folder.glob("*.md"):
         if old.name not in pages:
             old.unlink()
@@ -57,12 +66,24 @@ def page(name: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def plugin_fields() -> str:
+    """Return the page that lists the fields of all classes that hooks return, or that functions of plugins receive."""
+    parts = [
+        "# What plugins return",
+        "These are the classes that [hooks](../plugin-reference.md#hooks) return, and those that functions of plugins "
+        "receive.",
+    ]
+    for one in FIELDS:
+        parts += [f"## {one.__name__}", *_described(one)]
+    return "\n\n".join(parts) + "\n"
+
+
 def plugin_names() -> str:
     """Return the page that lists the names for authors of plugins, by module, with the first lines of docstrings."""
     parts = [
         "# Names for plugins",
-        "`from ortho_pipeline.plugin import NAME`. [Plugin reference](../plugin-reference.md) explains hooks and "
-        "fields. `help(ortho_pipeline.plugin.NAME)` prints a whole docstring.",
+        "`from ortho_pipeline.plugin import NAME`. [Plugin reference](../plugin-reference.md) explains hooks, and "
+        "[What plugins return](plugin-fields.md) fields. `help(ortho_pipeline.plugin.NAME)` prints a whole docstring.",
     ]
     for module in sorted(plugin._NAMES):
         about = _prose(inspect.getdoc(_module(module)).splitlines()[0])
@@ -167,6 +188,7 @@ def _entries(body: str, heading: str) -> tuple[str, str]:
 def _prose(text: str) -> str:
     """Return text as Markdown: double backticks are single ones, indented lines and examples are code."""
     text = re.sub(r"^>>> (?:.+\n?)+", lambda found: f"```python\n{found[0].strip()}\n```\n", text, flags=re.MULTILINE)
+    text = re.sub(r"^::\n\n", "", text, flags=re.MULTILINE)  # what follows is indented, so it is code in Markdown, too
     return re.sub(r"(?<!`)``([^`]+)``(?!`)", r"`\1`", text.strip())
 
 

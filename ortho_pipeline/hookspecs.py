@@ -75,7 +75,8 @@ class Piece:
         Its own model, in its own pixels. Needed where the first model of the scene does not cover it, and if `scale` is
         not 1.
     scale : float
-        Width of its pixels in pixels of the scene; not 1 if, for example, colours are coarser than panchromatic.
+        Width of its pixels in pixels of the scene; not 1 if, for example, colours are coarser than panchromatic. Then a
+        point goes to the ground by the model of the piece, and to the image by that of the scene.
 
     Examples
     --------
@@ -110,23 +111,26 @@ class Scene:
     models : mapping of str to SensorModel
         The best model first. Image coordinates are (column, row) from the outer corner of the first pixel.
     model_source : str
-        The file or tag of the first model.
+        The file or tag of the first model, as every report shows it.
     facts : mapping
-        Facts for people (acquisition time, sun elevation, cloud cover ...) as JSON values.
+        Facts for people (acquisition time, sun elevation, cloud cover ...) as JSON values, for `ortho info`.
     warnings : tuple of str
         What users must know before they trust the result. A `Notice` has its own code.
     priors : mapping of str to Prior
-        Accuracy of the parameters that ``--correction model`` adjusts (see `adjustable`).
+        How well parameters of the first model with parameters (`adjustable`) are known, in their units. With
+        ``--correction model`` they are observations like the control points. With ``shared=True``, all images of a
+        block with this prior have one value.
     rasters : tuple of path
         Files of the same size whose bands the ortho stacks, in this order; default: the image alone.
     pieces : tuple of Piece
-        Other bands and components of the same acquisition, adjusted together with this image.
+        Other bands and components of the same acquisition. Points measured in them count for this image, too.
     sources : tuple of path
-        Other files that were read, besides the image and `model_source`.
+        Other files that were read, for the record of a run.
     unsuited : mapping of str to str
         Model families (`ortho models`) that do not suit this product, each with its warning.
     adjusted : mapping, optional
-        The earlier adjustment of the model: the section ``adjustment`` of its model file.
+        How an adjustment changed a saved model: the section ``adjustment`` of its file. Plugins leave it out, because
+        they deliver models of vendors.
     accuracy : float, optional
         Standard deviation (m, per axis in plan) of the first model without control, as the vendor states it. An RPC
         may state its own.
@@ -260,13 +264,13 @@ class Sensor:
     description : str
         One line for `ortho sensors`.
     recognises : callable(dataset) -> bool
-        True if the open `gdal.Dataset` is such a product. Returns False, and raises nothing, for all others, also for
-        datasets without a file.
+        True if the open `gdal.Dataset` is such a product. It is cheap. For all else it returns False and raises
+        nothing, also for datasets without a file.
     open_scene : callable(dataset, **options) -> Scene
-        Translates the vendor's metadata. Raises `ortho_pipeline.errors.InputError` for a damaged product.
+        Translates the vendor's metadata. Raises `InputError` with file, field and remedy for a damaged product.
     options : mapping of str to str
-        The keyword options of `open_scene`, each with a line of help; each needs a default in `open_scene`. Values are
-        strings. The host refuses other options.
+        The keyword options of `open_scene` (``--sensor-option mounting=0.1``), each with a line of help; each needs a
+        default in `open_scene`. Values are strings. The host refuses other options.
     fallback : bool
         A fallback sensor opens a general kind of product. It is asked only if no other sensor recognises the dataset.
         It is also used if it alone declares the options that the user gave.

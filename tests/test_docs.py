@@ -140,9 +140,9 @@ def test_every_public_name_has_a_page_of_its_docstring(tmp_path):
     import make_reference
 
     make_reference.main(tmp_path)
-    assert {path.stem for path in tmp_path.iterdir()} == {*ortho_pipeline.__all__, "plugin-names"}
+    assert {path.stem for path in tmp_path.iterdir()} == {*ortho_pipeline.__all__, "plugin-fields", "plugin-names"}
     site = (ROOT / "mkdocs.yml").read_text()
-    assert re.findall(r"- reference/(\S+)\.md\n", site) == [*ortho_pipeline.__all__, "plugin-names"]
+    assert re.findall(r"- reference/(\S+)\.md\n", site) == [*ortho_pipeline.__all__, "plugin-fields", "plugin-names"]
     for name in ortho_pipeline.__all__:
         page, thing = (tmp_path / f"{name}.md").read_text(), getattr(ortho_pipeline, name)
         assert len(page.splitlines()) > 4, name

@@ -30,7 +30,6 @@ LONGER = {
     "docs/formats.md": "tables of files and their fields",
     "docs/formats/block-points.md": "tables of columns and of fields",
     "docs/notices.md": "a table of all notices",
-    "docs/plugin-reference.md": "tables of all fields and names",
 }
 GENERATED = ("docs/reference/", "docs/commands/")
 #: Wordings that the language guide of this project replaces; each has two words or more.

@@ -33,7 +33,9 @@ class ExportedImage:
     size : (int, int)
         Columns and rows.
     bands : int
+        Number of bands.
     nodata : float or None
+        Value of empty pixels.
 
     Examples
     --------
@@ -79,6 +81,7 @@ class BlockExport:
     models : str
         Name of the format of the model files.
     pairs : sequence of ImagePair
+        Images that overlap, which the program can match.
     resolution : float
         Ground sample distance (m) of the finest image, to two digits.
     crs : str

@@ -33,7 +33,15 @@ hookimpl = pluggy.HookimplMarker(PROJECT_NAME)
 
 @dataclass(frozen=True)
 class Simulated:
-    """Result of a simulation: its files by name, and text for the terminal with commands to try."""
+    """Result of a simulation.
+
+    Parameters
+    ----------
+    files : mapping of str to Path
+        Its files by name.
+    text : str
+        Text for the terminal, with commands to try.
+    """
 
     files: Mapping[str, Path]
     text: str
@@ -41,7 +49,17 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Reproduced:
-    """Result of an experiment: a document of JSON values, text for the terminal, and an HTML page."""
+    """Result of an experiment.
+
+    Parameters
+    ----------
+    document : mapping
+        Its tables as JSON values.
+    text : str
+        Text for the terminal.
+    page : callable() -> str
+        Returns HTML. The host calls it if the user gives a folder.
+    """
 
     document: Mapping[str, Any]
     text: str

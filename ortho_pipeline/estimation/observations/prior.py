@@ -17,6 +17,7 @@ class Prior:
     Parameters
     ----------
     mean, sigma : float
+        Expected value and its standard deviation.
     shared : bool
         All images of a block with this prior have the same value of the parameter, as photos of one camera.
 
