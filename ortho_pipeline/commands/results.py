@@ -20,7 +20,7 @@ from ortho_pipeline.estimation.family_fit import Removed
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.spatial.correlation import analyse_fit
-from ortho_pipeline.files import part_of_outputs, staged, together, write_text
+from ortho_pipeline.files import part_of_outputs, retire, staged, together, write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.options import OutputOptions, SceneOptions
@@ -234,14 +234,14 @@ def attempted(make: Callable[[], _R], files: dict[str, Path], *of_report: str) -
     make : callable
         Makes the report and writes its files.
     files : dict
-        Outputs of the command; those `of_report` are taken out if it fails, and none of them is written.
+        Outputs of the command. If it fails, those `of_report` are taken out: none of them is written, and those of an
+        earlier command go, because they describe other outputs.
     """
     try:
         with part_of_outputs():
             return make()
     except Exception as error:
-        for kind in of_report:
-            files.pop(kind, None)
+        retire(files.pop(kind) for kind in of_report if kind in files)
         why = f"{type(error).__name__}: {error}".removesuffix(": ")
         remedy = "this is a bug in ortho-pipeline: please report it with the traceback"
         if isinstance(error, OrthoError):

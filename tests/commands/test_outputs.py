@@ -119,10 +119,13 @@ def test_the_page_of_a_mosaic_does_not_cost_the_mosaic(tiny, tmp_path, monkeypat
     def fail(*_, **__):
         raise KeyError("crs")
 
+    earlier = assembly.mosaic([ortho], tmp_path / "m.tif").files["page"]
+    assert earlier.is_file()
     monkeypatch.setattr(assembly, "write_page", fail)
     result = assembly.mosaic([ortho], tmp_path / "m.tif")
     assert isinstance(result.failure, ReportError)
     assert (sorted(result.files), (tmp_path / "m.tif").is_file()) == (["mosaic", "seams"], True)
+    assert not earlier.exists(), "it describes another mosaic"
 
 
 def test_what_an_earlier_run_wrote_and_this_one_does_not_goes(tiny, tmp_path):
