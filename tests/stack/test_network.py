@@ -10,6 +10,7 @@ import pytest
 from networks import Made, Truth
 
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
+from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells
 from ortho_pipeline.block.stack.graph import pairs_of
 from ortho_pipeline.block.stack.steps import steps_of
@@ -165,10 +166,29 @@ def test_clear_dates_are_preferred_and_all_stay_connected():
 
 
 @pytest.mark.parametrize(("dates", "least", "most"), [(40, 0.99, 1.05), (5, 1.1, 1.6)])
-def test_many_loops_show_that_edges_are_better_than_stated(dates, least, most):
+def test_many_loops_show_that_edges_are_better_than_stated(dates, least, most, monkeypatch):
     """Many closed loops show how large the error of a pair is. With few loops, the stated error counts."""
+    monkeypatch.setattr(ErrorComponents, "of_seasons", np.zeros(2))
+    none, stated = _with_stated_error(dates, 0.05)
+    assert least < np.median(stated.sigma) / np.median(none.sigma) < most
+
+
+def test_what_loops_do_not_show_of_the_stated_error_is_an_error_of_seasons():
+    """Dates half a year apart differ by the stated error of a pair; dates of one season in two years do not."""
+    none, stated = _with_stated_error(40, 0.05)
+    years = Truth(seed=3, dates=40).made().years
+    apart = np.abs(years[:, None] - years)
+    for low, high, expected in [(0.45, 0.55, 0.05), (0.97, 1.03, 0.0)]:
+        pairs = np.argwhere(np.triu((apart > low) & (apart < high)))
+        more = [stated.sigma_between(i, j) ** 2 - none.sigma_between(i, j) ** 2 for i, j in pairs.tolist()]
+        assert len(pairs) > 3
+        # exp(-2) of it is common to opposite seasons, and 40 dates have so many loops that a tenth of it is left.
+        assert np.sqrt(np.median(more)) == pytest.approx(expected, abs=0.012)
+
+
+def _with_stated_error(dates: int, size: float) -> tuple[AdjustedStack, AdjustedStack]:
+    """Return the adjustments of edges without a stated error that all values share, and with one."""
     made = Truth(seed=3, dates=dates).made()
-    times = made.years.tolist()
-    none = np.median(adjust(made.truth.cells, made.edges, times).sigma)
-    stated = dataclasses.replace(made.edges, alike=np.full(len(made.edges), 0.05))
-    assert least < np.median(adjust(made.truth.cells, stated, times).sigma) / none < most
+    stated = dataclasses.replace(made.edges, alike=np.full(len(made.edges), size))
+    one, other = (adjust(made.truth.cells, edges, made.years.tolist()) for edges in (made.edges, stated))
+    return one, other

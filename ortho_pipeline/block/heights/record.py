@@ -84,12 +84,13 @@ class HeightsRecord(Record):
         if self.shift_significant:
             east, north = self.shift_m
             size, sigma = metres(math.hypot(east, north)), metres(max(self.shift_sigma_m))
-            part = f"{size} of this to the DEM ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma})"
+            part = f"{size} for the DEM ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma})"
             remedy: tuple[str | Setting, ...] = ("The DEM was moved by this",)
             if not self.shift_applied:
                 remedy = ("If the images are right, move the DEM with ", Setting("points.dem_shift", "estimate"))
             apart = "the DEM and the images are displaced from each other (by chance in less than 1 of 1000 cases)"
-            text = Text(f"{apart}. The adjustment attributes {part}, the rest to the images. ", *remedy)
+            doubt = "How much is an error of the DEM, and how much of the images, is uncertain"
+            text = Text(f"{apart}. {doubt}. Best estimate: {part}, the rest for the images. ", *remedy)
             fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
             found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
         if self.spots is not None and self.spots.left_out:

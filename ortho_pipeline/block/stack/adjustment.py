@@ -155,14 +155,15 @@ def _referred(
     cells: Cells, solved: _Solved, motion: Motion, years: Array, datum: int | None, sloped: NDArray[np.bool_]
 ) -> AdjustedStack:
     """Return a stack with its datum."""
-    part, known = solved.network.part, np.isfinite(years)
+    found, known = solved.network.with_seasons(solved.components.of_seasons, years), np.isfinite(years)
+    part = found.part
     if datum is None:
         number = int(np.bincount(part).argmax())
         weights = (part == number) / max(int((part == number).sum()), 1)
-        network = _mean_shift(solved.network, weights, bool(sloped[part == number].all()))
+        network = _mean_shift(found, weights, bool(sloped[part == number].all()))
     else:
         number = int(part[datum])
-        network = solved.network.relative_to(np.eye(len(years))[datum])
+        network = found.relative_to(np.eye(len(years))[datum])
     determined = part == number
     value = np.where(determined[:, None, None], network.value, 0.0)
     network = replace(network, value=value)

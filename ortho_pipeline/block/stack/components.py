@@ -61,6 +61,11 @@ class ErrorComponents:
     factor: Array
     constant: Array
 
+    @property
+    def of_seasons(self) -> Array:
+        """Variance ``(2,)`` of a date's error that closes all loops: the part of the stated error that loops lack."""
+        return np.asarray(np.maximum(-self.constant, 0.0) / 2)
+
     def at_place(self, edges: Edges) -> tuple[Array, Array]:
         """Return variances of single values ``(E, K)``, mean of both axes: in units of a date's scale, and own."""
         relative = edges.relative

@@ -9,6 +9,10 @@ An edge is accepted if it closes the loop: if it differs from what all other edg
 their common error explains. The first solution minimises the sum of lengths, so that wrong edges hardly move it. Then
 edges leave and come back until none changes.
 
+Loops do not show errors that close them. If they show less than the stated error of edges, the rest belongs to dates:
+the ground looks different through the year, and shadows and plants displace all matches alike. Dates of one season
+share that error.
+
 Source: Baarda 1968 (tests of single observations); Huber 1981 (robust start); Liang and Zeger 1986 (sandwich).
 """
 
@@ -37,6 +41,8 @@ _LIMIT = float(chi2.isf(CHANCE, 2))
 _SMALL = 0.03
 #: The stated error of an edge counts as much as this many loops.
 _STATED = 10
+#: The errors of dates that are so many years apart, counted within a year, have a correlation of exp(-1).
+_SEASON = 0.25
 #: An edge with a smaller redundancy is in no loop.
 _IN_LOOP = 1e-6
 
@@ -82,6 +88,17 @@ class Network:
         change = np.kron(np.eye(len(self.value)) - weights, np.eye(3))
         value = self.value - np.einsum("t,tmc->mc", weights, self.value)
         return replace(self, value=value, covariance=np.array([change @ one @ change.T for one in self.covariance]))
+
+    def with_seasons(self, variance: Array, years: Array) -> Network:
+        """Return the same corrections, with an error of variance ``(2,)`` px² that dates of one season share.
+
+        A date without a time (NaN), such as a reference, shares it with no other date.
+        """
+        apart = np.sin(np.pi * (years[:, None] - years)) ** 2 / np.sin(np.pi * _SEASON) ** 2
+        alike = np.where(np.isfinite(apart), np.exp(-np.nan_to_num(apart)), np.eye(len(years)))
+        covariance = self.covariance.copy()
+        covariance[:, ::3, ::3] += variance[:, None, None] * alike
+        return replace(self, covariance=covariance)
 
 
 def accepted_edges(
