@@ -304,7 +304,7 @@ def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) ->
     notes = [f"Relative: {px(relative.px)}{ground} {held_out}.", matching.floor(), *notes]
     if absolute.n < ENOUGH_CHECK_POINTS:
         notes.insert(0, FEW)
-    what = f"RMSE at {counted(absolute.n, 'measured point')} {apart} to matches"
+    what = f"RMSE at {counted(absolute.n, 'measured check point')} {apart}"
     on_ground = None if absolute.m is None else metres(absolute.m)
     return Headline(figure=px(absolute.px), metres=on_ground, what=what, notes=tuple(notes))
 
