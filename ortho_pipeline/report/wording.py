@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeGuard
 
@@ -214,8 +215,8 @@ def runner_up(report: SceneReport) -> str | None:
     plain = next((name for name in sizes if not found[name][1]), None)
     told = (
         []
-        if nearest in comparison.recommendation.reason.replace(chosen, "")
-        else [f"{nearest} is next with {px(sizes[nearest])}"]
+        if re.search(rf"(?<![\w+-]){re.escape(nearest)}(?![\w+-])", comparison.recommendation.reason)
+        else [f"The next best model is {nearest} with {px(sizes[nearest])}"]
     )
     told += [] if plain is None or plain == nearest else [f"{plain} as supplied has {px(sizes[plain])}"]
     said = [f"{' and '.join(told)}."] if told else []

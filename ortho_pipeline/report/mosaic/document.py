@@ -123,7 +123,9 @@ def along_text(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     said = []
     if before["rms"] is not None and after["rms"] is not None:
         worst = f"largest {short(after['largest_rms'])}"
-        said.append(f"{short(after['rms'])} in brightness (RMS; {worst}; before the correction: {short(before['rms'])})")
+        said.append(
+            f"{short(after['rms'])} in brightness (RMS; {worst}; before the correction: {short(before['rms'])})"
+        )
     if before["rmse_px"] is not None and after["rmse_px"] is not None:
         said.append(f"{after['rmse_px']:.2f} px in position (before the correction: {before['rmse_px']:.2f} px)")
     return f"along the seams scenes differ by {' and '.join(said)}" if said else "along the seams nothing was measured"
