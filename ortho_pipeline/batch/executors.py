@@ -326,7 +326,7 @@ def dask_executor(scheduler: str) -> Any:
         raise InputError(
             "dask is not installed",
             field="scheduler",
-            remedy="run pip install '.[dask]' in the checkout of ortho-pipeline",
+            remedy="run pip install '.[dask]' in the source folder of ortho-pipeline",
         ) from error
     try:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)

@@ -208,7 +208,7 @@ def _without_gdal() -> InputError | None:
     except ImportError as problem:
         missing = InputError(
             f"cannot load the Python bindings of GDAL ({problem})",
-            remedy="run 'make setup' in the checkout of ortho-pipeline (docs/install.md)",
+            remedy="run 'make setup' in the source folder of ortho-pipeline (docs/install.md)",
         )
         missing.__cause__ = problem
         return missing

@@ -274,7 +274,8 @@ def relative_to_reference(adjusted: Fit, match: MatchOptions) -> list[Notice]:
     )
     if common is not None and common.value.any():
         east, north = common.value * common.sigma
-        text += f". The other points place the reference {east:+.2f} m along x and {north:+.2f} m along y"
+        text += ". The measured points show that the reference is displaced by "
+        text += f"{east:+.2f} m along x and {north:+.2f} m along y"
     relative = Notice(
         "relative-to-reference",
         text,

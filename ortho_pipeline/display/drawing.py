@@ -176,7 +176,9 @@ class Drawing:
             raise InputError(
                 "PNG output needs matplotlib, which is not installed",
                 field="kind",
-                remedy=Text("run pip install '.[plots]' in the checkout, or use ", Setting("kind", "svg")),
+                remedy=Text(
+                    "run pip install '.[plots]' in the source folder of ortho-pipeline, or use ", Setting("kind", "svg")
+                ),
             ) from error
         figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

@@ -309,7 +309,7 @@ def _small(scene: Scene) -> Notice | None:
         return None
     text = Text(
         f"the image has {scene.width} x {scene.height} pixels, but its RPC is for about {sizes[0]:.0f} x "
-        f"{sizes[1]:.0f}. If it is a crop that begins elsewhere than the larger image, give ",
+        f"{sizes[1]:.0f}. If it is a crop whose first pixel is not that of the larger image, give ",
         Setting("scene.crop_offset", "COL,ROW"),
     )
     return Notice("maybe-a-crop", text, rpc_size=sizes)

@@ -48,7 +48,7 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
         raise InputError(
             "a GeoDataFrame needs GeoPandas, which is not installed",
             field="points",
-            remedy="run pip install '.[geopandas]' in the checkout of ortho-pipeline",
+            remedy="run pip install '.[geopandas]' in the source folder of ortho-pipeline",
         ) from error
     columns: dict[str, Any] = {
         "id": list(points.ids),

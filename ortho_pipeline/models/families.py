@@ -189,7 +189,7 @@ _FAMILIES = (
     Family(
         "affine12",
         "3D affine for a changing view direction",
-        "line scanners that turn while they scan",
+        "line scanners that turn a little while they scan (not OrbView-3)",
         "OrbView-3 formula 3",
         _RAY,
         _RAY,

@@ -154,7 +154,7 @@ def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: Col
     with completed(path, remedy=kind.wanted):
         table = kind.reader(path, text, *expected)
         if not table.rows:
-            raise InputError(f"no points in this file; its format is recognised: {kind.name}", file=path)
+            raise InputError(f"this file has no points; it was read as {kind.name}", file=path)
     table.source = os.fspath(path)
     return table
 

@@ -128,7 +128,7 @@ class MatchingRecord(Record):
         if self.absolute is None:
             return None
         ground = "" if self.absolute.m is None else f" ({metres(self.absolute.m)})"
-        points = counted(self.absolute.n, "measured point")
+        points = counted(self.absolute.n, "measured check point")
         return f"Absolute: {px(self.absolute.px)}{ground} RMSE at {points} that took no part in the adjustment."
 
     def text(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeGuard
 
@@ -214,8 +215,8 @@ def runner_up(report: SceneReport) -> str | None:
     plain = next((name for name in sizes if not found[name][1]), None)
     told = (
         []
-        if nearest in comparison.recommendation.reason.replace(chosen, "")
-        else [f"{nearest} is next with {px(sizes[nearest])}"]
+        if re.search(rf"(?<![\w+-]){re.escape(nearest)}(?![\w+-])", comparison.recommendation.reason)
+        else [f"The next best model is {nearest} with {px(sizes[nearest])}"]
     )
     told += [] if plain is None or plain == nearest else [f"{plain} as supplied has {px(sizes[plain])}"]
     said = [f"{' and '.join(told)}."] if told else []
@@ -304,7 +305,7 @@ def _of_matches(matching: MatchingRecord, relative: Tested, notes: list[str]) ->
     notes = [f"Relative: {px(relative.px)}{ground} {held_out}.", matching.floor(), *notes]
     if absolute.n < ENOUGH_CHECK_POINTS:
         notes.insert(0, FEW)
-    what = f"RMSE at {counted(absolute.n, 'measured point')} {apart} to matches"
+    what = f"RMSE at {counted(absolute.n, 'measured check point')} {apart}"
     on_ground = None if absolute.m is None else metres(absolute.m)
     return Headline(figure=px(absolute.px), metres=on_ground, what=what, notes=tuple(notes))
 

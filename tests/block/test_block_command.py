@@ -570,7 +570,7 @@ def test_pixel_centres_and_ground_of_its_own(tmp_path: Path) -> None:
         ("a,,1,2,,,,\n", "this point has no image"),
         (",l,1,2,,,,\n", "this point has no id"),
         ("a,l,1,2,240000,-33,5,\n", None),
-        ("", "no points in this file"),
+        ("", "this file has no points"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, lines: str, message: str | None) -> None:

@@ -64,6 +64,7 @@ def test_sigmas_that_are_too_small_are_enlarged_at_the_spots_too(tmp_path: Path)
     assert stated is not None
     assert right is not None
     assert stated.sigma_is == "enlarged"
+    assert "dem-sigma-enlarged" in {notice.code for notice in stated.notices()}
     assert stated.bias_sigma_m == pytest.approx(right.bias_sigma_m, rel=0.35)
     assert abs(stated.bias_m - 12.0) < 4 * stated.bias_sigma_m
 

@@ -192,7 +192,7 @@ def test_measured_points_see_what_matches_cannot(moved: Case, tmp_path: Path) ->
     head = report["headline"]
     # What is read first is what the measured points say.
     assert head["metres"] == metres(matching["absolute"]["m"])
-    assert "6 measured points" in head["what"]
+    assert "6 measured check points" in head["what"]
     assert any(note.startswith("Relative: ") and "relative to the reference" in note for note in head["notes"])
     assert any("2.00 m per axis" in note for note in head["notes"])
     # Six measured points test the scale of a map; matches do not.

@@ -73,7 +73,7 @@ class HeightsRecord(Record):
                 f"DEM and ties differ more than the stated DEM accuracy allows; using {metres(self.sigma_m)}, "
                 f"estimated from {counted(self.used, 'height')}. Roofs and trees cause this"
             )
-            found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
+            found.append(Notice("dem-sigma-enlarged", text, dem_sigma_m=self.sigma_m, count=self.used))
         if self.left_out:
             number, named = len(self.left_out), self.left_out[:_NAMED]
             left_out = (

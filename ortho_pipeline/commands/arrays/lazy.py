@@ -199,7 +199,7 @@ def libraries(field: str) -> tuple[Any, Any]:
         raise InputError(
             f"lazy arrays need {error.name}, which is not installed",
             field=field,
-            remedy="run pip install '.[xarray]' in the checkout of ortho-pipeline",
+            remedy="run pip install '.[xarray]' in the source folder of ortho-pipeline",
         ) from error
     return dask, xarray
 

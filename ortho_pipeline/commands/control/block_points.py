@@ -278,7 +278,8 @@ def relative_to_reference(fit: BlockFit, options: BlockOptions, match: MatchOpti
         floor = f"the sigmas include its {metres(sigma)} per axis, which all matches have in common"
         if common.value.any():
             east, north = common.value * sigma
-            beside = f". The rest of the block moves it by {east:+.2f} m east and {north:+.2f} m north"
+            beside = ". The rest of the block shows that the reference is displaced by "
+            beside += f"{east:+.2f} m east and {north:+.2f} m north"
     part = "all control points were matched" if options.points is None else "control points were matched"
     text = (
         f"accuracy is relative to the reference, because {part}; {floor}{beside}. An error common to images and "

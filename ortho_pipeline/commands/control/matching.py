@@ -187,7 +187,8 @@ class Matched:
             ("matches", f"{record.kept} of {record.tried} tried{': ' + reasons if reasons else ''}"),
             (
                 "",
-                f"{record.control} control, {record.check} check (one cell in five); they cover "
+                f"{record.control} control, {record.check} check (those in every fifth cell of a grid over the "
+                f"image); all cover "
                 f"{record.coverage.share:.0%} of the image",
             ),
             ("search", f"{metres(self.search.distance)} ({self.search.source}); {levels}"),

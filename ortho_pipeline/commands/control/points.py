@@ -72,7 +72,7 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
         raise InputError(
             Text(Setting(f"points.{chosen}"), " selects from ", Setting("points.gcps"), ", which is not given"),
             field=f"points.{chosen}",
-            remedy="leave it out; one cell in five of the matches is reserved for checking",
+            remedy="leave it out; the matches in every fifth cell of the image are check points already",
         )
     if chosen is not None and match.gcps_as == "check":
         raise InputError(

@@ -324,7 +324,7 @@ def _notices(document: Mapping[str, Any], measured: MeasuredOrtho, reference_sig
     found = []
     share = document["matches"]["tested_share"]
     if share < 0.5:
-        text = f"matches test {share:.0%} of the ortho; accuracy elsewhere is unknown"
+        text = f"matches test {share:.0%} of the ortho; the accuracy of the rest is unknown"
         found.append(Notice("ortho-tested-in-part", text, tested_share=share))
     if reference_sigma is None and document["points"] is None:
         text = "this accuracy is relative to the reference; the error of the reference is not included"

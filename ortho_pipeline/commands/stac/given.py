@@ -115,7 +115,7 @@ def _one_of_several(image: Any, scene: SceneOptions) -> Any:
     rpc = item.rpc_of(chosen)
     if rpc is not None:
         raise InputError(
-            f"the RPC of this image lies elsewhere ({rpc.name}), and there is no option to give it for several images",
+            f"the RPC of this image is not next to it ({rpc.name}), and no option gives an RPC for several images",
             file=image,
             remedy="put it next to the image, with the same stem",
         )

@@ -105,9 +105,16 @@ def _but(
         elif smallest not in errors:
             text += "but these points do not support it"
         else:
-            better = errors[chosen] / errors[smallest]
-            text += f"but its expected error over the scene ({significant(errors[smallest], 3)} px) is "
-            text += "larger" if better < 1 else "better by less than 2 %" if better <= _WORTH else "not clearly smaller"
+            better, simpler = errors[chosen] / errors[smallest], rows[chosen].parameters < rows[smallest].parameters
+            error = f"expected error over the scene ({significant(errors[smallest], 3)} px)"
+            if better < 1:
+                text += f"but its {error} is larger"
+            elif better > _WORTH:
+                text += f"but its {error} is not significantly smaller"
+            else:
+                text += f"but its {error} is less than 2 % smaller, so "
+                text += "the model with fewer parameters" if simpler else "the scene's own model"
+                text += " is recommended"
     fit = rows[chosen].fit
     weak = ", ".join(fit.reservations) if fit else ""
     return text + (f". {chosen} is {weak}: measure points there" if weak else "")

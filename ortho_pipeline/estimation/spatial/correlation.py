@@ -459,13 +459,13 @@ def _sentences(analysis: Covariance) -> list[str]:
             f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
-    chance = (
-        f"by chance alone, the larger of the two exceeds {analysis.critical:+.2f} in one of {round(1 / SIGNIFICANCE)}"
-    )
-    result = "Systematic errors remain" if analysis.verdict == "systematic" else "No systematic error was found"
+    chance = f"Without systematic errors, one scene in {round(1 / SIGNIFICANCE)} has a value above"
+    result, here = "No systematic error was found", "Here both values are lower"
+    if analysis.verdict == "systematic":
+        result, here = "Systematic errors remain", "Here the larger value is higher"
     sentences = [
-        f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}; "
-        f"{chance} scenes."
+        f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}. "
+        f"{chance} {analysis.critical:+.2f}. {here}."
     ]
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")

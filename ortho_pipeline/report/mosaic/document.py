@@ -90,7 +90,7 @@ def summary_text(document: Mapping[str, Any]) -> str:
 def balance_text(balance: Mapping[str, Any]) -> str:
     """Return the result of a balance in words."""
     before, after = (" / ".join(short(value) for value in balance[when]) for when in ("before", "after"))
-    said = f"overlaps differ by {after} (before: {before}; RMS of each band)"
+    said = f"overlaps differ by {after} (before the balance: {before}; RMS of each band)"
     said += f"; {share(balance['outlying_share'])} of {counted(balance['cells'], 'cell')} excluded as outliers"
     if balance["clamped_share"]:
         said += f"; {share(balance['clamped_share'])} of the pixels exceeded their type and were clamped"
@@ -123,7 +123,9 @@ def along_text(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     said = []
     if before["rms"] is not None and after["rms"] is not None:
         worst = f"largest {short(after['largest_rms'])}"
-        said.append(f"{short(after['rms'])} in brightness (RMS; {worst}; before: {short(before['rms'])})")
+        said.append(
+            f"{short(after['rms'])} in brightness (RMS; {worst}; before the correction: {short(before['rms'])})"
+        )
     if before["rmse_px"] is not None and after["rmse_px"] is not None:
-        said.append(f"{after['rmse_px']:.2f} px in position (before: {before['rmse_px']:.2f} px)")
+        said.append(f"{after['rmse_px']:.2f} px in position (before the correction: {before['rmse_px']:.2f} px)")
     return f"along the seams scenes differ by {' and '.join(said)}" if said else "along the seams nothing was measured"

@@ -146,6 +146,6 @@ def _new() -> Any:
         raise InputError(
             "plots need matplotlib, which is not installed",
             field="axes",
-            remedy="run pip install '.[plots]' in the checkout of ortho-pipeline",
+            remedy="run pip install '.[plots]' in the source folder of ortho-pipeline",
         ) from error
     return pyplot.subplots(layout="constrained")[1]

@@ -67,7 +67,7 @@ _LOOK: dict[str, str] = {
     "few-check-points": "Use at least 30 check points before you claim an accuracy class.",
     "no-redundancy": "Add points. Until then the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
-    "dem-shifted": "Add control points: they show which of them is wrong.",
+    "dem-shifted": "Add control points: they show whether the DEM or the images are displaced.",
     "weak-join": Text(
         "Give a DEM (",
         Setting("surface.dem"),
@@ -117,6 +117,9 @@ _KNOW: dict[str, str] = {
     "ortho-local-changes": "Check the places that the file of displacements marks as local.",
     "dem-sigma-by-default": Text("State the accuracy of the DEM with ", Setting("surface.sigma"), "."),
     "spot-heights-left-out": "Nothing to do: a laser may hit a cloud or a tree.",
+    "dem-sigma-enlarged": Text(
+        "Use a DEM of the surface that the images show, or state a larger accuracy with ", Setting("surface.sigma"), "."
+    ),
     "dem-sigma-estimated": Text("If you know the accuracy of the DEM, state it with ", Setting("surface.sigma"), "."),
     "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
     "correction-by-matches": "Nothing to do, unless you know a better correction.",
