@@ -99,8 +99,8 @@ def sharpen(
     for path in (pan, colours):
         check_paths(files, Request(path, scene, output=output))
     ledger = Ledger(begun=states(path for path in paths if not Location(path).is_far))
-    # Half of the memory for caches: windows are read once and in order, and what matches takes the rest.
-    output = replace(output, memory=output.memory // 2)
+    # A quarter of the memory for caches: windows are read once and in order. What matches and the warper take the rest.
+    output = replace(output, memory=output.memory // 4)
     pair = OrthoPair.open(pan, colours, scene, output, ratio)
     stage = progress or (lambda name, share: None)
     stage("Weights", 0.0)
