@@ -35,6 +35,8 @@ _EDGES, _PAIRS = 120, 180
 #: Limits of the scale of an edge, relative to the mean of its dates.
 _SCALES = 0.25, 25.0
 _ROUNDS = 30
+#: The errors of dates that are so many years apart, counted within a year, have a correlation of exp(-1).
+_SEASON = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,21 @@ def _correlations(place: Array) -> Array:
     """Return the correlations ``(2 ranges, K, K)`` of places: exponential, and Gaussian."""
     distance = spatial.distance.cdist(place, place) / np.array(_RANGES)[:, None, None]
     return np.concatenate([np.exp(-distance), np.exp(-(distance**2))])
+
+
+def season_correlation(years: Array) -> Array:
+    """Return the correlations ``(T, T)`` of errors that depend on the season.
+
+    A date without a time (NaN), such as a reference, has one of its own.
+
+    >>> season_correlation(np.array([0.0, 1.0, 1.5, np.nan])).round(2)
+    array([[1.  , 1.  , 0.14, 0.  ],
+           [1.  , 1.  , 0.14, 0.  ],
+           [0.14, 0.14, 1.  , 0.  ],
+           [0.  , 0.  , 0.  , 1.  ]])
+    """
+    apart = np.sin(np.pi * (years[:, None] - years)) ** 2 / np.sin(np.pi * _SEASON) ** 2
+    return np.where(np.isfinite(apart), np.exp(-np.nan_to_num(apart)), np.eye(len(years)))
 
 
 def components_of(edges: Edges, trends: Trends, place: Array, dates: int) -> ErrorComponents:

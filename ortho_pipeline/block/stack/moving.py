@@ -3,19 +3,19 @@
 What the network leaves at a place is compared with changes over time of some forms: steady, a step at one time, a
 wave of one year. The majority of places is stable by definition: a place moves if it differs from the rate that most
 places share. Sigmas include the errors that edges with a common date share at a place, and noisier places have larger
-ones.
+ones. Nothing shows whether these errors change from date to date or with the season, so the larger variance counts.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2
 
-from ortho_pipeline.block.stack.components import ErrorComponents
+from ortho_pipeline.block.stack.components import ErrorComponents, season_correlation
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.trends import median_of
 from ortho_pipeline.models.base import Array
@@ -29,6 +29,8 @@ _FEWEST, _STEPS = 4, 10
 #: Squared sigmas within which places share a rate.
 _ALIKE = 9.2
 _WAVE = 1.5
+#: A step has so many dates on each side. What is left is clipped at so many sigmas, so many times.
+_BESIDE, _CLIP, _CLIPPED = 4, 2.5, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,7 @@ class _Left:
     own: Array  # (E, K)
     shared: Array  # (K,)
     scale: Array  # (T,)
+    alike: Array  # (T, T), correlations of errors of dates that depend on the season
     first: NDArray[np.int_]
     second: NDArray[np.int_]
 
@@ -79,10 +82,18 @@ class _Left:
         squares = np.maximum((self.weight * apart**2).sum(axis=0), 1e-300)
         shares = self.weight * apart / squares
         size = np.einsum("ek,ekc->kc", shares, self.value)
+        for _ in range(_CLIPPED):
+            # A cloud that was matched at a few dates must not look like motion.
+            fitted = apart[:, :, None] * size
+            reach = _CLIP * np.sqrt(_noisier(self.value - fitted, self.weight) / np.maximum(self.weight, 1e-12))
+            clipped = np.clip(self.value - fitted, -reach[:, :, None], reach[:, :, None])
+            size = size + np.einsum("ek,ekc->kc", shares, clipped)
         of_dates = np.zeros((len(self.scale), shares.shape[1]))
         np.add.at(of_dates, self.first, shares)
         np.add.at(of_dates, self.second, -shares)
-        variance = self.shared * (self.scale[:, None] * of_dates**2).sum(axis=0) + (shares**2 * self.own).sum(axis=0)
+        scaled = np.sqrt(self.scale)[:, None] * of_dates
+        of_shared = np.maximum((scaled**2).sum(axis=0), (scaled * (self.alike @ scaled)).sum(axis=0))
+        variance = self.shared * of_shared + (shares**2 * self.own).sum(axis=0)
         return size, variance, self.value - (apart[:, :, None] * size)
 
 
@@ -106,7 +117,8 @@ def motion_of(
     steady : bool
         Try steady motion only.
     """
-    left = _left(edges, network, components, accepted & np.isfinite(years[edges.first] - years[edges.second]))
+    timed = accepted & np.isfinite(years[edges.first] - years[edges.second])
+    left = _left(edges, network, components, timed, years)
     time = np.where(np.isfinite(years), years, 0.0)
     tested = (left.weight > 0).sum(axis=0) >= _FEWEST
     span = float(np.ptp(years[np.isfinite(years)]))
@@ -119,7 +131,7 @@ def motion_of(
     forms = [] if steady else _forms(time, np.isfinite(years), span)
     crit = chi2.isf(_CHANCE / (1 + len(forms)), 2)
     moving = tested & (ratio > crit) & (size > LEAST)
-    without = _Left(rest, left.weight, left.own, left.shared, left.scale, left.first, left.second)
+    without = replace(left, value=rest)
     for name, course in forms:
         change, variance, _ = without.change(course)
         seen = tested & (variance < 1e6)
@@ -136,7 +148,9 @@ def motion_of(
     return Motion(moving, tested, rate, sigma, ratio, form)
 
 
-def _left(edges: Edges, network: Array, components: ErrorComponents, accepted: NDArray[np.bool_]) -> _Left:
+def _left(
+    edges: Edges, network: Array, components: ErrorComponents, accepted: NDArray[np.bool_], years: Array
+) -> _Left:
     seen = edges.measured & accepted[:, None]
     value = np.where(seen[:, :, None], np.nan_to_num(edges.value) - network, 0.0)
     shared, own = components.at_place(edges)
@@ -149,6 +163,7 @@ def _left(edges: Edges, network: Array, components: ErrorComponents, accepted: N
         own,
         np.where(seen, shared, 0.0).sum(axis=0) / many,
         components.scale,
+        season_correlation(years),
         edges.first,
         edges.second,
     )
@@ -179,9 +194,9 @@ def _majority(rate: Array, variance: Array) -> Array:
 def _forms(time: Array, known: NDArray[np.bool_], span: float) -> list[tuple[str, Array]]:
     """Return changes over time besides a steady one."""
     times = np.unique(time[known])
-    if len(times) < 6:
+    if len(times) < 2 * _BESIDE:
         return []
-    inside = times[2:-1]
+    inside = times[_BESIDE : len(times) - _BESIDE + 1]
     chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _STEPS).round().astype(int))]
     found = [("step", (time >= one).astype(float)) for one in chosen]
     if span >= _WAVE:

@@ -26,7 +26,7 @@ from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from scipy.stats import chi2
 
-from ortho_pipeline.block.stack.components import ErrorComponents
+from ortho_pipeline.block.stack.components import ErrorComponents, season_correlation
 from ortho_pipeline.block.stack.edges import Edges
 from ortho_pipeline.block.stack.trends import Trends
 from ortho_pipeline.models.base import Array
@@ -41,8 +41,6 @@ _LIMIT = float(chi2.isf(CHANCE, 2))
 _SMALL = 0.03
 #: The stated error of an edge counts as much as this many loops.
 _STATED = 10
-#: The errors of dates that are so many years apart, counted within a year, have a correlation of exp(-1).
-_SEASON = 0.25
 #: An edge with a smaller redundancy is in no loop.
 _IN_LOOP = 1e-6
 
@@ -94,10 +92,8 @@ class Network:
 
         A date without a time (NaN), such as a reference, shares it with no other date.
         """
-        apart = np.sin(np.pi * (years[:, None] - years)) ** 2 / np.sin(np.pi * _SEASON) ** 2
-        alike = np.where(np.isfinite(apart), np.exp(-np.nan_to_num(apart)), np.eye(len(years)))
         covariance = self.covariance.copy()
-        covariance[:, ::3, ::3] += variance[:, None, None] * alike
+        covariance[:, ::3, ::3] += variance[:, None, None] * season_correlation(years)
         return replace(self, covariance=covariance)
 
 
