@@ -34,12 +34,10 @@ HOME = Path(__file__).resolve().parents[1]
 #: What is slower by more than this is a regression.
 TOLERATED = 1.03
 LIMIT = f"{(TOLERATED - 1) * 100:.0f} %"
-NOT_SURE = (
-    f'"not sure": the job may be slower by more than {LIMIT} or not. More pairs decide it, for example --pairs 31.'
-)
+NOT_SURE = f'"not sure": the job may be slower by more than {LIMIT} or not. More pairs decide it: --pairs 31.'
 
 #: A block with four control points. With the two of a block of 10 images, one wrong ray makes half of them contradict.
-BLOCK = ("--images", "16", "--points", "2000")
+BLOCK = ("--images", "16", "--points", "8000")
 
 #: After `API` of a commit's warp.py, which knows the names of its modules: the CPU time of its warp, kernels loaded.
 TIMED = """
