@@ -22,7 +22,8 @@ def notes(tag: str, root: Path = ROOT) -> str:
     if tag != f"v{version}":
         raise SystemExit(f"Error: the tag is {tag}, but pyproject.toml has version {version}. Use v{version}.")
     changes = (root / "CHANGELOG.md").read_text(encoding="utf-8")
-    found = re.search(rf"^## {re.escape(version)} \(.*\)\n+(.+?)\s*(?=^## |\Z)", changes, re.MULTILINE | re.DOTALL)
+    section = changes.partition(f"\n## {version} (")[2].partition("\n## ")[0]
+    found = section.partition("\n")[2].strip()
     if not found:
         raise SystemExit(f"Error: CHANGELOG.md has no section '## {version} (DATE)' with changes.")
     relative = relative_links((root / "README.md").read_text(encoding="utf-8"))
@@ -31,7 +32,7 @@ def notes(tag: str, root: Path = ROOT) -> str:
             f"Error: {len(relative)} links of README.md are relative ({relative[0]}, ...). They break on PyPI. "
             "RELEASING.md has the command that makes them absolute."
         )
-    return found[1] + "\n"
+    return found + "\n"
 
 
 def relative_links(page: str) -> list[str]:
