@@ -17,6 +17,7 @@
 #                 and what they do with faults; the tables of docs/comparison.md (half an hour)
 #   make packages build sdist and wheel, install and try both in clean environments (PYTHONS=python3.12=wheel, more)
 #   make dist     build sdist and wheel in out/dist
+#   make sbom     list the wheel and what it requires, as they were tested, in out/dist/sbom.cdx.json (CycloneDX)
 #   make docs     do the tutorials and draw their pictures, then the documentation as a site in out/site, links checked,
 #                 and manual pages in out/man
 #   make images   draw all pictures again: README.md, docs/measure.md, docs/report.md, tutorials, notebooks (Chromium)
@@ -48,7 +49,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all test-with real-data faults mutants lint check dist page-types fuzz bench peers packages docs images constraints pin-image clean
+.PHONY: help setup demo test test-all test-with real-data faults mutants lint check dist sbom page-types fuzz bench peers packages docs images constraints pin-image clean
 
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
@@ -95,7 +96,7 @@ RESOLUTION ?= lowest-direct
 test-with: setup
 	@$(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt uv
 	mkdir -p out
-	$(BIN)/uv pip compile --quiet --universal --generate-hashes --resolution $(RESOLUTION) --extra dev \
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --upgrade --resolution $(RESOLUTION) --extra dev \
 	    --python-version "$$($(BIN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')" \
 	    -o out/$(RESOLUTION).txt pyproject.toml tools/constraints.in
 	$(MAKE) test VENV=out/venv-$(RESOLUTION) CONSTRAINTS=out/$(RESOLUTION).txt
@@ -111,6 +112,18 @@ check: lint
 dist: setup
 	@rm -rf out/dist
 	$(BIN)/python -m hatchling build --directory out/dist
+
+# The list is of an environment that has only the wheel and its requirements.
+SBOM_PIP = $(BIN)/python -m pip --disable-pip-version-check --python out/sbom/bin/python install --quiet
+sbom: dist
+	@rm -rf out/sbom out/cyclonedx
+	$(BIN)/python -m venv --without-pip out/sbom
+	$(BIN)/python tools/requirements.py | $(SBOM_PIP) --require-hashes -c $(CONSTRAINTS) -r /dev/stdin
+	$(SBOM_PIP) --no-deps out/dist/*.whl
+	$(BIN)/python -m venv out/cyclonedx
+	out/cyclonedx/bin/pip install --quiet cyclonedx-bom==7.5.0
+	out/cyclonedx/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
+	    -o out/dist/sbom.cdx.json out/sbom/bin/python
 
 page-types:
 	@npx --yes -p typescript@5.9 tsc -p tests/measure/types

@@ -13,6 +13,24 @@ unset PYTHONPATH PYTHONHOME VIRTUAL_ENV # nothing of the repository is on a path
 PLACE="$(mktemp -d)"
 trap 'rm -rf "$PLACE"' EXIT
 
+missing=() # found before minutes of work
+for one in "$@"; do
+    python="${one%%=*}" way="${one##*=}"
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
+        missing+=("$one: $python cannot be run, or has no module venv. A path works too: /path/to/python=$way")
+    elif [ "$way" = system ]; then
+        command -v gdal-config >/dev/null || missing+=("$one: gdal-config of the system's GDAL (libgdal-dev)")
+    elif [ "$way" != wheel ]; then
+        missing+=("$one: write $python=system or $python=wheel")
+    elif ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 12))'; then
+        missing+=("$one: the wheel needs Python 3.12 or newer")
+    fi
+done
+if [ ${#missing[@]} -gt 0 ]; then
+    printf '[packages] MISSING: %s\n' "${missing[@]}" >&2
+    exit 1
+fi
+
 say() { printf '[packages] %s\n' "$*"; }
 quietly() { "$@" >"$PLACE/log" 2>&1 || { tail -40 "$PLACE/log" >&2; say "FAILED: $*" >&2; exit 1; }; }
 
