@@ -415,6 +415,6 @@ def _product_files(folder: Any) -> list[str]:
     """Return the files in a folder that describe a DIMAP product."""
     names = [name for name in listing(folder).names if re.match(r"(dim_|vol_|metadata\.dim)", name.lower())]
     if not names:
-        remedy = "give its images by name, or the folder of a product that GDAL opens (DIMAP)"
+        remedy = f"give the images in it by name ({folder}/*.tif); only the folder of a DIMAP product is an image"
         raise InputError("this is a folder, not an image", file=folder, remedy=remedy)
     return names
