@@ -17,8 +17,13 @@ import pytest
 from click.testing import CliRunner
 from osgeo import gdal
 
+from ortho_pipeline.batch.stack.dates import dated_orthos
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.control.ties import names_of
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.locations import Location
 from ortho_pipeline.runtime.compilation import cache_folders
+from ortho_pipeline.stores.delivery import address_of
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
@@ -154,3 +159,51 @@ def test_the_sample_job_a_match_and_a_run_of_two_scenes(tmp_path: Path) -> None:
 
 def read(path: Path) -> np.ndarray:
     return gdal.Open(str(path)).ReadAsArray()
+
+
+def test_folders_with_blanks_and_umlauts_and_lines_that_end_as_on_windows(tmp_path: Path) -> None:
+    """The ortho has the pixels of the same job in a plain folder."""
+    odd, plain = tmp_path / "Straße Nr. 1" / "Übung (2)", tmp_path / "plain"
+    pipeline = (
+        "scenes:\n- image: {0}.tif\n  points: {{gcps: points.csv}}\n"
+        "defaults:\n  surface: {{dem: dem.tif}}\n  output: {{extent: [530600, 4122000, 530900, 4122300]}}\n"
+    )
+    made = []
+    for folder, name, ends in ((odd, "Grün ß", "\r\n"), (plain, "scene", "\n")):
+        folder.mkdir(parents=True)
+        shutil.copy(SAMPLE / "scene.tif", folder / f"{name}.tif")
+        shutil.copy(SAMPLE / "dem.tif", folder)
+        texts = {
+            f"{name}_RPC.TXT": (SAMPLE / "scene_RPC.TXT").read_text(),
+            "points.csv": (SAMPLE / "gcps.csv").read_text(),
+        }
+        for file, text in {**texts, "pipeline.yaml": pipeline.format(name)}.items():
+            (folder / file).write_bytes(text.replace("\n", ends).encode())
+        done = CliRunner().invoke(cli, ["run", str(folder / "pipeline.yaml"), "--executor", "sequential"])
+        assert done.exit_code == 0, done.output
+        report = json.loads((folder / "out" / name / f"{name}_report.json").read_text())
+        assert report["adjustment"]["rmse"]["control"]["n"] > 5
+        made.append(read(folder / "out" / name / f"{name}_ortho.tif"))
+    assert np.array_equal(*made)
+
+
+@pytest.mark.parametrize("name", ["C:/data/scene.tif", "C:\\data\\scene.tif", "d:/delivery.zip/a.tif", "c:scene.tif"])
+def test_a_drive_letter_begins_no_address(name: str) -> None:
+    location = Location(name)
+    assert not any((location.is_address, location.is_far, location.is_item, location.is_on_web))
+    assert address_of(name) is None
+
+
+def test_names_that_differ_in_case_alone_are_one_name(tmp_path: Path) -> None:
+    """Windows and macOS would write the outputs of both into one file."""
+    for name in ("a.tif", "A.tif"):
+        shutil.copy(SAMPLE / "reference.tif", tmp_path / name)
+    with pytest.raises(InputError, match=r"two images are called [aA]\b"):
+        dated_orthos([tmp_path])
+    assert len({one.lower() for one in names_of([tmp_path / "a.tif", tmp_path / "sub" / "A.tif"])}) == 2
+    (tmp_path / "pipeline.yaml").write_text(
+        "scenes:\n- image: a.tif\n- image: A.tif\ndefaults: {surface: {height: 0}}\n"
+    )
+    done = CliRunner().invoke(cli, ["run", str(tmp_path / "pipeline.yaml"), "--dry-run"])
+    assert done.exit_code == 2
+    assert "have the same scene name" in done.output

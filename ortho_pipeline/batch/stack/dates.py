@@ -8,6 +8,7 @@ import glob
 import io
 import os
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -129,11 +130,12 @@ def dated_orthos(
         if _real(one.path) in skipped:
             continue
         name = one.path.stem
-        if name in found and _real(found[name].path) != _real(one.path):
+        # Some file systems ignore case, or different encodings of é.
+        other = found.setdefault(unicodedata.normalize("NFC", name).casefold(), one)
+        if _real(other.path) != _real(one.path):
             raise InputError(
                 f"two images are called {name}", file=one.path, field="orthos", remedy="rename one of them"
             )
-        found[name] = one
     if len(found) < 2:
         raise InputError(
             f"a stack needs at least two images, not {len(found)}",
@@ -141,7 +143,7 @@ def dated_orthos(
             remedy=f"give a folder with orthos ({', '.join(RASTERS)})",
         )
     dated = []
-    for name, one in found.items():
+    for one in found.values():
         path = one.path
         scene = open_ortho(path, options, only=False)
         if scene.sensor != ORTHO and not heights:
@@ -155,7 +157,7 @@ def dated_orthos(
         time, source = _date(one, pattern, documents, dataset, scene)
         facts = [*(_facts_of(document) for document, _ in documents), scene.facts]
         conditions = conditions_of(facts, dataset)
-        dated.append(Dated(name, path, time, source, scene, conditions=conditions))
+        dated.append(Dated(path.stem, path, time, source, scene, conditions=conditions))
     return sorted(dated, key=lambda one: (one.time, one.name))
 
 
