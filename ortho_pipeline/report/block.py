@@ -71,6 +71,14 @@ TIED = "their image measurements were used as tie points"
 _NO_CHECKS = "there are no check points"
 #: A frame's side, the longest arrow in it, and the margin in which arrows of points at its edge end.
 _SIDE, _ARROW, _MARGIN = 420.0, 44.0, 48.0
+#: What parameters of a camera are called, with the unit in which people read lengths.
+_CAMERA = {
+    "focal_length": ("focal length", "mm"),
+    "x0": ("principal point x", "mm"),
+    "y0": ("principal point y", "mm"),
+    **{name: (f"radial distortion {name}", "") for name in ("k1", "k2", "k3")},
+    **{name: (f"tangential distortion {name}", "") for name in ("p1", "p2")},
+}
 
 
 def build_report(
@@ -282,7 +290,8 @@ def camera_lines(parameters: Sequence[SharedParameterRecord]) -> list[str]:
             found.append(
                 f"Camera of {counted(one.images, 'image')}: focal length {change:+.2f} % (sigma {sigma:.2f} %)"
             )
-    changed = ", ".join(dict.fromkeys(one.name for one in parameters if one.significant)) or "none"
+    named = (_CAMERA.get(one.name, (one.name, ""))[0] for one in parameters if one.significant)
+    changed = ", ".join(dict.fromkeys(named)) or "none"
     return [*found, f"Parameters of the camera that changed significantly: {changed}"]
 
 
@@ -380,6 +389,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         scale_rules=None if report.map_scale is None else scale_rules(report.map_scale),
         ground_sigmas=variance_lines(adjustment.variances),
         expected=sigma_lines(report),
+        camera=_CAMERA,
         roles={role: sum(point.role == role for point in adjustment.points) for role in ROLES},
         points=sorted(
             zip(adjustment.points, report.network.largest_deg, strict=True), key=lambda one: ROLES.index(one[0].role)
