@@ -13,7 +13,7 @@ import numpy as np
 #: Neighbours of a date among the earlier dates.
 NEIGHBOURS = 3
 #: Days from a date to its partners, and how far from that a partner may be. In whole years the season is the same.
-_LAGS = ((91.0, 25.0), (365.25, 40.0), (1826.25, 40.0))
+_LAGS = ((365.25, 40.0), (1826.25, 40.0))
 
 #: A date counts as under clouds to this part at most, and the sun as no lower (degrees).
 _CLOUDED, _LOW = 0.99, 5.0
