@@ -80,6 +80,17 @@ def test_still_ground_is_not_moving():
     assert sum(solved(seed=seed, dates=16)[1].motion.moving.sum() for seed in (30, 31)) <= 1
 
 
+def test_a_cloud_at_one_date_is_not_motion():
+    """One date is displaced at one place in all of its edges; the places about it are still."""
+    made = Truth(seed=30, dates=24, interval=30.0, hidden=0.0).made()
+    value = made.edges.value.copy()
+    for number, date in enumerate((2, 11, 21)):
+        value[made.edges.first == date, 40 + 30 * number] += 1.0
+        value[made.edges.second == date, 40 + 30 * number] -= 1.0
+    stack = adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years.tolist())
+    assert not stack.motion.moving[[40, 70, 100]].any()
+
+
 def test_only_dates_with_significant_slopes_get_them():
     made, stack = solved(seed=4, dates=16, sloped=3)
     np.testing.assert_array_equal(stack.sloped, np.abs(made.slopes).max(axis=(1, 2)) > 0)
