@@ -99,8 +99,8 @@ def sharpen(
     for path in (pan, colours):
         check_paths(files, Request(path, scene, output=output))
     ledger = Ledger(begun=states(path for path in paths if not Location(path).is_far))
-    # A quarter of the memory for caches: windows are read once and in order. What matches and the warper take the rest.
-    output = replace(output, memory=output.memory // 4)
+    # Half of the memory for reading; what matches takes the rest.
+    output = replace(output, memory=output.memory // 2)
     pair = OrthoPair.open(pan, colours, scene, output, ratio)
     stage = progress or (lambda name, share: None)
     stage("Weights", 0.0)
@@ -205,7 +205,7 @@ class OrthoPair:
     def samples(self) -> list[Sample]:
         """Read windows of both orthos on the coarse grid."""
         memory = self.output.memory
-        limit_cache(memory, 1, *(source.block for source in self.sources))
+        limit_cache(memory // 2, 1, *(source.block for source in self.sources))
         settings = {"resampling": "average", "memory": memory, **self.scene.access}
         pan, colours = (Regridded(path, self.coarse, **settings) for path in self.paths)
         return read_samples(pan, colours, self.bands, self.coarse, self.whole_ratio)
@@ -295,7 +295,8 @@ def _agreement(pair: OrthoPair, regression: Weights) -> tuple[Agreement | None, 
     alike = regression.explained >= _EXPLAINED
     share = max(regression.explained, 0.0)
     try:
-        agreement = measure_agreement(*pair.paths, pair.scene, pair.output)
+        less = replace(pair.output, memory=pair.output.memory // 2)
+        agreement = measure_agreement(*pair.paths, pair.scene, less)
     except (InputError, TooFewPoints) as error:
         if not alike:
             raise InputError(
@@ -332,8 +333,9 @@ def _write(pair: OrthoPair, weights: Sequence[float], path: Path, stage: Progres
     """Write the ortho; return the number of its valid pixels."""
     output, (pan, colours) = pair.output, pair.sources
     profile = Profile.of(colours, output.dtype, output.nodata)
-    threads = limit_cache(output.memory, output.threads or os.cpu_count() or 1, pan.block, colours.block)
-    image = Pansharpened(pan, colours, pair.grids, weights, profile, threads=threads, memory=output.memory // 8)
+    # Windows are read once and in order, so a small cache suffices.
+    threads = limit_cache(output.memory // 2, output.threads or os.cpu_count() or 1, pan.block, colours.block)
+    image = Pansharpened(pan, colours, pair.grids, weights, profile, threads=threads, memory=output.memory // 16)
     grid, valid_pixels = image.overlap.grid, 0
     options: dict[str, Any] = {"driver": output.format, "creation_options": output.creation_options}
     with RasterWriter(path, grid, profile, threads=threads, progress=stage, **options) as writer:
