@@ -8,11 +8,12 @@ import numpy as np
 import pyproj
 import pytest
 from osgeo import gdal
+from scipy import stats
 
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, write_accuracy
+from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, predictive, write_accuracy
 from ortho_pipeline.warp.quality.error_ellipse import circular_error
 from ortho_pipeline.warp.quality.sight import Sight
 
@@ -141,3 +142,9 @@ def test_what_a_vendor_states_is_a_radius_on_the_ground(tiny):
     sight = Sight(dataclasses.replace(tiny.model, err_bias=8.0, err_rand=1.0), grid_of(tiny))
     parts = parts_at(Budget(stated=3.0), sight, np.array([100.0]), np.array([90.0]), np.array([500.0]))
     np.testing.assert_allclose(parts.total, [[9.0, 9.0, 0.0]])
+
+
+@pytest.mark.parametrize(("freedom", "counted"), [(1, 3), (3, 3), (4, 4), (5, 5), (40, 40), (np.inf, 1e12)])
+def test_few_points_predict_with_the_variance_of_student(freedom, counted):
+    covariance = np.array([[4.0, -1.0], [-1.0, 2.0]])
+    np.testing.assert_allclose(predictive(covariance, freedom), covariance * stats.t.var(counted))
