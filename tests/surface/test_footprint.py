@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from ortho_pipeline.errors import CoverageError
+from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection
@@ -67,6 +67,15 @@ def test_a_drone_lies_on_the_ground_and_not_between_guesses(tmp_path):
     assert grid.dx == pytest.approx(0.12)
     xmin, ymin, xmax, ymax = grid.extent
     assert (xmax - xmin, ymax - ymin) == pytest.approx((120.0, 668 * 0.12), abs=0.25)
+
+
+def test_a_pixel_may_be_larger_than_the_scene_on_one_axis(tmp_path):
+    model, on = drone(), surface(tmp_path)
+    grid = choose_grid(model, laid(model, on), (WIDTH, HEIGHT), resolution=(500.0, 0.5))
+    assert (grid.dx, grid.dy) == (500.0, 0.5)
+    with pytest.raises(InputError, match="the whole scene is smaller than one pixel") as caught:
+        choose_grid(model, laid(model, on), (WIDTH, HEIGHT), resolution=(121.0, 81.0))
+    assert "the scene's own pixel is 0.12" in caught.value.remedy
 
 
 @pytest.mark.parametrize("pixel", [(1.0, 1.0), (0.5, 2.0), (2.0, 0.25)])
