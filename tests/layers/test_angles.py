@@ -18,6 +18,7 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.quality.angles import Sun, write_angles, write_shadows
 from ortho_pipeline.warp.quality.hiding import Hiding
 from ortho_pipeline.warp.quality.sight import Sight
@@ -52,8 +53,6 @@ def test_angles_of_view_are_those_of_the_rays_in_space(tiny, tmp_path):
 
 @pytest.mark.parametrize(("east", "north"), [(0.3, 0.0), (0.0, 0.4), (-0.2, -0.3)])
 def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path, east, north):
-    from ortho_pipeline.surface.writing import write_dem
-
     step = np.arange(0, 400.0, 4)
     heights = FLOOR + 50 + east * step - north * step[:, None]  # rows go south
     write_dem(tmp_path / "dem.tif", heights, (WEST - 70, NORTH + 70), 4.0, "EPSG:32636")
@@ -124,6 +123,22 @@ def test_ground_without_a_height_is_neither_lit_nor_in_shadow(tmp_path):
         "in the sun", "in shadow", "without a height",
     ]  # fmt: skip
     assert [mask.GetMetadataItem(f"SUN_{name}") for name in ("AZIMUTH", "ELEVATION")] == ["180", "45"]
+
+
+def test_the_earth_falls_away_below_a_low_sun(tmp_path):
+    """A plateau of 100 m, the sun 1 degree high in the south: its shadow is 140 m shorter than on a flat Earth."""
+    heights = np.full((720, 40), FLOOR)
+    heights[700:] += 100.0
+    write_dem(tmp_path / "dem.tif", heights, (WEST - 200, NORTH), 10.0, "EPSG:32636")
+    grid = Grid(pyproj.CRS.from_epsg(32636), WEST - 100, NORTH, 10.0, 10.0, 20, 695)
+    surface, sight = open_dem(tmp_path / "dem.tif", "ellipsoid"), Sight(Parallel(0.0, 0.0, 10.0, 256.0), grid)
+    write_shadows(sight, surface, Sun(180.0, 1.0), tmp_path / "shadow.tif", heights=(FLOOR, FLOOR + 100))
+    first = np.argmax(read(tmp_path / "shadow.tif") == 2, axis=0)
+    # distance * tangent + distance^2 / 2 R = 100 m, from the first sample of the plateau.
+    tangent, radius = np.tan(np.radians(1.0)), 6_371_000.0
+    length = radius * (np.sqrt(tangent**2 + 2 * 100.0 / radius) - tangent)
+    assert 100.0 / tangent - length > 130
+    np.testing.assert_allclose(7005.0 - 10.0 * first - 5.0, length, atol=12)
 
 
 def rendered(off_nadir: float, azimuth: float) -> np.ndarray:
