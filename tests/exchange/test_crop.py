@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_own
-from ortho_pipeline.exchange.crop import fits, moved, nearer, noted_offset
+from ortho_pipeline.exchange.crop import fits, moved, nearer, noted_offset, placed
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
 from ortho_pipeline.exchange.rpc_files import write_geom
 from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.hookspecs import Piece
 from ortho_pipeline.host import open_scene as open_product
 from ortho_pipeline.models import ImageCorrection, model_from_dict
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
@@ -157,6 +159,13 @@ def test_an_rpc_for_other_pixels_is_remarkable(tiny, tmp_path, size, first, code
         assert "columns {} to {} and rows {} to {}".format(*ends) in scene.warnings[0]
 
 
+def test_pieces_move_with_their_scene(tiny):
+    """A piece that begins at column 250 and row 30 of the larger image begins 100 and 50 earlier in the crop."""
+    scene = replace(open_product(tiny.image), pieces=(Piece("b.tif", offset=(250.0, 30.0)),))
+    (piece,) = placed(scene, open_dataset(tiny.image), CORNER).pieces
+    assert piece.offset == (150.0, -20.0)
+
+
 @pytest.mark.parametrize(
     ("size", "offset", "expected"),
     [
@@ -173,6 +182,10 @@ def test_the_size_in_a_geom_file_says_whose_rpc_it_is(tiny, tmp_path):
     path = cut(tiny, tmp_path / "crop.tif")
     for model, size, said in ((tiny.model, (400, 300), 1), (tiny.model.shifted(*CORNER), (200, 150), 0)):
         write_geom(model, size, tmp_path / "any.geom")
+        # Other programs read these names.
+        assert {f"number_samples:  {size[0]}", f"number_lines:  {size[1]}"} <= set(
+            (tmp_path / "any.geom").read_text().splitlines()
+        )
         scene = open_scene(path, SceneOptions(rpc=tmp_path / "any.geom"))
         np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
         text = "shifted to the crop (the RPC file is for an image of 400 x 300 pixels)"
