@@ -159,6 +159,24 @@ def test_an_rpc_for_other_pixels_is_remarkable(tiny, tmp_path, size, first, code
         assert "columns {} to {} and rows {} to {}".format(*ends) in scene.warnings[0]
 
 
+@pytest.mark.parametrize(
+    ("tags", "domain"),
+    [
+        # Airbus counts rows first, from 1.
+        ({"gml.root-instance": "<gml:low>1 1</gml:low> <gml:high>300 400</gml:high>"}, ""),
+        ({"numColumns": "400", "numRows": " 300 "}, "IMD"),
+    ],
+)
+def test_vendors_state_the_size_of_the_larger_image(tiny, whole, tmp_path, tags, domain):
+    scene = open_product(cut(tiny, tmp_path / "bare.tif", None), options={"rpc": str(whole)})
+    dataset = gdal.GetDriverByName("MEM").Create("", 200, 150)
+    dataset.SetGeoTransform((100.0, 1.0, 0.0, 50.0, 0.0, 1.0))
+    dataset.SetMetadata(tags, domain)
+    found = placed(scene, dataset)
+    np.testing.assert_allclose(ground_of(found), truth(tiny), atol=1e-9)
+    assert "shifted to the crop (the larger image has 400 x 300 pixels)" in found.warnings[-1]
+
+
 def test_pieces_move_with_their_scene(tiny):
     """A piece that begins at column 250 and row 30 of the larger image begins 100 and 50 earlier in the crop."""
     scene = replace(open_product(tiny.image), pieces=(Piece("b.tif", offset=(250.0, 30.0)),))
