@@ -208,6 +208,50 @@ def test_a_scene_across_the_antimeridian_has_a_narrow_grid(middle):
     assert scene_pixels(model, found, grid) == pytest.approx(1e6, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("height", "said"),
+    [(850.0, "500 to 850 m"), (150.0, "150 to 500 m"), (790.0, None), (210.0, None)],
+)
+def test_heights_that_a_model_does_not_project_are_told(tmp_path, height, said):
+    """An RPC of 300 to 700 m is good for half of that more on both sides; the DEM has 500 m and a spot."""
+    column, row, one = np.eye(20)[1], -np.eye(20)[2], np.eye(20)[0]
+    model = RPC(500.0, 500.0, 10.0, 10.0, 500.0, 500.0, 500.0, 0.1, 0.1, 200.0, column, one, row, one)
+    heights = np.full((80, 80), 500.0)
+    heights[40:44, 30:34] = height
+    write_dem(tmp_path / "dem.tif", heights, (9.8, 10.2), 0.005, "EPSG:4326")
+    beyond = lay(model, open_dem(tmp_path / "dem.tif", "ellipsoid"), 1000, 1000).beyond
+    whole = f"heights under the scene are {said} above the ellipsoid, its model is good for 200 to 800 m"
+    assert beyond == ("" if said is None else whole)
+
+
+@pytest.mark.parametrize(
+    ("fill", "changes", "said"),
+    [
+        ("error", {}, None), ("error", {"complete": False, "coverage": 0.5}, "the DEM covers 50.0 % of the scene"),
+        ("error", {"complete": False, "coverage": 0.5, "beyond": "too high"}, "too high"),
+        ("error", {"beyond": "too high"}, None), ("mask", {"complete": False, "coverage": 1e-3}, None),
+        ("mask", {"complete": False, "coverage": 0.0}, "the ortho would have no pixels"),
+        ("mask", {"complete": False, "coverage": 0.0, "beyond": "too high"}, "too high"),
+        ("mask", {"complete": False, "coverage": 0.5, "beyond": "too high"}, None),
+        ("mask", {"complete": False, "coverage": 0.5, "unmet": True}, None),
+        ("nearest", {"complete": False, "coverage": 0.5}, None),
+        ("nearest", {"complete": False, "coverage": 0.5, "unmet": True}, "more than 1.02 km from the nearest height"),
+        ("80", {"complete": False, "coverage": 0.0, "unmet": True}, None),
+    ],
+)  # fmt: skip
+def test_which_coverage_is_refused(tmp_path, fill, changes, said):
+    """Without a rule every gap; with voids left empty, only an ortho without pixels; with others what they lack."""
+    found = replace(laid(drone(), surface(tmp_path, fill=fill)), **changes)
+    if said is None:
+        found.require_coverage()
+        return
+    with pytest.raises(CoverageError) as caught:
+        found.require_coverage()
+    assert said in str(caught.value)
+    assert caught.value.file == str(tmp_path / "dem.tif")
+    assert caught.value.remedy
+
+
 def test_models_are_meant_for_the_heights_under_their_scene(tmp_path):
     v, u = np.mgrid[:451, :451]
     heights = GROUND + 10 * np.sin(u / 20) * np.cos(v / 15)
