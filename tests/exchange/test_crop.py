@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_own
-from ortho_pipeline.exchange.crop import moved, nearer, noted_offset
+from ortho_pipeline.exchange.crop import fits, moved, nearer, noted_offset, placed
 from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
+from ortho_pipeline.exchange.rpc_files import write_geom
 from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.hookspecs import Piece
 from ortho_pipeline.host import open_scene as open_product
 from ortho_pipeline.models import ImageCorrection, model_from_dict
 from ortho_pipeline.models.pushbroom.metadata import pushbroom_of_metadata
@@ -128,6 +131,83 @@ def test_an_image_much_smaller_than_its_rpc_is_remarkable(tiny, whole, tmp_path)
     gdal.Translate(str(part), str(tiny.image), srcWin=[300, 200, 60, 60])
     assert open_scene(part).warnings == ()
     assert open_scene(tiny.image).warnings == ()
+
+
+def opened(tiny: Any, tmp_path: Path, size: tuple[int, int], first: tuple[float, float]) -> Any:
+    """Open an image of a size with an RPC for 400 x 300 pixels, of which this is the first in the image's own count."""
+    write_rpc_txt(tiny.model.shifted(-first[0], -first[1]), tmp_path / "any_RPC.TXT")
+    gdal.GetDriverByName("GTiff").Create(str(tmp_path / "any.tif"), *size, 1)
+    return open_scene(tmp_path / "any.tif", SceneOptions(rpc=tmp_path / "any_RPC.TXT"))
+
+
+@pytest.mark.parametrize(
+    ("size", "first", "codes"),
+    [
+        ((400, 300), (0, 0), ()), ((200, 150), (0, 0), ()), ((199, 300), (0, 0), ("maybe-a-crop",)),
+        ((400, 149), (0, 0), ("maybe-a-crop",)), ((199, 149), (-15, 10), ("maybe-a-crop",)), ((199, 149), (-30, 0), ()),
+        ((199, 149), (0, -20), ()), ((400, 300), (-390, 0), ()), ((400, 300), (390, 290), ()),
+        ((400, 300), (-410, 0), ("rpc-elsewhere",)), ((400, 300), (410, 0), ("rpc-elsewhere",)),
+        ((400, 300), (0, -310), ("rpc-elsewhere",)), ((400, 300), (0, 310), ("rpc-elsewhere",)),
+    ],
+)  # fmt: skip
+def test_an_rpc_for_other_pixels_is_remarkable(tiny, tmp_path, size, first, codes):
+    """Less than half of the range on one side, or no common pixel at all; a range that begins elsewhere is a crop's."""
+    scene = opened(tiny, tmp_path, size, first)
+    assert tuple(notice.code for notice in scene.notices) == codes
+    if codes == ("rpc-elsewhere",):
+        ends = (first[0], first[0] + 400, first[1], first[1] + 300)
+        assert "columns {} to {} and rows {} to {}".format(*ends) in scene.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("tags", "domain"),
+    [
+        # Airbus counts rows first, from 1.
+        ({"gml.root-instance": "<gml:low>1 1</gml:low> <gml:high>300 400</gml:high>"}, ""),
+        ({"numColumns": "400", "numRows": " 300 "}, "IMD"),
+    ],
+)
+def test_vendors_state_the_size_of_the_larger_image(tiny, whole, tmp_path, tags, domain):
+    scene = open_product(cut(tiny, tmp_path / "bare.tif", None), options={"rpc": str(whole)})
+    dataset = gdal.GetDriverByName("MEM").Create("", 200, 150)
+    dataset.SetGeoTransform((100.0, 1.0, 0.0, 50.0, 0.0, 1.0))
+    dataset.SetMetadata(tags, domain)
+    found = placed(scene, dataset)
+    np.testing.assert_allclose(ground_of(found), truth(tiny), atol=1e-9)
+    assert "shifted to the crop (the larger image has 400 x 300 pixels)" in found.warnings[-1]
+
+
+def test_pieces_move_with_their_scene(tiny):
+    """A piece that begins at column 250 and row 30 of the larger image begins 100 and 50 earlier in the crop."""
+    scene = replace(open_product(tiny.image), pieces=(Piece("b.tif", offset=(250.0, 30.0)),))
+    (piece,) = placed(scene, open_dataset(tiny.image), CORNER).pieces
+    assert piece.offset == (150.0, -20.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "offset", "expected"),
+    [
+        ((400, 300), None, True), ((400, 299), None, False), ((200, 150), None, False), ((200, 150), (0, 0), True),
+        ((200, 150), (200, 150), True), ((200, 150), (201, 150), False), ((200, 150), (200, 151), False),
+        ((200, 150), (-1, 0), False), ((200, 150), (0, -1), False),
+    ],
+)  # fmt: skip
+def test_a_crop_lies_within_the_larger_image(size, offset, expected):
+    assert fits(size, (400, 300), offset) is expected
+
+
+def test_the_size_in_a_geom_file_says_whose_rpc_it_is(tiny, tmp_path):
+    path = cut(tiny, tmp_path / "crop.tif")
+    for model, size, said in ((tiny.model, (400, 300), 1), (tiny.model.shifted(*CORNER), (200, 150), 0)):
+        write_geom(model, size, tmp_path / "any.geom")
+        # Other programs read these names.
+        assert {f"number_samples:  {size[0]}", f"number_lines:  {size[1]}"} <= set(
+            (tmp_path / "any.geom").read_text().splitlines()
+        )
+        scene = open_scene(path, SceneOptions(rpc=tmp_path / "any.geom"))
+        np.testing.assert_allclose(ground_of(scene), truth(tiny), atol=1e-9)
+        text = "shifted to the crop (the RPC file is for an image of 400 x 300 pixels)"
+        assert sum(text in warning for warning in scene.warnings) == said
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.heights.opening import open_surface
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.export import FORMATS
+from ortho_pipeline.exchange.gcp import write_geolocation
 from ortho_pipeline.exchange.rpc import export_rpc, read_rpc
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.options import PointOptions, SurfaceOptions
@@ -266,6 +267,42 @@ def test_geolocation_arrays_map_as_the_model(tiny, tmp_path, with_dem):
     back, good = transformer.TransformPoints(1, [tuple(row) for row in found])
     assert all(good)
     np.testing.assert_allclose(np.array(back)[:, :2], image, atol=0.3)
+
+
+@dataclass(frozen=True, eq=False)
+class Bent(SensorModel):
+    """Longitudes are a quadratic of the column: 1e-5 degrees per pixel at the first, 1.5 times as much at 1000."""
+
+    kind = "bent"
+    a: float = 1e-5
+    b: float = 2.5e-9
+
+    @property
+    def crs(self) -> str:
+        return "EPSG:4979"
+
+    @property
+    def domain(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([20.0064, -30.0025, 500.0]), np.array([0.0064, 0.0026, 100.0])
+
+    def ground_to_image(self, ground: Any) -> np.ndarray:
+        lon, lat, _ = np.asarray(ground, dtype=float).T
+        columns = (np.sqrt(self.a**2 + 4 * self.b * (lon - 20.0)) - self.a) / (2 * self.b)
+        return np.stack([columns, (-30.0 - lat) / self.a], axis=1)
+
+
+def test_the_error_between_samples_of_geolocation_arrays_is_the_largest(tmp_path):
+    """Samples every 4 pixels: in the middle a straight line is off by 4 b degrees, most pixels where they are small."""
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), 1024, 512, 1)
+    worst = write_geolocation(made, Bent(), (1024, 512), None, tmp_path / "g.vrt")
+    assert worst == pytest.approx(4 * Bent.b / (Bent.a + 2 * Bent.b * 2), rel=0.01)
+    told = gdal.Open(str(tmp_path / "g.vrt")).GetMetadata("GEOLOCATION")
+    assert [told[f"{name}_STEP"] for name in ("PIXEL", "LINE")] == ["4", "4"]
+    arrays = gdal.Open(told["X_DATASET"]).ReadAsArray()
+    assert arrays.shape == (2, 129, 257)
+    columns = np.arange(257) * 4.0
+    np.testing.assert_allclose(arrays[0, 7], 20.0 + Bent.a * columns + Bent.b * columns**2, atol=1e-12)
+    np.testing.assert_allclose(arrays[1, :, 9], -30.0 - Bent.a * 4 * np.arange(129), atol=1e-12)
 
 
 # -- command line ----------------------------------------------------------------------------------------------------

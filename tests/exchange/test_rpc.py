@@ -288,6 +288,18 @@ def test_stale_side_car_is_an_error_with_a_choice(tmp_path):
     assert source == str(tmp_path / "other.txt")
 
 
+@pytest.mark.parametrize("shift", [(0.9, 0.0), (0.0, -0.9), (1.1, 0.0), (0.0, -1.1)])
+def test_a_side_car_and_a_tag_agree_within_a_pixel(tmp_path, shift):
+    rpc = make_rpc()
+    image = make_image(tmp_path / "a.tif", rpc)
+    write_rpb(rpc.shifted(*shift), tmp_path / "a.RPB")
+    if np.abs(shift).max() < 1:
+        assert same(rpc_of_dataset(gdal.Open(str(image)))[0], rpc.shifted(*shift))
+    else:
+        with pytest.raises(InputError, match=r"differ by 1\.1 px"):
+            rpc_of_dataset(gdal.Open(str(image)))
+
+
 def test_choice_that_is_not_there_is_an_error(tmp_path):
     dataset = gdal.Open(str(make_image(tmp_path / "a.tif", make_rpc())))
     with pytest.raises(InputError, match="no RPC sidecar"):
@@ -589,6 +601,19 @@ def test_poor_fit_warns_or_is_refused(monkeypatch, caplog):
     with pytest.raises(InputError, match="represents this model only to"):
         export_rpc(Wavy())
     assert export_rpc(Wavy(), force=True).max_error_px > 0.5
+
+
+@pytest.mark.parametrize(("amplitude", "told", "refused"), [(0.012, 0, False), (0.028, 1, False), (0.14, 1, True)])
+def test_a_poor_fit_is_told_above_two_hundredths_and_refused_above_a_tenth_of_a_pixel(
+    monkeypatch, amplitude, told, refused
+):
+    monkeypatch.setattr(Wavy, "amplitude", amplitude)
+    exported = export_rpc(Wavy(), force=True)
+    assert exported.max_error_px == pytest.approx(amplitude, rel=0.35)
+    assert len(exported.warnings) == told
+    if refused:
+        with pytest.raises(InputError, match="represents this model only to"):
+            export_rpc(Wavy())
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,15 @@ import dataclasses
 import numpy as np
 import pyproj
 import pytest
+from blocks import FLOOR, NORTH, WEST, City, Parallel
 from osgeo import gdal
+from scipy import stats
 
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import open_dem
-from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, write_accuracy
+from ortho_pipeline.surface.writing import write_dem
+from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, predictive, write_accuracy
 from ortho_pipeline.warp.quality.error_ellipse import circular_error
 from ortho_pipeline.warp.quality.sight import Sight
 
@@ -141,3 +144,71 @@ def test_what_a_vendor_states_is_a_radius_on_the_ground(tiny):
     sight = Sight(dataclasses.replace(tiny.model, err_bias=8.0, err_rand=1.0), grid_of(tiny))
     parts = parts_at(Budget(stated=3.0), sight, np.array([100.0]), np.array([90.0]), np.array([500.0]))
     np.testing.assert_allclose(parts.total, [[9.0, 9.0, 0.0]])
+
+
+@pytest.mark.parametrize(("freedom", "counted"), [(1, 3), (3, 3), (4, 4), (5, 5), (40, 40), (np.inf, 1e12)])
+def test_few_points_predict_with_the_variance_of_student(freedom, counted):
+    covariance = np.array([[4.0, -1.0], [-1.0, 2.0]])
+    np.testing.assert_allclose(predictive(covariance, freedom), covariance * stats.t.var(counted))
+
+
+#: Metres of the ground per metre of the map on the central meridian of a UTM zone.
+TRUE = 1 / 0.9996
+
+
+def test_parallel_rays_have_the_parts_of_a_plain_formula():
+    """Rays that go 0.3 m east and -0.4 m north per metre upwards, pixels of 2 m."""
+    sight = Sight(Parallel(0.3, -0.4, 2.0, 256.0), City(()).grid())
+    budget = Budget(heights=4.0, datum=3.0, reference=0.5, interpolation_px=0.6)
+    place = [np.array([value]) for value in (200.0, 300.0, FLOOR)]
+    parts = parts_at(budget, sight, *place)
+    square = TRUE**2
+    np.testing.assert_allclose(parts.model, [[0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(parts.heights, [np.array([2.25, 4.0, -3.0]) * square], rtol=1e-4)
+    np.testing.assert_allclose(parts.even, [[0.25, 0.25, 0.0]])
+    # The variance of an even distribution of +-0.6 px.
+    np.testing.assert_allclose(parts.interpolation, [np.array([0.48, 0.48, 0.0]) * square], rtol=1e-4, atol=1e-5)
+    # Heights of a raster: those at the place count instead.
+    other = parts_at(budget, sight, *place, sigma_heights=np.array([1.0]))
+    np.testing.assert_allclose(other.heights, [np.array([0.9, 1.6, -1.2]) * square], rtol=1e-4)
+
+
+def test_the_same_error_everywhere_is_that_of_the_scene(tmp_path):
+    sight = Sight(Parallel(0.3, -0.4, 2.0, 256.0), City(()).grid(2.0))
+    budget = Budget(heights=4.0, datum=3.0, reference=0.5, interpolation_px=0.6)
+    made = write_accuracy(
+        budget, sight, City(()).surface(tmp_path / "dem.tif"), (128, 128), tmp_path / "accuracy.tif",
+        heights=(FLOOR, FLOOR), step=1,
+    )  # fmt: skip
+    east, north, cross = 2.25 + 0.25 + 0.48, 4.0 + 0.25 + 0.48, -3.0
+    np.testing.assert_allclose(made.sigma, np.sqrt([east, north]), rtol=1e-3)
+    wanted = {"model": 0.0, "heights": 6.25, "even": 0.5, "interpolation": 0.96}
+    assert made.shares == pytest.approx({name: part / 7.71 for name, part in wanted.items()}, rel=1e-3)
+    drawn = np.random.default_rng(2).multivariate_normal([0, 0], [[east, cross], [cross, north]], 400_000)
+    assert made.ce90 == pytest.approx(np.quantile(np.hypot(*drawn.T), 0.9), rel=0.005)
+    assert made.quantiles == pytest.approx((made.ce90,) * 3, rel=1e-3)
+    np.testing.assert_allclose(made.cells, made.ce90, rtol=1e-3)
+    assert made.known == 1.0
+
+
+def test_quantiles_and_cells_are_those_of_the_pixels(tmp_path):
+    """Standard deviations of heights rise from 5 to 15 m, rays lean east: errors lie along a line, evenly large."""
+    side, count = 600.0, 700
+    rise = 5 + 10 * (np.arange(count) + 0.5 - 50) / side
+    write_dem(tmp_path / "sigma.tif", np.tile(rise, (count, 1)), (WEST - 50, NORTH + 50), 1.0, "EPSG:32636")
+    write_dem(tmp_path / "dem.tif", np.full((count, count), FLOOR), (WEST - 50, NORTH + 50), 1.0, "EPSG:32636")
+    sigma, surface = (open_dem(tmp_path / name, "ellipsoid") for name in ("sigma.tif", "dem.tif"))
+    sight = Sight(Parallel(0.5, 0.0, 1.0, side), City((), side=side).grid(1.0))
+    path = tmp_path / "accuracy.tif"
+    made = write_accuracy(
+        Budget(heights=sigma, datum=3.0), sight, surface, (600, 600), path, heights=(FLOOR, FLOOR), step=1
+    )
+
+    def wanted(share):
+        return stats.norm.ppf(0.95) * 0.5 * np.hypot(5 + 10 * np.asarray(share), 3.0)
+
+    np.testing.assert_allclose(made.quantiles, wanted((0.05, 0.5, 0.95)), rtol=5e-3)
+    assert made.cells.shape == (32, 32)
+    middles = (made.cell * np.arange(31) + made.cell / 2) / side
+    np.testing.assert_allclose(made.cells[:, :31], np.tile(wanted(middles), (32, 1)), rtol=2e-3)
+    assert made.sigma[1] == pytest.approx(0.0, abs=1e-3)

@@ -64,6 +64,17 @@ def test_the_layer_stands_beside_the_ortho_and_the_report_says_what_dominates(ti
     assert (middle != known).mean() < 0.05
 
 
+def test_a_point_without_redundancy_has_its_own_accuracy(tiny, tmp_path):
+    """One point and a shift: 0.5 px of 4.8 m on either axis, from the points or from the model file."""
+    tiny.write(tiny.gcps, [(*row, 0.5) for row in tiny.points(1)], header="id,col,row,x,y,h,sigma_image")
+    point = PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid", correction="shift")
+    first = rectified(tiny, tmp_path / "first", points=point, sigma=0.01)
+    again = rectified(tiny, tmp_path / "again", scene=SceneOptions(model=first.files["model"]), sigma=0.01)
+    for result in (first, again):
+        found = ce90(result)
+        np.testing.assert_allclose(found[np.isfinite(found)], 0.5 * 4.8 * math.sqrt(2 * math.log(10)), rtol=0.02)
+
+
 def test_a_model_file_knows_how_good_its_parameters_were(tiny, points, tmp_path):
     first = rectified(tiny, tmp_path / "first", points=points)
     again = rectified(tiny, tmp_path / "again", scene=SceneOptions(model=first.files["model"]))

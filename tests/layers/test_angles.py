@@ -18,6 +18,7 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.surface.dem import open_dem
+from ortho_pipeline.surface.writing import write_dem
 from ortho_pipeline.warp.quality.angles import Sun, write_angles, write_shadows
 from ortho_pipeline.warp.quality.hiding import Hiding
 from ortho_pipeline.warp.quality.sight import Sight
@@ -52,8 +53,6 @@ def test_angles_of_view_are_those_of_the_rays_in_space(tiny, tmp_path):
 
 @pytest.mark.parametrize(("east", "north"), [(0.3, 0.0), (0.0, 0.4), (-0.2, -0.3)])
 def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path, east, north):
-    from ortho_pipeline.surface.writing import write_dem
-
     step = np.arange(0, 400.0, 4)
     heights = FLOOR + 50 + east * step - north * step[:, None]  # rows go south
     write_dem(tmp_path / "dem.tif", heights, (WEST - 70, NORTH + 70), 4.0, "EPSG:32636")
@@ -66,6 +65,80 @@ def test_the_sun_falls_on_a_slope_as_the_normal_has_it(tmp_path, east, north):
     # The map's north is a third of a degree from the true one here.
     assert incidence == pytest.approx(np.degrees(np.arccos(cosine)), abs=0.4)
     assert zenith == pytest.approx(0.0, abs=1e-6)
+
+
+def test_angles_end_where_the_image_ends(tmp_path):
+    """Rays that go 0.3 m east and 0.4 m north per metre upwards; the image is smaller than the map on two sides."""
+    surface, grid = City(()).surface(tmp_path / "dem.tif"), City(()).grid(1.0)
+    sight, path = Sight(Parallel(0.3, 0.4, 1.0, 256.0), grid), tmp_path / "a.tif"
+    made = write_angles(sight, surface, (99, 150), path, heights=(FLOOR, FLOOR), step=8)
+    zenith, azimuth = read(path)
+    inside = np.zeros((32, 32), dtype=bool)
+    inside[:19, :12] = True  # middles at 4, 12, … 148 and 92
+    np.testing.assert_array_equal(np.isfinite(zenith), inside)
+    np.testing.assert_array_equal(np.isfinite(azimuth), inside)
+    np.testing.assert_allclose(zenith[inside], np.degrees(np.arctan(0.5)), atol=0.01)
+    np.testing.assert_allclose(azimuth[inside], np.degrees(np.arctan2(0.3, 0.4)), atol=0.01)
+    assert made.view_zenith_deg == pytest.approx((np.degrees(np.arctan(0.5)),) * 2, abs=0.01)
+    nothing = write_angles(sight, surface, (1, 1), path, heights=(FLOOR, FLOOR), step=8)
+    assert np.isnan(nothing.view_zenith_deg).all()
+
+
+@pytest.mark.parametrize("place", [(142.0, 0.0), (142.0, 90.5), (142.0, -3.0), (360.5, 40.0), (-360.5, 40.0)])
+def test_what_is_no_place_of_the_sun_is_refused(place):
+    with pytest.raises(InputError, match="not a position of the sun") as caught:
+        Sun(*place)
+    assert caught.value.field == "output.sun"
+
+
+@pytest.mark.parametrize(("place", "way"), [((360.0, 45.0), (0.0, 1.0)), ((-360.0, 90.0), (0.0, 0.0)),
+                                            ((-90.0, 45.0), (-1.0, 0.0))])  # fmt: skip
+def test_the_way_to_the_sun(place, way):
+    np.testing.assert_allclose(Sun(*place).way, way, atol=1e-12)
+
+
+def test_ground_without_a_height_is_neither_lit_nor_in_shadow(tmp_path):
+    """A tower of 20 m in the sun of 45 degrees from the south: 20 m of shadow north of it, wherever voids are."""
+    tower = City(((100, 100, 120, 120, 20.0),))
+    tower.surface(tmp_path / "dem.tif")
+    dataset = gdal.Open(str(tmp_path / "dem.tif"), gdal.GA_Update)
+    heights = dataset.ReadAsArray()
+    heights[40:80, 40:140] = -32768.0
+    dataset.WriteArray(heights)
+    dataset = None
+    surface, grid = open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"), tower.grid(1.0)
+    path, sight = tmp_path / "shadow.tif", Sight(Parallel(0.0, 0.0, 1.0, 256.0), grid)
+    share = write_shadows(sight, surface, Sun(180.0, 45.0), path, heights=(FLOOR, FLOOR + 20))
+    found = read(path)
+    x, y = tower.places(grid)
+    own = surface.heights(np.stack([part.ravel() for part in (x + WEST, y + NORTH - 256.0)], axis=1)).reshape(x.shape)
+    np.testing.assert_array_equal(found == 4, np.isnan(own))
+    dark = (x > 101) & (x < 119) & (y > 121.5) & (y < 138.5)
+    bright = (np.abs(x - 110) > 12) | (y < 99) | (y > 142)
+    assert (found[dark] == 2).all()
+    assert set(np.unique(found[bright])) == {1, 4}
+    assert share == pytest.approx((found == 2).sum() / (found < 4).sum())
+    mask = gdal.Open(str(path))
+    assert [mask.GetMetadataItem(f"CLASS_{value}") for value in (1, 2, 4)] == [
+        "in the sun", "in shadow", "without a height",
+    ]  # fmt: skip
+    assert [mask.GetMetadataItem(f"SUN_{name}") for name in ("AZIMUTH", "ELEVATION")] == ["180", "45"]
+
+
+def test_the_earth_falls_away_below_a_low_sun(tmp_path):
+    """A plateau of 100 m, the sun 1 degree high in the south: its shadow is 140 m shorter than on a flat Earth."""
+    heights = np.full((720, 40), FLOOR)
+    heights[700:] += 100.0
+    write_dem(tmp_path / "dem.tif", heights, (WEST - 200, NORTH), 10.0, "EPSG:32636")
+    grid = Grid(pyproj.CRS.from_epsg(32636), WEST - 100, NORTH, 10.0, 10.0, 20, 695)
+    surface, sight = open_dem(tmp_path / "dem.tif", "ellipsoid"), Sight(Parallel(0.0, 0.0, 10.0, 256.0), grid)
+    write_shadows(sight, surface, Sun(180.0, 1.0), tmp_path / "shadow.tif", heights=(FLOOR, FLOOR + 100))
+    first = np.argmax(read(tmp_path / "shadow.tif") == 2, axis=0)
+    # distance * tangent + distance^2 / 2 R = 100 m, from the first sample of the plateau.
+    tangent, radius = np.tan(np.radians(1.0)), 6_371_000.0
+    length = radius * (np.sqrt(tangent**2 + 2 * 100.0 / radius) - tangent)
+    assert 100.0 / tangent - length > 130
+    np.testing.assert_allclose(7005.0 - 10.0 * first - 5.0, length, atol=12)
 
 
 def rendered(off_nadir: float, azimuth: float) -> np.ndarray:

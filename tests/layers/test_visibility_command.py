@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import orthos
 import pytest
-from blocks import FLOOR, City, Parallel, f1, towards
+from blocks import FLOOR, NORTH, WEST, City, Parallel, f1, towards
 from osgeo import gdal
 
 from ortho_pipeline import commands
@@ -16,6 +16,7 @@ from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.report.document import read_report
 from ortho_pipeline.runtime.process_limits import Resources
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.warp import lattice_engine as engine
 from ortho_pipeline.warp.quality.hiding import Hiding
 
@@ -60,6 +61,34 @@ def test_a_mask_has_the_classes_and_nodata_leaves_them_empty(town, tmp_path):
     band = true.GetRasterBand(1)
     np.testing.assert_array_equal(band.GetMaskBand().ReadAsArray() == 0, classes == 2)
     assert (band.ReadAsArray()[classes == 2] == 0).all()
+
+
+@pytest.mark.parametrize("void", [False, True])
+def test_what_the_image_or_the_dem_does_not_reach_has_classes_of_its_own(tmp_path, void):
+    """Seen straight down by an image of 150 x 200 m; a void of the DEM is partly in it."""
+    City(()).surface(tmp_path / "dem.tif")
+    dataset = gdal.Open(str(tmp_path / "dem.tif"), gdal.GA_Update)
+    heights = dataset.ReadAsArray()
+    if void:
+        heights[100:180, 150:250] = -32768.0
+    dataset.WriteArray(heights)
+    dataset = None
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "image.tif"), 300, 400, 1, gdal.GDT_Byte)
+    made.WriteArray(np.full((400, 300), 90, dtype=np.uint8))
+    made = None
+    surface, grid = open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"), City(()).grid(1.0)
+    job = Parallel(0.0, 0.0, 0.5, 256.0), RasterSource(tmp_path / "image.tif"), surface, grid
+    hiding = Hiding(tmp_path / "ortho.tif", (FLOOR, FLOOR), tmp_path / "mask.tif")
+    result = orthos.rectify(*job, hiding, driver="GTiff", resampling="nearest")
+    x, y = City(()).places(grid)
+    own = surface.heights(np.stack([part.ravel() for part in (x + WEST, y + NORTH - 256.0)], axis=1)).reshape(x.shape)
+    wanted = np.where(np.isnan(own), 4, np.where((x < 150) & (y > 56), 1, 3))
+    mask = gdal.Open(str(tmp_path / "mask.tif"))
+    np.testing.assert_array_equal(mask.ReadAsArray(), wanted)
+    assert np.isnan(own).any() == void
+    assert result.hidden_share == 0.0
+    names = ["visible", "hidden", "outside of the image", "without a height"]
+    assert [mask.GetMetadataItem(f"CLASS_{value}") for value in (1, 2, 3, 4)] == names
 
 
 def test_tiles_threads_and_memory_change_nothing(town, tmp_path, monkeypatch):

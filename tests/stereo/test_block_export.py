@@ -10,6 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pyproj
 import pytest
 from click.testing import CliRunner
 from ortho_csm.files import read_csm
@@ -20,6 +21,7 @@ import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.errors import CoverageError, InputError, PluginError
+from ortho_pipeline.exchange.block_export import pairs_of
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import BlockFormat, hookimpl
@@ -147,6 +149,46 @@ def test_the_command_takes_several_programs_and_says_what_to_run(pair: Pair, tmp
     assert {"cars.json", "asp.sh", "s2p.json"} <= set(os.listdir(tmp_path / "out"))
     listed = " ".join(CliRunner().invoke(cli, ["adjust", "--help"]).stdout.split())
     assert "asp (Ames Stereo Pipeline 3), cars (CARS 1), s2p (s2p)" in listed
+
+
+def leaning(tangent: float, first: float = 0.0, size: tuple[int, int] = (400, 300)) -> tuple[op.RPC, tuple[int, int]]:
+    """Return an image of 400 x 300 pixels from its column `first` on, whose rays go so many metres east per metre up.
+
+    They meet at 500 m.
+    """
+    one, column, row = np.eye(20)[0], np.eye(20)[1], -np.eye(20)[2]
+    radius = pyproj.Geod(ellps="WGS84").inv(20.0, -30.0, 20.01, -30.0)[2] * (1 + 500 / 6_384_000)
+    column[3] = -tangent * 500.0 / radius
+    return op.RPC(
+        200.0 - first, 150.0, 20.0, -30.0, 500.0, 200.0, 150.0, 0.01, 0.0065, 500.0, column, one, row, one
+    ), size
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "overlap", "angle_deg"),
+    [
+        (leaning(0.2), leaning(-0.2), 1.0, 2 * np.degrees(np.arctan(0.2))),
+        (leaning(0.0), leaning(0.5, first=200.0), 0.5, np.degrees(np.arctan(0.5))),
+        # All of a small image counts, whichever is named first.
+        (leaning(0.1), leaning(0.3, first=100.0, size=(200, 300)), 1.0, np.degrees(np.arctan(0.3) - np.arctan(0.1))),
+        (leaning(0.3, first=100.0, size=(200, 300)), leaning(0.1), 1.0, np.degrees(np.arctan(0.3) - np.arctan(0.1))),
+        (leaning(0.0), leaning(np.tan(np.radians(1.05))), 1.0, 1.05),
+    ],
+)
+def test_overlap_and_angle_of_a_pair_are_those_of_its_rays(first, second, overlap, angle_deg) -> None:
+    (pair,) = pairs_of({"a": first, "b": second}, 500.0)
+    assert (pair.first, pair.second) == ("a", "b")
+    assert pair.overlap == pytest.approx(overlap, abs=1 / 32)
+    assert pair.angle_deg == pytest.approx(angle_deg, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [(leaning(np.tan(np.radians(0.95))), "less than 1 degree"), (leaning(0.5, first=388.0), "no images overlap")],
+)
+def test_views_that_make_no_pair_are_refused(second, message) -> None:
+    with pytest.raises(CoverageError, match=message):
+        pairs_of({"a": leaning(0.0), "b": second}, 500.0)
 
 
 # -- refusals --------------------------------------------------------------------------------------------------------

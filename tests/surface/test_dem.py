@@ -17,6 +17,7 @@ import numpy as np
 import pyproj
 import pytest
 from osgeo import gdal, osr
+from pyproj.database import get_units_map
 
 from ortho_pipeline.errors import CrsError, DatumError, InputError
 from ortho_pipeline.geodesy.crs import GroundTransform, Vertical
@@ -148,6 +149,16 @@ def test_feet_of_the_crs_and_units_that_contradict(tmp_path: Path) -> None:
     assert surface.window(3, 4, 1, 1)[0, 0] == pytest.approx(hills()[4, 3] * 0.3048)
     with pytest.raises(DatumError, match="unit"):
         dem_unit("furlong", None)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [("m", "metre"), ("Meters", "metre"), ("cm", "centimetre"), ("centimeter", "centimetre"), ("feet", "foot"),
+     ("foot", "foot"), ("International foot", "foot"), ("US survey feet", "US survey foot"),
+     ("us-ft", "US survey foot"), ("ft_us", "US survey foot"), ("ftUS", "US survey foot")],
+)  # fmt: skip
+def test_units_by_name_are_those_of_proj(text: str, name: str) -> None:
+    assert dem_unit(text, None) == pytest.approx(get_units_map()[name].conv_factor, rel=1e-12)
 
 
 @pytest.mark.parametrize("fill", ["bad", "nan", float("inf")])

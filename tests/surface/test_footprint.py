@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from ortho_pipeline.errors import CoverageError
+from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.exchange.rpc import export_rpc
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection
@@ -67,6 +67,15 @@ def test_a_drone_lies_on_the_ground_and_not_between_guesses(tmp_path):
     assert grid.dx == pytest.approx(0.12)
     xmin, ymin, xmax, ymax = grid.extent
     assert (xmax - xmin, ymax - ymin) == pytest.approx((120.0, 668 * 0.12), abs=0.25)
+
+
+def test_a_pixel_may_be_larger_than_the_scene_on_one_axis(tmp_path):
+    model, on = drone(), surface(tmp_path)
+    grid = choose_grid(model, laid(model, on), (WIDTH, HEIGHT), resolution=(500.0, 0.5))
+    assert (grid.dx, grid.dy) == (500.0, 0.5)
+    with pytest.raises(InputError, match="the whole scene is smaller than one pixel") as caught:
+        choose_grid(model, laid(model, on), (WIDTH, HEIGHT), resolution=(121.0, 81.0))
+    assert "the scene's own pixel is 0.12" in caught.value.remedy
 
 
 @pytest.mark.parametrize("pixel", [(1.0, 1.0), (0.5, 2.0), (2.0, 0.25)])
@@ -197,6 +206,50 @@ def test_a_scene_across_the_antimeridian_has_a_narrow_grid(middle):
     assert (xmax - xmin, ymax - ymin) == pytest.approx((0.2, 0.2), abs=2 * grid.dx)
     assert (xmin - middle + 0.1 + 180.0) % 360.0 == pytest.approx(180.0, abs=2 * grid.dx)
     assert scene_pixels(model, found, grid) == pytest.approx(1e6, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("height", "said"),
+    [(850.0, "500 to 850 m"), (150.0, "150 to 500 m"), (790.0, None), (210.0, None)],
+)
+def test_heights_that_a_model_does_not_project_are_told(tmp_path, height, said):
+    """An RPC of 300 to 700 m is good for half of that more on both sides; the DEM has 500 m and a spot."""
+    column, row, one = np.eye(20)[1], -np.eye(20)[2], np.eye(20)[0]
+    model = RPC(500.0, 500.0, 10.0, 10.0, 500.0, 500.0, 500.0, 0.1, 0.1, 200.0, column, one, row, one)
+    heights = np.full((80, 80), 500.0)
+    heights[40:44, 30:34] = height
+    write_dem(tmp_path / "dem.tif", heights, (9.8, 10.2), 0.005, "EPSG:4326")
+    beyond = lay(model, open_dem(tmp_path / "dem.tif", "ellipsoid"), 1000, 1000).beyond
+    whole = f"heights under the scene are {said} above the ellipsoid, its model is good for 200 to 800 m"
+    assert beyond == ("" if said is None else whole)
+
+
+@pytest.mark.parametrize(
+    ("fill", "changes", "said"),
+    [
+        ("error", {}, None), ("error", {"complete": False, "coverage": 0.5}, "the DEM covers 50.0 % of the scene"),
+        ("error", {"complete": False, "coverage": 0.5, "beyond": "too high"}, "too high"),
+        ("error", {"beyond": "too high"}, None), ("mask", {"complete": False, "coverage": 1e-3}, None),
+        ("mask", {"complete": False, "coverage": 0.0}, "the ortho would have no pixels"),
+        ("mask", {"complete": False, "coverage": 0.0, "beyond": "too high"}, "too high"),
+        ("mask", {"complete": False, "coverage": 0.5, "beyond": "too high"}, None),
+        ("mask", {"complete": False, "coverage": 0.5, "unmet": True}, None),
+        ("nearest", {"complete": False, "coverage": 0.5}, None),
+        ("nearest", {"complete": False, "coverage": 0.5, "unmet": True}, "more than 1.02 km from the nearest height"),
+        ("80", {"complete": False, "coverage": 0.0, "unmet": True}, None),
+    ],
+)  # fmt: skip
+def test_which_coverage_is_refused(tmp_path, fill, changes, said):
+    """Without a rule every gap; with voids left empty, only an ortho without pixels; with others what they lack."""
+    found = replace(laid(drone(), surface(tmp_path, fill=fill)), **changes)
+    if said is None:
+        found.require_coverage()
+        return
+    with pytest.raises(CoverageError) as caught:
+        found.require_coverage()
+    assert said in str(caught.value)
+    assert caught.value.file == str(tmp_path / "dem.tif")
+    assert caught.value.remedy
 
 
 def test_models_are_meant_for_the_heights_under_their_scene(tmp_path):

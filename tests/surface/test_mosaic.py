@@ -73,6 +73,33 @@ def test_many_files_are_the_dem_that_gdals_mosaic_of_them_is(tmp_path: Path) -> 
     assert set(many.file.files) == set(map(str, paths))
 
 
+def test_where_files_overlap_the_later_one_counts_if_it_has_a_height(tmp_path: Path) -> None:
+    """As in GDAL's mosaic of the same files."""
+    random = np.random.default_rng(3)
+    first, second = random.uniform(0, 900, (2, ROWS, ROWS))
+    first[2:9, 12:18], second[5:14, 0:4] = -9999.0, -9999.0
+    paths = [write_cell(tmp_path, 30, 41, heights=first), write_cell(tmp_path, 31, 41, heights=second, shift=-0.4)]
+    gdal.BuildVRT(str(tmp_path / "all.vrt"), [str(path) for path in paths]).FlushCache()
+    one, many = (open_dem(tmp_path / name, "ellipsoid", fill="mask") for name in ("all.vrt", "*.tif"))
+    assert many.shape == (ROWS, 2 * ROWS - 8)
+    whole = many.window(0, 0, *many.shape[::-1])
+    np.testing.assert_array_equal(whole, one.window(0, 0, *one.shape[::-1]))
+    assert np.isnan(whole).any()
+
+
+@pytest.mark.parametrize("change", [(0, 1, 0, 0, 0, 0.5), (0, 1, 0, 0, 0, -1), (0, -1, 0, 0, 0, 1)])
+def test_rows_of_another_direction_or_spacing_are_refused(tmp_path: Path, change: tuple[float, ...]) -> None:
+    write_cell(tmp_path, 30, 41)
+    odd = write_cell(tmp_path, 31, 41)
+    dataset = gdal.Open(str(odd), gdal.GA_Update)
+    west, dx, _, north, _, dy = dataset.GetGeoTransform()
+    dataset.SetGeoTransform((west, dx * change[1], 0, north, 0, dy * change[5]))
+    dataset = None
+    with pytest.raises(CrsError, match="the rows of this file differ in direction or spacing") as caught:
+        open_dem(tmp_path / "*.tif", "ellipsoid")
+    assert caught.value.file == str(odd)
+
+
 def own_bilinear(cells: dict[tuple[int, int], np.ndarray], places: np.ndarray) -> np.ndarray:
     """Return heights at (lon, lat), bilinear between the samples of a cell, which go on with those of its neighbours.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import math
 import os
@@ -25,6 +26,7 @@ from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid, open_dataset
 from ortho_pipeline.report.mosaic.document import mosaic_document
 from ortho_pipeline.warp.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt, writing
+from ortho_pipeline.warp.mosaic.layout import intersection
 
 UTM = pyproj.CRS("EPSG:32635")
 SIDE = 700
@@ -122,6 +124,58 @@ def test_what_does_not_fit_is_refused(tmp_path, landscape, options, message):
     assert caught.value.file == str(b.path)
     with pytest.raises(InputError, match="needs at least one ortho"):
         lay_out([])
+
+
+def oblong(folder: Path, name: str, column: int, row: int, size: tuple[int, int], pixel: tuple[float, float]) -> Ortho:
+    """Write an ortho of one value whose corner is a pixel of 2 x 3 m."""
+    grid = Grid(UTM, 500000 + 2.0 * column, 4e6 - 3.0 * row, *pixel, *size)
+    path = folder / f"{name}.tif"
+    with RasterWriter(path, grid, Profile(1, np.dtype("uint8"), "mask", None), driver="GTiff") as writer:
+        writer.write(0, 0, np.full((1, *size[::-1]), ord(name), dtype=np.uint8), np.ones(size[::-1], dtype=bool))
+    return Ortho(name, path)
+
+
+def test_orthos_of_oblong_pixels_lie_where_their_corners_are(tmp_path):
+    a = oblong(tmp_path, "a", 25, 20, (50, 45), (2.0, 3.0))
+    b = oblong(tmp_path, "b", 0, 0, (40, 30), (2.0, 3.0))
+    placed = lay_out([a, b], "first-on-top")
+    assert placed.grid.extent == (500000, 4e6 - 3 * 65, 500000 + 2 * 75, 4e6)
+    assert [(layer.left, layer.top) for layer in placed.layers] == [(25, 20), (0, 0)]
+    wanted = np.zeros((65, 75))
+    wanted[:30, :40] = ord("b")
+    wanted[20:, 25:] = ord("a")
+    write_cog(placed, tmp_path / "m.tif")
+    values, valid = read(tmp_path / "m.tif")
+    np.testing.assert_array_equal(np.where(valid, values, 0), wanted)
+    (pair,) = overlaps(placed)
+    assert pair.pixels == pytest.approx(15 * 10)
+
+
+@pytest.mark.parametrize("pixel", [(2.0, 3.5), (2.5, 3.0)])
+def test_pixels_that_differ_on_one_axis_are_refused(tmp_path, pixel):
+    a, b = (oblong(tmp_path, name, 0, 0, (40, 30), size) for name, size in (("a", (2.0, 3.0)), ("b", pixel)))
+    with pytest.raises(InputError, match=f"{pixel[0]:g} x {pixel[1]:g}"):
+        lay_out([a, b])
+
+
+@pytest.mark.parametrize(
+    ("other", "common"),
+    [((10, 5, 20, 15), (10, 5, 12, 8)), ((12, 0, 20, 8), None), ((2, 8, 12, 9), None), ((0, 0, 3, 4), (2, 1, 3, 4))],
+)
+def test_boxes_that_only_touch_have_nothing_in_common(other, common):
+    assert intersection((2, 1, 12, 8), other) == common
+    assert intersection(other, (2, 1, 12, 8)) == common
+
+
+def test_the_figures_of_a_seam_are_by_their_definitions(tmp_path, landscape, monkeypatch):
+    a, b = (cut(tmp_path, name, landscape, 60 * k, 0, 120, 120) for k, name in enumerate("ab"))
+    monkeypatch.setattr(
+        inspect.getmodule(measure_seam), "_shifts", lambda *_: np.array([[3.0, 4.0], [0.0, 1.0], [0.0, 0.0]])
+    )
+    (pair,) = overlaps(lay_out([a, b], "first-on-top"))
+    seam = measure_seam(pair)
+    assert (seam["patches"], seam["median_px"], seam["largest_px"]) == (3, [0.0, 1.0], 5.0)
+    assert seam["rmse_px"] == pytest.approx(math.sqrt(26 / 3))
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(0.0, 0.0), (0.4, -0.25), (3.3, 1.6), (-9.0, 14.5)])

@@ -21,6 +21,7 @@ from ortho_pipeline.options import MosaicOptions
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.warp.mosaic import (
+    Balance,
     Ortho,
     along_seams,
     balanced,
@@ -28,6 +29,7 @@ from ortho_pipeline.warp.mosaic import (
     overlaps,
     owners_of,
     seamlines,
+    seams,
     write_cog,
     writing,
 )
@@ -127,6 +129,33 @@ def test_gains_are_found_where_almost_half_of_an_overlap_has_changed(tmp_path, c
     assert found.outlying == pytest.approx(6 / 16, abs=1 / 32)
 
 
+def test_an_offset_that_is_known_is_halved(tmp_path):
+    """The second ortho is 50 brighter: 25 more for the first, 25 less for the second, and gains of 1."""
+    first, second = GROUND[:240, :220], GROUND[:240, 100:320] + 50
+    placed = lay_out([write(tmp_path, "a", first, 0, 0), write(tmp_path, "b", second, 100, 0)], "first-on-top")
+    found = balanced(placed, overlaps(placed))
+    np.testing.assert_allclose(found.gains, 1.0, atol=1e-3)
+    np.testing.assert_allclose(found.offsets, [[25.0], [-25.0]], atol=1.0)
+    np.testing.assert_allclose(found.before, 50.0, atol=0.01)
+    np.testing.assert_allclose(found.after, 0.0, atol=0.05)
+    assert found.outlying < 0.05
+
+
+@pytest.mark.parametrize("nodata", [None, 0.0])
+@pytest.mark.parametrize("offset", [10.7, -10.7, 0.4, -0.4])
+def test_the_share_that_is_clamped_is_counted(tmp_path, offset, nodata):
+    """A ramp of all bytes from 1 (0 where that is a value) to 255: an offset moves some beyond what rounding allows."""
+    least = 0 if nodata is None else 1
+    ramp = np.tile(np.arange(least, 256.0), (20, 1))
+    placed = lay_out([write(tmp_path, "a", ramp, 0, 0, dtype="uint8", nodata=nodata)])
+    balance = Balance(np.ones((1, 1)), np.full((1, 1), offset), np.zeros(1), np.zeros(1), 0, 0.0)
+    share = write_cog(placed, tmp_path / "m.tif", balance=balance)
+    assert share == pytest.approx((np.abs(ramp + offset - 127.5) > 128).mean())
+    values, valid = read(tmp_path / "m.tif")
+    assert valid.all()
+    np.testing.assert_array_equal(values, np.clip(np.rint(ramp + offset), least, 255))
+
+
 def test_a_balanced_mosaic_has_no_steps_and_clamps_what_does_not_fit(tmp_path):
     orthos = quartet(tmp_path)
     result = mosaic(
@@ -209,6 +238,26 @@ def test_a_seam_runs_where_it_is_known_to_be_best(tmp_path):
     assert valid.all()
     wanted = np.where(owners.owners == 0, np.pad(first, ((0, 0), (0, 160))), np.pad(second, ((0, 0), (160, 0))))
     np.testing.assert_array_equal(values, np.rint(wanted))
+
+
+def test_a_seam_stays_within_its_reach_and_away_from_small_holes(tmp_path, monkeypatch):
+    """The order's seam is the end of the first ortho, at column 300; far from it the first has a hole."""
+    monkeypatch.setattr(seamlines, "_REACH", 20)
+    random = np.random.default_rng(4)
+    first, second = GROUND[:300, :300].copy(), GROUND[:300, 160:460].copy()
+    second[:, :140] += random.choice([-1.0, 1.0], (300, 140)) * random.uniform(0, 300, (300, 140))
+    valid = np.ones((300, 300), dtype=bool)
+    valid[140:150, 190:200] = False
+    orthos = [write(tmp_path, "a", first, 0, 0, valid), write(tmp_path, "b", second, 160, 0)]
+    owners = owners_of(lay_out(orthos, "first-on-top"), None, seamlines=True)
+    hole = np.zeros(owners.owners.shape, dtype=bool)
+    hole[140:150, 190:200] = True
+    np.testing.assert_array_equal(
+        owners.owners == 1, (np.arange(460) >= 300) | hole | (owners.owners != owners.ordered)
+    )
+    columns = np.nonzero(owners.owners != owners.ordered)[1]
+    assert len(columns) > 500
+    assert 280 <= columns.min() <= columns.max() < 300
 
 
 def scenes(folder: Path) -> list[Ortho]:
@@ -296,6 +345,23 @@ def test_a_step_at_one_place_of_a_seam_is_told_beside_the_mean(tmp_path):
     assert seam["rms"][0] < 30.0
     said = mosaic([one.path for one in orthos], tmp_path / "m.tif", MosaicOptions(format="COG", seamlines=True))
     assert "in brightness (RMS; largest 5" in said.summary
+
+
+@pytest.mark.parametrize("cell", [1, 4])
+def test_the_figures_along_a_straight_seam_are_by_their_definitions(tmp_path, monkeypatch, cell):
+    """The right scene is 30 brighter along a seam of 240 px, whatever the cells; content is off by what is said."""
+    monkeypatch.setattr(seams, "_shifts", lambda *_: np.array([[3.0, 4.0], [0.0, 1.0], [0.0, 0.0]]))
+    left, right = GROUND[:240, :220], GROUND[:240, 180:400] + 30.0
+    placed = lay_out([write(tmp_path, "left", left, 0, 0), write(tmp_path, "right", right, 180, 0)], "first-on-top")
+    labels = owners_of(placed, None, seamlines=False).owners[::cell, ::cell]
+    (seam,) = along_seams(placed, labels, cell, None).values()
+    assert seam["length_px"] == 240
+    assert (seam["difference"], seam["rms"], seam["largest_rms"]) == ([-30.0], [30.0], [30.0])
+    assert (seam["matched"], seam["median_px"], seam["largest_px"]) == (3, [0.0, 1.0], 5.0)
+    assert seam["rmse_px"] == pytest.approx(math.sqrt(26 / 3))
+    alike = Balance(np.ones((2, 1)), np.array([[0.0], [-30.0]]), np.zeros(1), np.zeros(1), 0, 0.0)
+    (seam,) = along_seams(placed, labels, cell, alike).values()
+    assert (seam["difference"], seam["rms"]) == ([0.0], [0.0])
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (3, -2)])

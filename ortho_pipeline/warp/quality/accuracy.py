@@ -147,10 +147,9 @@ def predictive(covariance: Array, freedom: float) -> Array:
     """Return the covariance ``(P, P)`` of a prediction by parameters whose scale was itself estimated.
 
     A prediction by a fit with f degrees of freedom follows Student's t, whose variance is f / (f - 2) times that of the
-    normal distribution. It has none below 2; three stand for fewer.
+    normal distribution. It has none below 2; three stand for fewer. With infinitely many the scale is known.
     """
-    few = max(freedom, 3.0)
-    return covariance * (few / (few - 2.0))
+    return covariance / (1.0 - 2.0 / max(freedom, 3.0))
 
 
 # -- at places -------------------------------------------------------------------------------------------------------
