@@ -327,9 +327,7 @@ def test_a_camera_that_looks_past_the_ground_has_a_box_below_it():
     assert not up.sees_ground
     # 1200 m above the middle of the heights.
     np.testing.assert_allclose(up.domain, [[480e3, 4.42e6, 300.0], [600.0, 600.0, 300.0]], rtol=1e-9)
-    into_the_sky = FrameCamera.from_roll_pitch_yaw(
-        interior, (33.0, 0.0, 1500.0), np.pi, 0.0, 0.0, heights=(0.0, 600.0)
-    )
+    into_the_sky = FrameCamera.from_roll_pitch_yaw(interior, (33.0, 0.0, 1500.0), np.pi, 0.0, 0.0, heights=(0.0, 600.0))
     centre, half = into_the_sky.domain
     np.testing.assert_allclose(centre, [33.0, 0.0, 300.0], atol=1e-9)
     # At the equator the radii of curvature are a and a (1 - e^2) of WGS 84.
@@ -381,7 +379,11 @@ def test_angles_in_a_map_count_from_the_north_of_the_grid():
         FrameCamera.from_map(AERIAL, "EPSG:32632", exterior, frame=frame, heights=(0.0, 1.0))
         for frame in ("map", "topocentric")
     )
-    place = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [-150.0, -150.0, 500.0]]) + (674e3, 6.65e6, 0)
+    place = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [-150.0, -150.0, 500.0]]) + (
+        674e3,
+        6.65e6,
+        0,
+    )
     ground = np.column_stack(pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(*place.T))
     np.testing.assert_allclose(camera.ground_to_image(ground), in_map.ground_to_image(place), atol=0.06)
     lon, lat, _ = camera.perspective_centre
