@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyproj
@@ -11,6 +12,7 @@ from scipy.stats import f
 
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.statistics import (
     basis_of,
     chance_of,
@@ -221,3 +223,29 @@ def test_small_figures_are_by_their_definitions():
     rows = np.eye(4)
     cofactors = np.linalg.inv(design.T @ design + rows.T @ rows)
     assert effective_parameters(4, [(rows[:1], cofactors), (rows[1:], cofactors)]) == pytest.approx(2.0)
+
+
+def test_even_points_of_a_line_halve_it():
+    points = make_points(11)
+    ids = tuple(f"{k:02}" for k in range(11))
+    line = replace(points, ids=ids, image=np.column_stack([np.arange(11.0), np.zeros(11)]))
+    assert np.flatnonzero(select_control(line, "even:2").control).tolist() == [0, 10]
+    assert np.flatnonzero(select_control(line, "even:3").control).tolist() == [0, 5, 10]
+    assert np.flatnonzero(select_control(line, "cluster:2:5").control).tolist() in ([4, 5], [5, 6])
+    assert (select_control(line, "random:4").roles == select_control(line, "random:4:0").roles).all()
+    assert len(select_control(line, "even:11").control.nonzero()[0]) == 11
+    for wrong in ("cluster:2:0", "cluster:2:6"):
+        with pytest.raises(InputError, match="not a selection"):
+            select_control(line, wrong)
+
+
+def test_a_common_error_moves_as_far_as_its_information_says():
+    # Information 3 on an error whose own is 1: variance 1 / 4, a step of (slope - value) / 4.
+    error = CommonGroundError(value=np.array([0.4, 0.0]), told=np.diag([3.0, 0.0]), sigma=2.0, points=5)
+    np.testing.assert_allclose(error.left, np.diag([0.25, 1.0]))
+    np.testing.assert_allclose(error.step(np.array([2.4, 1.0])), [0.5, 1.0])
+    # The median of the estimates is believed up to four of its standard deviations.
+    for each, value in ((3.9, [3.9, 1.0]), (4.1, [0.4, 0.0]), (-4.1, [0.4, 0.0])):
+        estimates = np.array([[each, 1.0], [np.nan, 9.0], [each, 1.0], [99.0, 1.0]])
+        np.testing.assert_allclose(error.started(estimates).value, value)
+    np.testing.assert_allclose(error.started(np.zeros((0, 2))).value, [0.0, 0.0])
