@@ -379,11 +379,8 @@ def test_angles_in_a_map_count_from_the_north_of_the_grid():
         FrameCamera.from_map(AERIAL, "EPSG:32632", exterior, frame=frame, heights=(0.0, 1.0))
         for frame in ("map", "topocentric")
     )
-    place = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [-150.0, -150.0, 500.0]]) + (
-        674e3,
-        6.65e6,
-        0,
-    )
+    offsets = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [-150.0, -150.0, 500.0]])
+    place = offsets + np.array([674e3, 6.65e6, 0.0])
     ground = np.column_stack(pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(*place.T))
     np.testing.assert_allclose(camera.ground_to_image(ground), in_map.ground_to_image(place), atol=0.06)
     lon, lat, _ = camera.perspective_centre
