@@ -21,7 +21,7 @@ from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import Pushbroom, model_from_dict
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import Array, Constraints, SensorModel
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.metadata import mounting_of_angles, pushbroom_of_metadata
@@ -716,7 +716,13 @@ def test_a_camera_of_a_table_of_look_angles() -> None:
     assert len(LineCamera.of_table(1000, 500, x, zigzag, v, rounding=0.03).dx) == 4
     with pytest.raises(InputError, match="not those of a smooth line"):
         LineCamera.of_table(1000, 500, x, zigzag, v)
-    for columns, across in ((x[::-1], u), (x[:1], u[:1]), (x, np.full(21, 0.1)), (x, np.where(x > 990, np.nan, u))):
+    # Up to 0.005 px count as smooth.
+    fine = u + 0.001 / 2000 * (-1.0) ** np.arange(21)
+    assert np.abs(LineCamera.of_table(1000, 500, x, fine, v).directions(x)[:, 0] - fine).max() < 0.005 / 2000
+    two = LineCamera.of_table(1000, 500, x[[0, -1]], u[[0, -1]], v[[0, -1]])
+    assert np.abs(two.directions(x[[0, -1]])[:, 0] - u[[0, -1]]).max() < 1e-12
+    wrong = (x[::-1], u), (np.maximum(x, 60.0), u), (x[:1], u[:1]), (x, np.full(21, 0.1)), (x, u + np.inf)
+    for columns, across in wrong:
         with pytest.raises(InputError):
             LineCamera.of_table(1000, 500, columns, across, v[: len(across)])
 
@@ -785,3 +791,31 @@ def test_a_derivative_of_a_spline_beyond_its_degree_is_zero() -> None:
 def test_impossible_shapes_of_orbits_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(InputError):
         OrbitShape(**change)  # type: ignore[arg-type]
+
+
+def test_partials_of_the_shape_of_an_orbit_that_is_no_circle() -> None:
+    """A steep path: on a circle the terms with the cosine vanish."""
+
+    def shape(values: Array) -> Constraints:
+        climb, bend, tilt = values
+
+        def path(times: Array, derivative: int) -> tuple[Array, Array]:
+            one, zero, arc = np.ones_like(times), np.zeros_like(times), times * (4 - times)
+            places = [7e6 + climb * times, 7500 * times, bend * arc + tilt * times]
+            slopes = [[times, zero, zero], [zero, zero, zero], [zero, arc, times]]
+            if derivative:
+                places = [climb * one, 7500 * one, bend * (4 - 2 * times) + tilt * one]
+                slopes = [[one, zero, zero], [zero, zero, zero], [zero, 4 - 2 * times, one]]
+            return np.stack(places, axis=1), np.moveaxis(np.array(slopes), 2, 0)
+
+        return OrbitShape(plane=10.0, circular=1e-3, radius=7e6, radius_sigma=9.0, samples=3).of(path, (0.0, 4.0))
+
+    start = np.array([3000.0, 50.0, 700.0])
+    found = shape(start)
+    assert abs(found.residuals[3:6]).min() > 0.3
+    for k, step in enumerate(np.eye(3)):
+        change = (shape(start - step).residuals - shape(start + step).residuals) / 2
+        # Relative to the largest of each kind.
+        for rows in (slice(0, 3), slice(3, 6), slice(6, 7)):
+            largest = np.abs(found.jacobian[rows]).max()
+            assert np.abs(change - found.jacobian[:, k])[rows].max() < 1e-5 * largest
