@@ -114,3 +114,5 @@ def test_the_hull_counts_inside_the_image_only():
     beyond = control_hull(np.array([(-500.0, 0.0), (500, 0), (500, 800), (-500, 800)]), SIZE)
     assert beyond.share == pytest.approx(0.5)
     assert set(beyond.outline) == {(-500.0, 0.0), (500.0, 0.0), (500.0, 800.0), (-500.0, 800.0)}
+    triangle = control_hull(np.array([(0.0, 0.0), (1000, 0), (0, 800)]), SIZE)
+    assert (triangle.share, triangle.n, len(triangle.outline)) == (pytest.approx(0.5), 3, 3)

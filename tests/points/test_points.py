@@ -475,7 +475,8 @@ def test_points_of_arrays_are_those_of_a_file(tmp_path):
     [
         # Half a millimetre is one point, two millimetres are two; 1e-8 degrees are 1.1 mm.
         ("EPSG:32634", (500_000.0, 6_000_000.0), 1e-4, True), ("EPSG:32634", (500_000.0, 6_000_000.0), 2e-3, False),
-        ("EPSG:4979", (24.0, -33.0), 1e-9, True), ("EPSG:4979", (24.0, -33.0), 2e-8, False),
+        ("EPSG:3031", (-1_500_000.0, -1_000_000.0), 1e-4, True), ("EPSG:4979", (24.0, -33.0), 1e-9, True),
+        ("EPSG:4979", (24.0, -33.0), 2e-8, False),
     ],
 )  # fmt: skip
 def test_the_same_place_twice_is_refused_and_a_near_one_is_not(tmp_path, crs, at, apart, same):
