@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import f
 
 from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.estimation.choice.expected_error import expectation
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.statistics import (
@@ -249,3 +250,28 @@ def test_a_common_error_moves_as_far_as_its_information_says():
         estimates = np.array([[each, 1.0], [np.nan, 9.0], [each, 1.0], [99.0, 1.0]])
         np.testing.assert_allclose(error.started(estimates).value, value)
     np.testing.assert_allclose(error.started(np.zeros((0, 2))).value, [0.0, 0.0])
+
+
+def test_the_expected_error_of_a_linear_model_is_that_of_the_textbooks():
+    points = make_points(20)
+    found = fit_family("affine3d", points, robust=False)
+    statistics = expectation(found, found.used, SIZE)
+    # 40 observations, 8 that stand for the stated noise, 8 parameters and the noise: Akaike's criterion, corrected.
+    n, k, squares = 48, 9, (found.residuals / 0.5).ravel() @ (found.residuals / 0.5).ravel() + 8
+    assert statistics.criterion == pytest.approx(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
+    assert statistics.noise == pytest.approx((squares - 8) / 32)
+    assert statistics.stated == pytest.approx(2 * 0.5**2)
+    # The trace of the hat matrix is the number of parameters.
+    assert statistics.tested == pytest.approx(0.5**2 * 8 / 20)
+    assert statistics.scene > statistics.tested
+    assert statistics.unseen == 0.0
+
+
+@pytest.mark.parametrize(
+    "places", [[(0, 0), (10, 5), (5, 10), (6, 6)], [(10, 10), (0, 5), (5, 0), (4, 4)], [(1, 9), (9, 8), (0, 0), (5, 5)]]
+)
+def test_the_first_of_even_points_is_the_farthest_from_the_middle(places):
+    image = np.array(places, dtype=float)
+    chosen = select_control(replace(make_points(4), image=image), "even:1").control
+    middle = (image.max(axis=0) + image.min(axis=0)) / 2
+    assert np.flatnonzero(chosen).tolist() == [int(np.argmax(np.hypot(*(image - middle).T)))]
