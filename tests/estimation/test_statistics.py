@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyproj
@@ -12,6 +13,7 @@ from scipy.stats import f
 
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.choice.expected_error import expectation
+from ortho_pipeline.estimation.determinacy import uncertain_edge, unstable
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.statistics import (
@@ -275,3 +277,32 @@ def test_the_first_of_even_points_is_the_farthest_from_the_middle(places):
     chosen = select_control(replace(make_points(4), image=image), "even:1").control
     middle = (image.max(axis=0) + image.min(axis=0)) / 2
     assert np.flatnonzero(chosen).tolist() == [int(np.argmax(np.hypot(*(image - middle).T)))]
+
+
+@pytest.mark.parametrize("noise", [0.1, 2.0])
+def test_the_uncertainty_of_a_corner_is_that_of_a_regression(noise):
+    """Nine points of a regular grid, -1 to 1: a regression has 1/9 + x^2/6 + y^2/6 of their variance at (x, y)."""
+    places = np.stack(np.meshgrid([1000.0, 5000.0, 9000.0], [1000.0, 5000.0, 9000.0]), axis=-1).reshape(-1, 2)
+    points = make_points(9)
+    ground = np.column_stack([400e3 + places[:, 0], 5030e3 - places[:, 1], np.full(9, 300.0)])
+    image = places + noise * np.random.default_rng(1).normal(size=(9, 2))
+    found = fit_family("affine2d", replace(points, ground=ground, image=image), size=SIZE, robust=False)
+    # The corners of the domain are 2 % beyond those of the image, at 1.25; noise moves them a little.
+    assert found.corner_ratio == pytest.approx(np.sqrt(1 / 9 + 2 * (1.02 * 1.25) ** 2 / 6), rel=2e-3)
+    assert [uncertain_edge(factor) != [] for factor in (9.9, 10.1)] == [False, True]
+
+
+def test_parameters_that_cannot_be_separated_are_named():
+    def said(correlation: float, condition: float = 100.0) -> list[str]:
+        cofactors = np.diag([4.0, 1.0, 9.0])
+        cofactors[0, 2] = cofactors[2, 0] = -6.0 * correlation
+        model = SimpleNamespace(param_names=("a", "b", "c"))
+        solution = SimpleNamespace(model=model, cofactors=cofactors, condition=condition, effective=3.0)
+        return [str(notice) for notice in unstable(solution, None)]
+
+    assert said(0.9994) == []
+    (text,) = said(0.9996)
+    assert "1 pair of parameters" in text
+    assert "a and c" in text
+    assert said(0.5, condition=9.9e3) == []
+    assert said(0.5, condition=1.1e4)[0].startswith("unstable")
