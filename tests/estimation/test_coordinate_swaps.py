@@ -76,3 +76,19 @@ def test_a_bad_model_is_not_taken_for_a_swap(model):
     """Points 300 px off in a way that no swap explains pass on, to be fitted or refused by the adjustment."""
     image, ground = truth(model)
     refuse_swapped(model, make_points(model, image + np.array([250.0, -170.0]), ground), int(ROWS))
+
+
+def test_points_of_another_place_are_told_to_check_their_crs(model):
+    image, ground = truth(model)
+    with pytest.raises(InputError, match="outside the model's domain") as caught:
+        refuse_swapped(model, make_points(model, image, ground + np.array([77.0, 71.0, 0.0])), int(ROWS))
+    assert caught.value.field == "CRS"
+
+
+def test_points_without_heights_are_compared_at_the_reference_height(model):
+    _, ground = truth(model)
+    level = ground * [1.0, 1.0, 0.0] + [0.0, 0.0, model.reference_height]
+    unknown = ground * [1.0, 1.0, np.nan]
+    refuse_swapped(model, make_points(model, model.ground_to_image(level), unknown), int(ROWS))
+    with pytest.raises(InputError, match="column and row are"):
+        refuse_swapped(model, make_points(model, model.ground_to_image(level)[:, ::-1], unknown), int(ROWS))

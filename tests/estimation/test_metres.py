@@ -7,8 +7,10 @@ import pytest
 from space import FLOOR, Satellite, axes, between, from_space, to_space
 
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.estimation.ground_residuals import in_metres, viewing
+from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, viewing, with_reference_height
 from ortho_pipeline.estimation.observations.image_errors import ImageErrors
+from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.models.map_plane import MapPlane
 from ortho_pipeline.points import Points
 
 PLACE = (17.9, 60.0)
@@ -66,3 +68,47 @@ def test_errors_of_the_ground_are_metres_east_north_and_up(crs):
     np.testing.assert_allclose(
         ImageErrors.of(model, points).covariance, moved @ moved.transpose(0, 2, 1), rtol=1e-3, atol=1e-6
     )
+
+
+def plane(relief: tuple[float, float]) -> MapPlane:
+    """Pixels of 4 m by 3 m on the central meridian of a UTM zone, whose scale is 0.9996."""
+    return MapPlane("EPSG:32633", (499_800.0, 4_640_150.0), (4.0, 3.0), (100, 100), 0.0, relief, (-50.0, 500.0))
+
+
+@pytest.mark.parametrize(
+    ("relief", "azimuth", "along", "across"),
+    # A vertical view has no azimuth: along is north.
+    [((0.0, 0.0), None, 3.0, 4.0), ((0.5, 0.0), 270.0, 4.0, 3.0), ((0.0, 0.5), 180.0, 3.0, 4.0)],
+)
+def test_the_view_of_a_plane_with_oblong_pixels(relief, azimuth, along, across):
+    seen = viewing(plane(relief), 100, 100)
+    assert seen["ground_pixel_m"] == pytest.approx([4.0 / 0.9996, 3.0 / 0.9996], rel=1e-5)
+    assert seen["lean_m_per_m"] == pytest.approx(sum(relief) / 0.9996, rel=1e-5)
+    assert seen["view"]["incidence_deg"] == pytest.approx(np.degrees(np.arctan(sum(relief) / 0.9996)), abs=1e-3)
+    assert seen["view"]["sensor_azimuth_deg"] == (None if azimuth is None else pytest.approx(azimuth, abs=0.01))
+    if azimuth is not None:
+        assert seen["lean_azimuth_deg"] == pytest.approx(azimuth - 180, abs=0.01) or azimuth == 180
+    assert seen["view"]["pixel_m"]["along_view"] == pytest.approx(along / 0.9996, rel=1e-5)
+    assert seen["view"]["pixel_m"]["across_view"] == pytest.approx(across / 0.9996, rel=1e-5)
+
+
+def test_residuals_along_and_across_the_view():
+    random = np.random.default_rng(3)
+    ground = np.column_stack([random.uniform(499_850, 500_150, 8), random.uniform(4_639_900, 4_640_100, 8), [50.0] * 8])
+    # Higher points move to the right, upwards (rows count down), or not at all.
+    for relief, column, row in (((0.5, 0.0), (1, 0), (0, 1)), ((0.0, 0.5), (0, -1), (1, 0)), ((0.0, 0.0), None, None)):
+        model = plane(relief)
+        image = model.ground_to_image(ground) + random.normal(0, 0.3, (8, 2))
+        made = fit(ImageCorrection.identity(model, "shift", (50.0, 50.0)), Points.of(image, ground, "EPSG:32633"))
+        found = along_view(made)
+        if column is None:
+            assert np.isnan(found).all()
+        else:
+            np.testing.assert_allclose(found, made.residuals @ np.array([column, row]).T, atol=1e-9)
+
+
+def test_points_without_heights_are_at_the_reference_height():
+    ground = np.array([[1.0, 2.0, np.nan], [3.0, 4.0, 7.0]])
+    filled = with_reference_height(plane((0.5, 0.0)), ground)
+    np.testing.assert_array_equal(filled, [[1.0, 2.0, 0.0], [3.0, 4.0, 7.0]])
+    assert np.isnan(ground[0, 2])

@@ -9,9 +9,11 @@ import numpy as np
 import pyproj
 import pytest
 from scipy import ndimage
+from scipy.optimize import brentq
+from scipy.special import gamma, kv
 
 from ortho_pipeline.estimation.fit import Fit, fit
-from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE, MOST_POINTS
+from ortho_pipeline.estimation.spatial.shared_errors import FAMILIES, MATCHED_ALIKE, MOST_POINTS, positive_part
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.points import Points
 
@@ -261,3 +263,21 @@ def test_many_points_are_thinned_and_claim_the_same(rpc: RPC) -> None:
     many = adjusted(rpc, points)
     few = adjusted(rpc, points.select(np.arange(0, 2 * MOST_POINTS, 2)))
     np.testing.assert_allclose(many.sigmas, few.sigmas, rtol=0.35)
+
+
+def test_correlations_are_an_e_th_at_their_range_and_the_second_is_matern() -> None:
+    for family in FAMILIES:
+        np.testing.assert_allclose(family(np.array([0.0, 1.0])), [1.0, np.exp(-1)], rtol=1e-9)
+    # Stein 1999, section 2.10: x^nu K_nu(x) 2^(1 - nu) / Gamma(nu) with nu = 3/2.
+    x = np.array([0.2, 0.7, 1.0, 3.0])
+    scaled = brentq(lambda at: 2**-0.5 / gamma(1.5) * at**1.5 * kv(1.5, at) - np.exp(-1), 1.0, 4.0) * x
+    np.testing.assert_allclose(FAMILIES[1](x), 2**-0.5 / gamma(1.5) * scaled**1.5 * kv(1.5, scaled), rtol=1e-9)
+    np.testing.assert_allclose(np.log(FAMILIES[2](x)), -(x**2))
+    np.testing.assert_allclose(np.log(FAMILIES[0](x)), -x)
+
+
+def test_the_positive_part_is_in_units_of_the_design() -> None:
+    np.testing.assert_allclose(positive_part(np.diag([2.0, -3.0]), np.eye(2)), np.diag([2.0, 0.0]), atol=1e-12)
+    # In units of F' F = diag(4, 9) this matrix has the eigenvalues 1 and -1, with vectors of equal parts.
+    matrix, design = np.array([[0.0, 6.0], [6.0, 0.0]]), np.diag([2.0, 3.0])
+    np.testing.assert_allclose(positive_part(matrix, design), np.array([[2.0, 3.0], [3.0, 4.5]]), atol=1e-12)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyproj
@@ -10,7 +12,10 @@ import pytest
 from scipy.stats import f
 
 from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.estimation.choice.expected_error import expectation
+from ortho_pipeline.estimation.determinacy import uncertain_edge, unstable
 from ortho_pipeline.estimation.family_fit import fit_family
+from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.statistics import (
     basis_of,
     chance_of,
@@ -221,3 +226,83 @@ def test_small_figures_are_by_their_definitions():
     rows = np.eye(4)
     cofactors = np.linalg.inv(design.T @ design + rows.T @ rows)
     assert effective_parameters(4, [(rows[:1], cofactors), (rows[1:], cofactors)]) == pytest.approx(2.0)
+
+
+def test_even_points_of_a_line_halve_it():
+    points = make_points(11)
+    ids = tuple(f"{k:02}" for k in range(11))
+    line = replace(points, ids=ids, image=np.column_stack([np.arange(11.0), np.zeros(11)]))
+    assert np.flatnonzero(select_control(line, "even:2").control).tolist() == [0, 10]
+    assert np.flatnonzero(select_control(line, "even:3").control).tolist() == [0, 5, 10]
+    assert np.flatnonzero(select_control(line, "cluster:2:5").control).tolist() in ([4, 5], [5, 6])
+    assert (select_control(line, "random:4").roles == select_control(line, "random:4:0").roles).all()
+    assert len(select_control(line, "even:11").control.nonzero()[0]) == 11
+    for wrong in ("cluster:2:0", "cluster:2:6"):
+        with pytest.raises(InputError, match="not a selection"):
+            select_control(line, wrong)
+
+
+def test_a_common_error_moves_as_far_as_its_information_says():
+    # Information 3 on an error whose own is 1: variance 1 / 4, a step of (slope - value) / 4.
+    error = CommonGroundError(value=np.array([0.4, 0.0]), told=np.diag([3.0, 0.0]), sigma=2.0, points=5)
+    np.testing.assert_allclose(error.left, np.diag([0.25, 1.0]))
+    np.testing.assert_allclose(error.step(np.array([2.4, 1.0])), [0.5, 1.0])
+    # The median of the estimates is believed up to four of its standard deviations.
+    for each, value in ((3.9, [3.9, 1.0]), (4.1, [0.4, 0.0]), (-4.1, [0.4, 0.0])):
+        estimates = np.array([[each, 1.0], [np.nan, 9.0], [each, 1.0], [99.0, 1.0]])
+        np.testing.assert_allclose(error.started(estimates).value, value)
+    np.testing.assert_allclose(error.started(np.zeros((0, 2))).value, [0.0, 0.0])
+
+
+def test_the_expected_error_of_a_linear_model_is_that_of_the_textbooks():
+    points = make_points(20)
+    found = fit_family("affine3d", points, robust=False)
+    statistics = expectation(found, found.used, SIZE)
+    # 40 observations, 8 that stand for the stated noise, 8 parameters and the noise: Akaike's criterion, corrected.
+    n, k, squares = 48, 9, (found.residuals / 0.5).ravel() @ (found.residuals / 0.5).ravel() + 8
+    assert statistics.criterion == pytest.approx(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
+    assert statistics.noise == pytest.approx((squares - 8) / 32)
+    assert statistics.stated == pytest.approx(2 * 0.5**2)
+    # The trace of the hat matrix is the number of parameters.
+    assert statistics.tested == pytest.approx(0.5**2 * 8 / 20)
+    assert statistics.scene > statistics.tested
+    assert statistics.unseen == 0.0
+
+
+@pytest.mark.parametrize(
+    "places", [[(0, 0), (10, 5), (5, 10), (6, 6)], [(10, 10), (0, 5), (5, 0), (4, 4)], [(1, 9), (9, 8), (0, 0), (5, 5)]]
+)
+def test_the_first_of_even_points_is_the_farthest_from_the_middle(places):
+    image = np.array(places, dtype=float)
+    chosen = select_control(replace(make_points(4), image=image), "even:1").control
+    middle = (image.max(axis=0) + image.min(axis=0)) / 2
+    assert np.flatnonzero(chosen).tolist() == [int(np.argmax(np.hypot(*(image - middle).T)))]
+
+
+@pytest.mark.parametrize("noise", [0.1, 2.0])
+def test_the_uncertainty_of_a_corner_is_that_of_a_regression(noise):
+    """Nine points of a regular grid, -1 to 1: a regression has 1/9 + x^2/6 + y^2/6 of their variance at (x, y)."""
+    places = np.stack(np.meshgrid([1000.0, 5000.0, 9000.0], [1000.0, 5000.0, 9000.0]), axis=-1).reshape(-1, 2)
+    points = make_points(9)
+    ground = np.column_stack([400e3 + places[:, 0], 5030e3 - places[:, 1], np.full(9, 300.0)])
+    image = places + noise * np.random.default_rng(1).normal(size=(9, 2))
+    found = fit_family("affine2d", replace(points, ground=ground, image=image), size=SIZE, robust=False)
+    # The corners of the domain are 2 % beyond those of the image, at 1.25; noise moves them a little.
+    assert found.corner_ratio == pytest.approx(np.sqrt(1 / 9 + 2 * (1.02 * 1.25) ** 2 / 6), rel=2e-3)
+    assert [uncertain_edge(factor) != [] for factor in (9.9, 10.1)] == [False, True]
+
+
+def test_parameters_that_cannot_be_separated_are_named():
+    def said(correlation: float, condition: float = 100.0) -> list[str]:
+        cofactors = np.diag([4.0, 1.0, 9.0])
+        cofactors[0, 2] = cofactors[2, 0] = -6.0 * correlation
+        model = SimpleNamespace(param_names=("a", "b", "c"))
+        solution = SimpleNamespace(model=model, cofactors=cofactors, condition=condition, effective=3.0)
+        return [str(notice) for notice in unstable(solution, None)]
+
+    assert said(0.9994) == []
+    (text,) = said(0.9996)
+    assert "1 pair of parameters" in text
+    assert "a and c" in text
+    assert said(0.5, condition=9.9e3) == []
+    assert said(0.5, condition=1.1e4)[0].startswith("unstable")

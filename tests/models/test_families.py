@@ -12,6 +12,7 @@ import pytest
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
 from ortho_pipeline.estimation.family_fit import fit_family, prune
 from ortho_pipeline.estimation.fit import fit
+from ortho_pipeline.estimation.regularisation import _corner
 from ortho_pipeline.models import (
     ImageCorrection,
     Rational,
@@ -482,3 +483,39 @@ def test_a_rejected_point_stays_out_when_pruned():
 
 def test_a_thousand_points_are_all_left_out_in_turn():
     assert fit_family("rfm3", make_points(1000)).rmse("loo").n == 1000
+
+
+# -- domain of the start ---------------------------------------------------------------------------------------------
+
+
+def test_the_domain_is_that_of_image_points_and_heights():
+    """Nine control points from column and row 100 to 900 of an image with 1000 x 1000 pixels of 10 m."""
+    image = np.stack(np.meshgrid([100.0, 500.0, 900.0], [100.0, 500.0, 900.0]), axis=-1).reshape(-1, 2)
+    # The last two are check points: 14 and 16 km east of the middle of the image.
+    image = np.concatenate([image, [[1900.0, 500.0], [2100.0, 500.0]]])
+    heights = np.array([100.0, 300.0, 150.0, 250.0, 120.0, 180.0, 290.0, 110.0, 210.0, 200.0, 200.0])
+    ground = np.column_stack([400e3 + 10 * image[:, 0], 5010e3 - 10 * image[:, 1], heights])
+    points = make_points(11, ground=ground, camera=lambda _: image, noise=0.0)
+    points = points.with_roles(["control"] * 9 + ["check"] * 2)
+    control = points.select(np.arange(9))
+    # Each side is 1 % of the extent farther.
+    box = start_model("affine3d", control, size=(1000, 1000)).box
+    np.testing.assert_allclose(box, [[399_900, 4_999_900, 98], [410_100, 5_010_100, 302]], atol=1e-6)
+    box = start_model("affine3d", control).box
+    np.testing.assert_allclose(box, [[400_920, 5_000_920, 98], [409_080, 5_009_080, 302]], atol=1e-6)
+    box = start_model("affine3d", control, heights=(0.0, 1000.0)).box
+    np.testing.assert_allclose(box[:, 2], [-10.0, 1010.0], atol=1e-9)
+    box = start_model("affine3d", points, size=(1000, 1000)).box
+    np.testing.assert_allclose(box[:, 0], [400e3 - 190, 419e3 + 190], atol=1e-6)
+    # Terrain is never exactly flat: a thousandth of the extent.
+    flat = start_model("affine2d", control.with_ground(control.ground * (1, 1, 0) + (0, 0, 200)), size=(1000, 1000))
+    np.testing.assert_allclose(flat.box[:, 2], [200 - 5.1, 200 + 5.1], atol=1e-6)
+
+
+def test_the_corner_of_an_l_is_found_and_not_a_turn_away_from_the_origin():
+    # Down from 5 to 0, to the right by 4, with the sharp corner at index 5; before it a turn outwards.
+    x = np.array([0.0, 0, 0, 0, 0, 0, 1, 2, 3, 4])
+    y = np.array([5.0, 4, 3, 2, 1, 0, 0, 0, 0, 0])
+    assert _corner(x, y) == 5
+    outwards = np.concatenate([[-3.0, -2.0, -1.0], x]), np.concatenate([[5.0, 5.0, 5.0], y])
+    assert _corner(*outwards) == 8

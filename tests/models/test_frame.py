@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pyproj
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
 from ortho_pipeline.estimation.fit import Prior, fit
@@ -15,6 +16,7 @@ from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, geocentric, geo
 from ortho_pipeline.models import ImageCorrection, model_from_dict
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.frame.camera import EXTERIOR, MAP, PARAMETERS, FrameCamera
+from ortho_pipeline.models.frame.orientation import camera_from_platform, heights_below
 from ortho_pipeline.models.frame.resection import resect
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.points import Points
@@ -314,3 +316,132 @@ def test_map_frame_is_worse_over_a_large_scene():
     in_map = fit(resect(points, BILSAT, map_crs="EPSG:32636"), points, robust=False)
     assert 0.01 < in_map.rmse("control").total < 2.0
     assert fit(resect(points, BILSAT), points, robust=False).rmse("control").total < 1e-6
+
+
+def test_a_camera_that_looks_past_the_ground_has_a_box_below_it():
+    # A frame of 0.06 m x 0.08 m at 0.1 m sees 26.6 degrees from its axis to a corner: tangent 0.05 / 0.1.
+    interior = Interior(600, 800, 0.1, 1e-4, 1e-4)
+    up = FrameCamera.from_map(
+        interior, "EPSG:32636", [480e3, 4.42e6, 1500.0, np.pi, 0.0, 0.0], frame=MAP, heights=(0.0, 600.0)
+    )
+    assert not up.sees_ground
+    # 1200 m above the middle of the heights.
+    np.testing.assert_allclose(up.domain, [[480e3, 4.42e6, 300.0], [600.0, 600.0, 300.0]], rtol=1e-9)
+    into_the_sky = FrameCamera.from_roll_pitch_yaw(interior, (33.0, 0.0, 1500.0), np.pi, 0.0, 0.0, heights=(0.0, 600.0))
+    centre, half = into_the_sky.domain
+    np.testing.assert_allclose(centre, [33.0, 0.0, 300.0], atol=1e-9)
+    # At the equator the radii of curvature are a and a (1 - e^2) of WGS 84.
+    radii = 6378137.0 * np.array([1.0, 1 - 0.00669437999014])
+    np.testing.assert_allclose(np.radians(half[:2]) * radii, [600.0, 600.0], rtol=1e-3)
+
+
+def test_rays_flatter_than_ten_degrees_do_not_widen_the_box():
+    # Corners of the image look to the horizon, the upper edge 2 degrees below it: 1000 m / tan 2 = 29 km away.
+    interior = Interior(1000, 1000, 0.1, 1e-4, 1e-4)
+    tilt = np.radians(90 - 2) - np.arctan(0.5)
+    camera = FrameCamera.from_map(
+        interior, "EPSG:32636", [480e3, 4.42e6, 1000.0, tilt, 0.0, 0.0], frame=MAP, heights=(0.0, 1.0)
+    )
+    centre, half = camera.domain
+    assert camera.sees_ground
+    assert centre[1] + half[1] - 4.42e6 < 1000.0 / np.tan(np.arcsin(0.17)) + 1
+
+
+def test_a_field_of_a_frame_camera_that_is_wrong_is_named():
+    for field, value in (
+        ("exterior", [0.0, 0.0, np.nan, 0.0, 0.0, 0.0]), ("exterior", [0.0] * 5),
+        ("origin", (33.0, 37.0)), ("origin", (33.0, 37.0, np.inf)), ("heights", (0.0, np.inf)),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as error:
+            FrameCamera(AERIAL, **{"exterior": np.zeros(6), field: value})
+        assert error.value.field == field
+    with pytest.raises(InputError, match="not a map projection in metres"):
+        FrameCamera.from_map(AERIAL, "EPSG:4326", [33.0, 37.0, 2000.0, 0.0, 0.0, 0.0])
+    with pytest.raises(InputError, match="not a map projection in metres"):  # US feet
+        FrameCamera.from_map(AERIAL, "EPSG:2263", [980e3, 200e3, 2000.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="not finite"):
+        aerial().with_params([np.nan, 0.0, 6000.0, 0.0, 0.0, 0.0])
+
+
+def test_a_frame_camera_keeps_its_own_copy_of_the_orientation():
+    exterior = np.zeros(6)
+    camera = FrameCamera(AERIAL, exterior)
+    exterior[2] = 1.0
+    assert camera.exterior[2] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        camera.exterior[2] = 1.0
+
+
+def test_angles_in_a_map_count_from_the_north_of_the_grid():
+    # 2.7 degrees of convergence. Near the nadir, the topocentric camera sees what the same camera in the map sees.
+    exterior = [674e3, 6.65e6, 2000.0, 0.02, -0.03, 0.5]
+    in_map, camera = (
+        FrameCamera.from_map(AERIAL, "EPSG:32632", exterior, frame=frame, heights=(0.0, 1.0))
+        for frame in ("map", "topocentric")
+    )
+    offsets = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [-150.0, -150.0, 500.0]])
+    place = offsets + np.array([674e3, 6.65e6, 0.0])
+    ground = np.column_stack(pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(*place.T))
+    np.testing.assert_allclose(camera.ground_to_image(ground), in_map.ground_to_image(place), atol=0.06)
+    lon, lat, _ = camera.perspective_centre
+    east, north, _ = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(lon, lat, 0.0)
+    np.testing.assert_allclose([east, north, camera.perspective_centre[2]], exterior[:3], atol=1e-6)
+
+
+def test_platform_angles_are_those_of_scipy():
+    for roll, pitch, yaw in np.random.default_rng(3).uniform(-1.5, 1.5, (5, 3)):
+        # To north, east, down from forward, right, down; the camera has right, forward, up.
+        platform = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+        expected = np.stack([platform[:, 1], platform[:, 0], -platform[:, 2]])
+        np.testing.assert_allclose(camera_from_platform(roll, pitch, yaw), expected, atol=1e-15)
+
+
+def test_the_ground_is_below_the_camera():
+    position = geocentric(np.array([[*PLACE, 2500.0]]))[0]
+    # At most nine tenths of the way from the lowest ground up to the camera.
+    assert heights_below(position, (500.0, 3000.0)) == pytest.approx((500.0, 2300.0), abs=1e-6)
+    assert heights_below(position, (500.0, 1000.0)) == (500.0, 1000.0)
+    with pytest.raises(InputError, match="sees no ground"):
+        heights_below(position, (2500.1, 3000.0))
+    assert np.isnan(satellite(0, 0).image_to_ground([[1024.0, 1024.0]], 700e3)).all()
+    assert np.isnan(aerial().image_to_ground([[500.0, 750.0]], np.nan)).all()
+
+
+@pytest.mark.parametrize(
+    ("k1", "k2", "k3", "square"),
+    [
+        # d(r (1 + k1 r^2 + k2 r^4 + k3 r^6)) / dr = 0: 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with s = r^2.
+        (0.0, -0.2, 0.0, 1.0),
+        (0.0, 0.0, -1 / 7, 1.0),
+        (1 / 3, -0.4, 0.0, 1.0),
+        # 1 - 1.5 s + 0.5 s^2 = (1 - s) (1 - s / 2): the nearer of two roots.
+        (-0.5, 0.1, 0.0, 1.0),
+        (1.0, 0.5, 0.25, np.inf),
+    ],
+)
+def test_a_lens_is_used_up_to_the_radius_at_which_it_folds(k1, k2, k3, square):
+    interior = Interior(1000, 1000, 900e-6, 1e-6, 1e-6, k1=k1, k2=k2, k3=k3)
+    away = np.sqrt(min(square, 1e4)) * np.array([0.6, -0.8])
+    inside, outside = interior.image_of(np.stack([0.9999 * away, 1.0001 * away]))
+    assert np.isfinite(inside).all()
+    assert np.isnan(outside).all() == np.isfinite(square)
+
+
+def test_a_resected_camera_is_for_heights_a_little_beyond_those_of_its_points():
+    for altitude, spread, margin in ((6000.0, 200.0, 200.0), (1150.0, 200.0, 10.0), (1102.0, 200.0, 1.0)):
+        truth = FrameCamera.from_roll_pitch_yaw(AERIAL, (*PLACE, altitude), 0.1, -0.1, 1.0, heights=(800.0, 1101.0))
+        image = np.array([[50, 50], [900, 100], [950, 1400], [100, 1300], [480, 700.0]])
+        ground = truth.image_to_ground(image, 1100.0 - spread * np.array([0.0, 1.0, 0.3, 0.7, 0.5]))
+        found = resect(points_of(ground, image, 0.0), AERIAL)
+        # Half their range and 100 m, but at most a fifth of the way to the camera, and at least a metre.
+        assert found.heights == pytest.approx((900.0 - margin, 1100.0 + margin), abs=0.1)
+
+
+def test_points_on_both_sides_of_the_antimeridian_have_a_frame_among_them():
+    truth = FrameCamera.from_roll_pitch_yaw(BILSAT, (179.99, 39.9, 686e3), 0.02, 0.05, 0.3, heights=(0.0, 900.0))
+    points = measured(truth, 20)
+    points.ground[:, 0] = (points.ground[:, 0] + 180) % 360 - 180
+    assert np.ptp(points.ground[:, 0]) > 359
+    found = resect(points, BILSAT)
+    assert abs((found.origin[0] - 179.99 + 180) % 360 - 180) < 1
+    assert apart(found, truth)[0] < 1

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from measured import points_of
 from ortho_studies.simulation.scanner import LineScanner
+from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.fit import fit
@@ -20,13 +21,18 @@ from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models import Pushbroom, model_from_dict
-from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.base import Array, Constraints, SensorModel
 from ortho_pipeline.models.pushbroom.constraints import Observations, OrbitShape
 from ortho_pipeline.models.pushbroom.line_camera import LineCamera
 from ortho_pipeline.models.pushbroom.metadata import mounting_of_angles, pushbroom_of_metadata
-from ortho_pipeline.models.pushbroom.rotations import angles_of, rotations
+from ortho_pipeline.models.pushbroom.rotations import angles_of, orbital_axes, rotations
 from ortho_pipeline.models.pushbroom.splines import Spline, SplineForm
-from ortho_pipeline.models.pushbroom.tables import pushbroom_of_tables, rotations_of_angles, rotations_of_quaternions
+from ortho_pipeline.models.pushbroom.tables import (
+    lagrange,
+    pushbroom_of_tables,
+    rotations_of_angles,
+    rotations_of_quaternions,
+)
 from ortho_pipeline.testing import check_sensor_model
 
 FOCAL, PIXEL = 1.945, 7e-6
@@ -675,3 +681,141 @@ def test_files_that_are_no_pushbroom(change: dict[str, object]) -> None:
 
 def test_a_shape_without_constraints_is_empty() -> None:
     assert len(replace(metadata_start(scanner()), shape=OrbitShape(), attitude_observations=()).constraints()) == 0
+
+
+# -- small parts against closed forms --------------------------------------------------------------------------------
+
+
+def test_rotations_and_orbital_axes_are_those_of_scipy_and_of_vectors() -> None:
+    angles = np.random.default_rng(2).uniform(-1, 1, (10, 3))
+    assert np.allclose(rotations(angles), Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix(), atol=1e-15)
+    # Above longitude 0 on the equator, flying north and a little away from the Earth: left is west.
+    assert np.allclose(
+        orbital_axes(np.array([7e6, 0, 0]), np.array([100.0, 0, 7500])), [[0, 0, 1], [0, -1, 0], [1, 0, 0]]
+    )
+    # The platform follows the inertial velocity, to which the rotation of the Earth adds 7.292115e-5 x 7e6 m/s east.
+    turn = rotations_of_angles([[0.0, 0.0, 0.0]], [[7e6, 0.0, 0.0]], [[0.0, 0.0, 7500.0]])[0]
+    forward = np.array([0.0, 7.292115e-5 * 7e6, 7500.0]) / math.hypot(7.292115e-5 * 7e6, 7500.0)
+    assert np.allclose(turn[:, 0], forward, atol=1e-9)
+    assert np.allclose(turn[:, 1], np.cross([1.0, 0.0, 0.0], forward), atol=1e-9)
+
+
+def test_a_camera_of_a_table_of_look_angles() -> None:
+    x = np.linspace(0.0, 1000.0, 21)
+    xi = x / 500 - 1
+    u, v = (x - 480.0 + 3.0 * xi**3) / 2000.0, 1e-3 - 2.0 * xi**2 / 2000.0
+    camera = LineCamera.of_table(1000, 500, x, u, v)
+    assert np.abs(camera.directions(x) - np.stack([u, v], axis=1)).max() < 1e-12
+    assert (len(camera.dx), len(camera.dy)) == (4, 3)  # a cubic and a parabola
+    straight = LineCamera.of_table(1000, 500, x, (x - 480.0) / -2000.0, np.full(21, 1e-3))
+    assert straight.focal_length == pytest.approx(-2000.0)
+    assert (straight.principal_column, straight.principal_line) == pytest.approx((480.0, 2.0))
+    assert len(straight.dx) == len(straight.dy) == 0
+    # A zigzag of 0.02 px is rounding if the table is rounded to that, else no line of detectors.
+    zigzag = u + 0.02 / 2000 * (-1.0) ** np.arange(21)
+    assert len(LineCamera.of_table(1000, 500, x, zigzag, v, rounding=0.03).dx) == 4
+    with pytest.raises(InputError, match="not those of a smooth line"):
+        LineCamera.of_table(1000, 500, x, zigzag, v)
+    # Up to 0.005 px count as smooth.
+    fine = u + 0.001 / 2000 * (-1.0) ** np.arange(21)
+    assert np.abs(LineCamera.of_table(1000, 500, x, fine, v).directions(x)[:, 0] - fine).max() < 0.005 / 2000
+    two = LineCamera.of_table(1000, 500, x[[0, -1]], u[[0, -1]], v[[0, -1]])
+    assert np.abs(two.directions(x[[0, -1]])[:, 0] - u[[0, -1]]).max() < 1e-12
+    wrong = (x[::-1], u), (np.maximum(x, 60.0), u), (x[:1], u[:1]), (x, np.full(21, 0.1)), (x, u + np.inf)
+    for columns, across in wrong:
+        with pytest.raises(InputError):
+            LineCamera.of_table(1000, 500, columns, across, v[: len(across)])
+
+
+def test_misfits_of_an_orbit_are_those_of_its_shape() -> None:
+    radius, speed, climb, bend = 7e6, 7500.0, 40.0, 3.0
+
+    def path(times: Array, derivative: int) -> tuple[Array, Array]:
+        """Straight ahead in y while it climbs in x, and along a parabola in z that is zero at 0 and 4 seconds."""
+        one = np.ones_like(times)
+        places = np.stack([radius + climb * times, speed * times, bend * times * (4 - times)], axis=1)
+        rates = np.stack([climb * one, speed * one, bend * (4 - 2 * times)], axis=1)
+        return (places, rates)[derivative], np.zeros((len(times), 3, 1))
+
+    plane = OrbitShape(plane=10.0, samples=1).of(path, (0.0, 4.0))
+    assert plane.residuals == pytest.approx([-bend * 2 * 2])  # 12 m above the plane of both ends
+    assert plane.sigma.tolist() == [10.0]
+    circular = OrbitShape(circular=1e-3, samples=1).of(path, (0.0, 4.0))
+    place, rate = np.array([radius + 80, 15e3, 12.0]), np.array([climb, speed, 0.0])
+    assert circular.residuals == pytest.approx([-place @ rate / np.linalg.norm(place) / np.linalg.norm(rate)])
+    height = OrbitShape(radius=7.001e6, radius_sigma=5.0).of(path, (0.0, 4.0))
+    assert height.residuals == pytest.approx([7.001e6 - np.linalg.norm(place)], abs=1e-6)
+    both = OrbitShape(plane=10.0, circular=1e-3, samples=3).of(path, (0.0, 4.0))
+    assert both.sigma.tolist() == [10.0] * 3 + [1e-3] * 3
+    assert both.fictitious.all()
+
+
+def test_a_scene_lasts_as_long_as_kepler_says() -> None:
+    # Two degrees to the south at a distance of 7000 km: 5828.5 s for a whole orbit.
+    corners = np.array([[0.0, 1.0], [0.5, 1.0], [0.5, -1.0], [0.0, -1.0]])
+    altitude = 7000e3 - 6378137.0
+    model = pushbroom_of_metadata(corners, 6000, 24_000, altitude=altitude, along_deg=0.0, heights=(-1.0, 1.0))
+    # Degrees of latitude are 0.7 % shorter at the equator.
+    assert model.line_period * 24_000 == pytest.approx(5828.5 * 2 * 0.99331 / 360, rel=1e-3)
+
+
+def test_lagrange_follows_polynomials_of_degree_seven_and_short_tables() -> None:
+    times = np.array([0.0, 1.0, 1.5, 3.0, 4.0, 6.0, 6.5, 8.0])
+    wanted = np.array([-0.5, 0.0, 2.2, 7.9])
+    for degree, table in ((7, times), (2, times[:3]), (7, np.concatenate([times - 20, times]))):
+        values, rates = lagrange(table, np.stack([table**degree, table, 1 + 0 * table], axis=1), wanted)
+        assert np.allclose(values, np.stack([wanted**degree, wanted, 1 + 0 * wanted], axis=1), rtol=1e-9, atol=1e-6)
+        slopes = degree * wanted ** (degree - 1)
+        assert np.allclose(rates, np.stack([slopes, 1 + 0 * wanted, 0 * wanted], axis=1), rtol=1e-7, atol=1e-5)
+
+
+@pytest.mark.parametrize(("away", "said"), [(1e10, "where no satellite can be"), (1e6, "no satellite is that fast")])
+def test_positions_of_no_satellite_are_refused(away: float, said: str) -> None:
+    camera = scanner(12)
+    times, positions, turns = tables_of(camera, np.linspace(-0.6, 1.6, 20) * camera.height)
+    positions[7] += away
+    with pytest.raises(InputError, match=said):
+        pushbroom_of_tables(
+            LineCamera(12_000, 12_000, 6000.0, 0.0, 277_857.0), line_period=camera.line_period, first_time=0.0,
+            orbit=(times, positions), attitude=(times, turns),
+        )  # fmt: skip
+
+
+def test_a_derivative_of_a_spline_beyond_its_degree_is_zero() -> None:
+    line = Spline(1, np.array([0.0, 1.0]), np.array([[0.0, 1.0, 2.0], [3.0, 5.0, 7.0]]))
+    assert np.allclose(line(np.array([-1.0, 0.5, 2.0]), 1), [3.0, 4.0, 5.0])
+    assert not line(np.array([-1.0, 0.5, 2.0]), 2).any()
+
+
+@pytest.mark.parametrize("change", [{"samples": 0}, {"samples": 1.5}, {"plane": 0.0}, {"circular": math.inf}])
+def test_impossible_shapes_of_orbits_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        OrbitShape(**change)  # type: ignore[arg-type]
+
+
+def test_partials_of_the_shape_of_an_orbit_that_is_no_circle() -> None:
+    """A steep path: on a circle the terms with the cosine vanish."""
+
+    def shape(values: Array) -> Constraints:
+        climb, bend, tilt = values
+
+        def path(times: Array, derivative: int) -> tuple[Array, Array]:
+            one, zero, arc = np.ones_like(times), np.zeros_like(times), times * (4 - times)
+            places = [7e6 + climb * times, 7500 * times, bend * arc + tilt * times]
+            slopes = [[times, zero, zero], [zero, zero, zero], [zero, arc, times]]
+            if derivative:
+                places = [climb * one, 7500 * one, bend * (4 - 2 * times) + tilt * one]
+                slopes = [[one, zero, zero], [zero, zero, zero], [zero, 4 - 2 * times, one]]
+            return np.stack(places, axis=1), np.moveaxis(np.array(slopes), 2, 0)
+
+        return OrbitShape(plane=10.0, circular=1e-3, radius=7e6, radius_sigma=9.0, samples=3).of(path, (0.0, 4.0))
+
+    start = np.array([3000.0, 50.0, 700.0])
+    found = shape(start)
+    assert abs(found.residuals[3:6]).min() > 0.3
+    for k, step in enumerate(np.eye(3)):
+        change = (shape(start - step).residuals - shape(start + step).residuals) / 2
+        # Relative to the largest of each kind.
+        for rows in (slice(0, 3), slice(3, 6), slice(6, 7)):
+            largest = np.abs(found.jacobian[rows]).max()
+            assert np.abs(change - found.jacobian[:, k])[rows].max() < 1e-5 * largest

@@ -170,3 +170,24 @@ def test_real_rpcs_are_accepted_and_narrowed_only_where_they_have_poles_or_folds
     assert not any(refused)  # the others are no RPCs, or lack fields
     # EROS-A of GDAL's tests folds below 500 m, the Planet scene of its bug report has a pole at -4 m.
     assert set(narrowed) == {"md_eros.rpc", "md_eros.tif", "unstable_rpc_with_dem_source.tif"}
+
+
+@pytest.mark.parametrize(
+    ("bend", "heights"), [(-2.0, (200.0, 887.5)), (2.0, (512.5, 1200.0)), (-0.5, (200.0, 1200.0)), (-5.0, None)]
+)
+def test_heights_beyond_a_fold_are_taken_away(bend, heights):
+    # The column is L (1 + bend H): its slope is zero at H = -1 / bend, and levels are an eighth of 500 m apart.
+    column = np.eye(20)[1] + bend * np.eye(20)[5]
+    if heights is None:  # at 0.2 of the half-height above the middle
+        with pytest.raises(InputError, match="several places on the ground"):
+            simple(col_num=column)
+    else:
+        assert simple(col_num=column).height_range == pytest.approx(heights)
+
+
+def test_the_widest_pixel_is_100_km_at_its_latitude():
+    # 180 degrees of longitude on 100 pixels are 200.4 km at the equator, 100 km at a latitude of 60.06 degrees.
+    wide = {"lon_scale": 180.0, "col_scale": 100.0, "lon_off": 0.0}
+    assert simple(lat_off=60.5, **wide).lat_off == 60.5
+    with pytest.raises(InputError, match="a pixel of this RPC would be"):
+        simple(lat_off=59.5, **wide)

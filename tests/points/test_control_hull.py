@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.options import PointOptions, SurfaceOptions
-from ortho_pipeline.points.control_hull import COVERED, control_hull, empty_parts, uncovered
+from ortho_pipeline.points.control_hull import COVERED, control_hull, empty_parts, outside_of_hull, uncovered
 
 SIZE = (1000, 800)
 
@@ -99,3 +99,20 @@ def test_fit_rectify_and_compare_say_so(tiny, tmp_path):
     assert not any("empty:" in text for text in commands.fit(tiny.image, plain).warnings)
     everywhere = PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid")
     assert not any("empty:" in text for text in commands.fit(tiny.image, everywhere).warnings)
+
+
+def test_points_are_outside_if_they_are_farther_than_half_the_spacing_from_the_hull():
+    # Four points on 100 x 100 px have a spacing of 50 px, so the hull is widened by 25 px, round at its corners.
+    control = np.array([(0.0, 0.0), (100, 0), (100, 100), (0, 100)])
+    places = np.array([(50.0, 50), (124, 50), (126, 50), (50, -24), (50, -26), (117, 117), (118, 118)])
+    assert outside_of_hull(control, places).tolist() == [False, False, True, False, True, False, True]
+    assert outside_of_hull(control, np.zeros((0, 2))).shape == (0,)
+    assert outside_of_hull(np.zeros((0, 2)), places).tolist() == [False] * 7
+
+
+def test_the_hull_counts_inside_the_image_only():
+    beyond = control_hull(np.array([(-500.0, 0.0), (500, 0), (500, 800), (-500, 800)]), SIZE)
+    assert beyond.share == pytest.approx(0.5)
+    assert set(beyond.outline) == {(-500.0, 0.0), (500.0, 0.0), (500.0, 800.0), (-500.0, 800.0)}
+    triangle = control_hull(np.array([(0.0, 0.0), (1000, 0), (0, 800)]), SIZE)
+    assert (triangle.share, triangle.n, len(triangle.outline)) == (pytest.approx(0.5), 3, 3)

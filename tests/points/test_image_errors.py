@@ -233,3 +233,17 @@ def test_a_block_takes_what_points_have_in_common(tmp_path: Path) -> None:
     points = read_block_points(path, crs="EPSG:4326", vertical="ellipsoid")
     np.testing.assert_array_equal(points.sigma_ground[:, 0], [0.3, 0.0, 0.5])
     np.testing.assert_array_equal(points.sigma_common, [0.4, 2.0, 0.0])
+
+
+@pytest.mark.parametrize(("factor", "agrees"), [(1.009, True), (0.991, True), (1.015, False), (0.985, False)])
+def test_a_scalar_agrees_with_a_covariance_within_one_per_cent(tmp_path: Path, factor: float, agrees: bool) -> None:
+    points = made(1).with_covariance_image([[[4, 1], [1, 2]]])
+    for make in (
+        lambda sigma: replace(points, sigma_image=[sigma]),
+        lambda sigma: read(tmp_path / "p.csv", f"{sigma!r},4,2,1,"),
+    ):
+        if agrees:
+            assert make(factor * 3**0.5).sigma_image == pytest.approx([3**0.5])
+        else:
+            with pytest.raises(InputError, match="gives"):
+                make(factor * 3**0.5)

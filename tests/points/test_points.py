@@ -468,3 +468,32 @@ def test_points_of_arrays_are_those_of_a_file(tmp_path):
         Points.of(image, ground[:1], "EPSG:4979")
     with pytest.raises(InputError, match="two points have the id"):
         Points.of(image, ground, "EPSG:4979", ids=["a", "a"])
+
+
+@pytest.mark.parametrize(
+    ("crs", "at", "apart", "same"),
+    [
+        # Half a millimetre is one point, two millimetres are two; 1e-8 degrees are 1.1 mm.
+        ("EPSG:32634", (500_000.0, 6_000_000.0), 1e-4, True), ("EPSG:32634", (500_000.0, 6_000_000.0), 2e-3, False),
+        ("EPSG:3031", (-1_500_000.0, -1_000_000.0), 1e-4, True), ("EPSG:4979", (24.0, -33.0), 1e-9, True),
+        ("EPSG:4979", (24.0, -33.0), 2e-8, False),
+    ],
+)  # fmt: skip
+def test_the_same_place_twice_is_refused_and_a_near_one_is_not(tmp_path, crs, at, apart, same):
+    text = HEADER + f"a,1,2,{at[0]},{at[1]},100\nb,3,4,{at[0] + apart!r},{at[1]},100\n"
+    path = write(tmp_path / "p.csv", text)
+    if same:
+        with pytest.raises(InputError, match="the same ground coordinates as in line 2"):
+            read_points(path, crs=crs, vertical="ellipsoid")
+    else:
+        assert len(read_points(path, crs=crs, vertical="ellipsoid")) == 2
+
+
+def test_a_pixel_is_the_same_to_a_millionth(tmp_path):
+    for apart, same in ((1e-7, True), (1e-5, False)):
+        path = write(tmp_path / "p.csv", HEADER + f"a,1,2,24,-33,100\nb,{1 + apart!r},2,24.1,-33,100\n")
+        if same:
+            with pytest.raises(InputError, match="the same image coordinates"):
+                read_points(path, crs="EPSG:4979", vertical="ellipsoid")
+        else:
+            assert len(read_points(path, crs="EPSG:4979", vertical="ellipsoid")) == 2
