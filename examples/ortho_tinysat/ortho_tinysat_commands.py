@@ -1,4 +1,4 @@
-"""The commands that TinySat-1 adds to `ortho`. Its help imports this module: it declares them, and imports no more."""
+"""The commands that TinySat-1 adds to `ortho`. `ortho --help` imports this module, so it only declares them."""
 
 from collections.abc import Iterable
 

@@ -294,7 +294,8 @@ class MatchOptions:
             "M",
             kind="number",
             above=0,
-            unset="three times the stated accuracy; else 100 (an ortho: or 30 pixels), at most a quarter of the image",
+            unset="three times the stated accuracy; without one, 100 (an ortho: or 30 pixels) or a quarter of the "
+            "image, whichever is smaller",
         ),
     ] = None
     search_rotation: Annotated[

@@ -1,4 +1,4 @@
-"""Control, check and tie points: one table, a reader for every format, and which of them control.
+"""Control, check and tie points: one table, a reader for every format, and the choice of control.
 
 Imports `geodesy` and the rooms below. A new point format is an entry in `formats`.
 """

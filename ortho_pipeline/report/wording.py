@@ -221,7 +221,10 @@ def runner_up(report: SceneReport) -> str | None:
     told += [] if plain is None or plain == nearest else [f"{plain} as supplied has {px(sizes[plain])}"]
     said = [f"{' and '.join(told)}."] if told else []
     if checked:
-        said.append("The check points were used for this choice, so they do not test it independently.")
+        said.append(
+            "The check points took no part in the adjustments, but they helped to choose the model. So their RMSE can "
+            "be a little too small; only other check points are an independent test."
+        )
     return " ".join(said) or None
 
 
@@ -276,7 +279,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows.append(
         (
             "NMAS 1947",
-            "90 % of the points within 1/30 inch at map scale (1/50 inch from 1:20,000)",
+            "90 % of the points within 1/30 inch at map scale (1/50 inch at 1:20,000 and smaller)",
             metres(found.ce90),
             scale_text(found.nmas_scale),
         )

@@ -84,13 +84,13 @@ class HeightsRecord(Record):
         if self.shift_significant:
             east, north = self.shift_m
             size, sigma = metres(math.hypot(east, north)), metres(max(self.shift_sigma_m))
-            part = f"{size} for the DEM ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma})"
+            part = f"{size} ({east:+.1f} m east, {north:+.1f} m north, sigma {sigma})"
             remedy: tuple[str | Setting, ...] = ("The DEM was moved by this",)
             if not self.shift_applied:
                 remedy = ("If the images are right, move the DEM with ", Setting("points.dem_shift", "estimate"))
             apart = "the DEM and the images are displaced from each other (by chance in less than 1 of 1000 cases)"
-            doubt = "How much is an error of the DEM, and how much of the images, is uncertain"
-            text = Text(f"{apart}. {doubt}. Best estimate: {part}, the rest for the images. ", *remedy)
+            doubt = "Which of both is off its true position is less certain, so the adjustment moves both"
+            text = Text(f"{apart}. {doubt}. Estimate for the DEM: {part}. ", *remedy)
             fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
             found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
         if self.spots is not None and self.spots.left_out:

@@ -57,7 +57,8 @@ def stack(
     """Make finished orthos and raw scenes of many dates agree with each other.
 
     Each date is matched with earlier dates and with the same season of earlier years. One network of all pairs gives
-    the smallest correction of each date that the matches justify. Wrong pairs and moving ground are found and left out.
+    the smallest correction of each date that the matches justify: a shift or an affine transformation, never a smooth
+    field as in align. Wrong pairs and moving ground are found and left out.
     Raw scenes need heights; their pixels are resampled once, with the corrected model. A second run matches only new
     pairs. Dates come from a CSV list (columns file and date), from file names, STAC items, reports or metadata.
     """

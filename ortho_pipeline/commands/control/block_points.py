@@ -362,7 +362,9 @@ def read_points(
     flat = table.control & ~np.isfinite(table.ground[:, 2])
     if flat.any():
         names = np.array(table.ids)[flat][:10].tolist()
-        text = f"control points without a height count in plan only: {', '.join(names)}"
+        text = (
+            f"control points without a height count in plan only, unless a DEM gives their height: {', '.join(names)}"
+        )
         notes.append(Notice("control-without-height", text, points=names))
     return table, notes
 

@@ -459,13 +459,16 @@ def _sentences(analysis: Covariance) -> list[str]:
             f"{FEWEST_POINTS} points, and {FEWEST_POINTS} observations more than parameters."
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
-    chance = f"Without systematic errors, one scene in {round(1 / SIGNIFICANCE)} has a value above"
-    result, here = "No systematic error was found", "Here both values are lower"
+    many = round(1 / SIGNIFICANCE)
+    chance = f"Without systematic errors, both values are below {analysis.critical:+.2f} in {many - 1} scenes of {many}"
+    if analysis.critical < 0:
+        chance += " (residuals of a fit to few points are negatively correlated)"
+    result, here = "No systematic error was found", "Here both are below it"
     if analysis.verdict == "systematic":
-        result, here = "Systematic errors remain", "Here the larger value is higher"
+        result, here = "Systematic errors remain", "Here the larger one is above it"
     sentences = [
         f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}. "
-        f"{chance} {analysis.critical:+.2f}. {here}."
+        f"{chance}. {here}."
     ]
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")

@@ -44,7 +44,7 @@ def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...
         return ()
     said = ", ".join(f"{100 * share:.0f} % of {label}" for label, share in list(part.items())[:6])
     said += "" if len(part) <= 6 else f" and less of {counted(len(part) - 6, 'more image')}"
-    text = f"points cover {said}: the rest is untested"
+    text = f"points cover {said}: the rest has no points"
     return (Notice("points-cover-part", text, share=part),)
 
 
