@@ -76,6 +76,23 @@ def test_moving_ground_is_found_and_moves_no_date(share):
     assert np.abs(left).max() < 0.25
 
 
+def test_the_rate_of_an_area_is_that_of_the_ground_and_not_of_its_rim():
+    """Places within a circle move at one rate, and the ring about them, more exactly measured, at a tenth of it."""
+    made = Truth(seed=12, dates=24, interval=30.0, hidden=0.0).made()
+    edges, place = made.edges, made.truth.cells.place
+    reach = np.hypot(*place.T)
+    share = np.where(reach < 0.45, 1.0, np.where(reach < 0.55, 0.1, 0.0))
+    years = made.years[edges.first] - made.years[edges.second]
+    value = edges.value + (years[:, None] * share)[:, :, None] * np.array([0.8, -0.6])
+    variance = edges.variance * np.where(share == 0.1, 0.1, 1.0)
+    motion = adjust(
+        made.truth.cells, dataclasses.replace(edges, value=value, variance=variance), made.years.tolist()
+    ).motion
+    rate, sigma = motion.typical(motion.areas(made.truth.cells)[0])
+    np.testing.assert_allclose(rate, [0.8, -0.6], atol=4 * sigma)
+    assert sigma < 0.05
+
+
 def test_still_ground_is_not_moving():
     assert sum(solved(seed=seed, dates=16)[1].motion.moving.sum() for seed in (30, 31)) <= 1
 

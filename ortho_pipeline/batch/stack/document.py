@@ -170,10 +170,8 @@ def _moving(stack: AdjustedStack, placed: Placed, metres: Array) -> list[MovingR
     to_lon_lat = ground_transform(placed.model.crs, "EPSG:4979")
     cell = (stack.cells.side**2) * abs(float(np.linalg.det(metres)))
     for area in motion.areas(stack.cells):
-        weight = 1.0 / np.maximum(motion.sigma[area] ** 2, 1e-12)
-        rate = metres @ ((motion.rate[area] * weight).sum(axis=0) / weight.sum(axis=0))
-        # Errors of neighbouring cells are shared: their mean is no more certain than a cell.
-        sigma = float(np.median(motion.sigma[area])) * float(np.sqrt(abs(np.linalg.det(metres))))
+        rate, sigma = motion.typical(area)
+        rate, sigma = metres @ rate, sigma * float(np.sqrt(abs(np.linalg.det(metres))))
         middle = placed.model.image_to_ground(stack.cells.middles[area].mean(axis=0)[None], 0.0)
         lon, lat, _ = to_lon_lat(middle)[0]
         strongest = area[int(motion.ratio[area].argmax())]

@@ -62,6 +62,13 @@ class Motion:
         found = [np.flatnonzero(numbered.ravel() == number + 1) for number in range(count)]
         return sorted(found, key=lambda one: (-len(one), one[0]))
 
+    def typical(self, area: NDArray[np.int_]) -> tuple[Array, float]:
+        """Return the rate ``(2,)`` of an area and its sigma along an axis, px a year: medians of its cells.
+
+        Cells at the rim move in part. Neighbours share errors, so the median is no more certain than one cell.
+        """
+        return np.median(self.rate[area], axis=0), float(np.median(self.sigma[area]))
+
 
 @dataclass(frozen=True, eq=False)
 class _Left:

@@ -54,7 +54,7 @@ class ClosureRecord(Record):
 
 
 class MovingRecord(Record):
-    """Ground that moves, relative to the stable ground; rates and sigmas are of its cells' mean, m a year."""
+    """Ground that moves, relative to the stable ground; rates and sigmas are the medians of its cells, m a year."""
 
     lon: float
     lat: float
