@@ -88,9 +88,10 @@ class HeightsRecord(Record):
             remedy: tuple[str | Setting, ...] = ("The DEM was moved by this",)
             if not self.shift_applied:
                 remedy = ("If the images are right, move the DEM with ", Setting("points.dem_shift", "estimate"))
-            apart = "the DEM and the images are displaced from each other (by chance in less than 1 of 1000 cases)"
-            doubt = "Which of both is off its true position is less certain, so the adjustment moves both"
-            text = Text(f"{apart}. {doubt}. Estimate for the DEM: {part}. ", *remedy)
+            apart = "the DEM and the images are displaced from each other"
+            chance = "chance alone would do this in less than 1 of 1000 cases"
+            doubt = "It is not certain which of both is off, so the adjustment divides the displacement between both"
+            text = Text(f"{apart} ({chance}). {doubt}. Estimate for the DEM: {part}. ", *remedy)
             fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
             found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
         if self.spots is not None and self.spots.left_out:
