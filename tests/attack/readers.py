@@ -190,7 +190,8 @@ def _frame(camera: str, exterior: str, **more: str) -> Callable[[Path], Any]:
 
 
 def _photo(path: Path) -> Any:
-    xmp = path.read_bytes().decode("utf-8", "replace").replace("\0", "")
+    # An empty packet cannot be written into a file; blanks are as empty for whoever reads them.
+    xmp = path.read_bytes().decode("utf-8", "replace").replace("\0", "") or " "
     scene = open_scene(photo(path.with_name("one.tif"), xmp=xmp), SceneOptions(sensor="photo"))
     return [*scene.models.values(), scene.facts, scene.priors]
 
