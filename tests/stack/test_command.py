@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from ortho_pipeline.batch.stack import matching
 from ortho_pipeline.batch.stack.command import stack
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.errors import CrsError, InputError
+from ortho_pipeline.files import Outputs
 from ortho_pipeline.options import MatchOptions, OutputOptions, StackOptions
 from ortho_pipeline.report.stack.records import StackRecord
 
@@ -176,6 +178,16 @@ def test_a_killed_run_resumes_to_the_same_result(made, tmp_path):
     assert not (tmp_path / "out" / "stack.json").exists()
     run([made[0][0].parent], tmp_path / "out")
     assert contents(tmp_path / "out") == contents(made[1])
+
+
+def test_a_lock_of_a_run_that_was_killed_after_its_last_rename_goes(made, tmp_path):
+    shutil.copytree(made[1], tmp_path / "out")
+    before = contents(tmp_path / "out")
+    for path in (tmp_path / "out" / "pairs").glob("*.json"):
+        Outputs(path.parent, path.name).lock_path.touch()
+    assert list((tmp_path / "out").rglob("*.part"))
+    run([made[0][0].parent], tmp_path / "out")
+    assert contents(tmp_path / "out") == before
 
 
 def test_corrections_only_keep_the_pixels(made, tmp_path):

@@ -19,6 +19,7 @@ from ortho_pipeline.batch.plan import STATE
 from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, key_of, locked
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.errors import InputError, error_document
+from ortho_pipeline.files import clear_up
 from ortho_pipeline.files.locations import VsiPath, located
 from ortho_pipeline.runtime.process_limits import one_blas_thread
 from ortho_pipeline.stores.delivery import address_of, delivered
@@ -156,6 +157,10 @@ class RecordedFolder:
             if kept is None:
                 left.append(one)
             else:
+                # A command that was killed after its last rename has left a lock; another worker may hold it.
+                for name in (_record_of(one.name), *one.files.values()):
+                    with contextlib.suppress(InputError):
+                        clear_up(folder / name)
                 note(one.name, Made(kept, True))
         # New processes for nothing take longer than all of this.
         if left:
