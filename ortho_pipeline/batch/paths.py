@@ -6,6 +6,7 @@ import fnmatch
 import glob
 import itertools
 import os
+import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -179,3 +180,12 @@ def _found(base: str, parts: Sequence[str]) -> Iterator[str]:
         for folder, names, _ in os.walk(top):
             names[:] = [name for name in names if not name.startswith(".")]
             yield from _found(folder, parts[at + 1 :] or ["*"])
+
+
+def key_of_name(name: str) -> str:
+    """Return a key that is equal for names that are one file where case, or the encoding of é, is ignored.
+
+    >>> key_of_name("Scene") == key_of_name("scene")
+    True
+    """
+    return unicodedata.normalize("NFC", name).casefold()

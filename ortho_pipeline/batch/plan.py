@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
-from ortho_pipeline.batch.paths import PipelinePaths, Place
+from ortho_pipeline.batch.paths import PipelinePaths, Place, key_of_name
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.resolved.request import OWN_POINTS, Request
@@ -352,8 +351,7 @@ class _Planner:
     def _check_names(self, jobs: Sequence[Job]) -> None:
         taken: dict[str, Job] = {}
         for job in jobs:
-            # Some file systems ignore case, or different encodings of é.
-            key = unicodedata.normalize("NFC", job.name).casefold()
+            key = key_of_name(job.name)
             if key in (*RUN_FILES.values(), "mosaic.vrt", "mosaic.tif"):
                 raise InputError(
                     f"the run writes a file of the name {job.name!r}",

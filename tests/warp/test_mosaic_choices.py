@@ -349,7 +349,10 @@ def test_a_step_at_one_place_of_a_seam_is_told_beside_the_mean(tmp_path):
 
 @pytest.mark.parametrize("cell", [1, 4])
 def test_the_figures_along_a_straight_seam_are_by_their_definitions(tmp_path, monkeypatch, cell):
-    """The right scene is 30 brighter along a seam of 240 px, whatever the cells; content is off by what is said."""
+    """The right scene is 30 brighter along a seam of 240 px, whatever the size of a cell.
+
+    The displacements of its content at three places are given.
+    """
     monkeypatch.setattr(seams, "_shifts", lambda *_: np.array([[3.0, 4.0], [0.0, 1.0], [0.0, 0.0]]))
     left, right = GROUND[:240, :220], GROUND[:240, 180:400] + 30.0
     placed = lay_out([write(tmp_path, "left", left, 0, 0), write(tmp_path, "right", right, 180, 0)], "first-on-top")

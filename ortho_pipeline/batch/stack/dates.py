@@ -8,7 +8,6 @@ import glob
 import io
 import os
 import re
-import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.freshness import state_of
-from ortho_pipeline.batch.paths import PipelinePaths, Place
+from ortho_pipeline.batch.paths import PipelinePaths, Place, key_of_name
 from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
 from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has_surface
@@ -130,8 +129,7 @@ def dated_orthos(
         if _real(one.path) in skipped:
             continue
         name = one.path.stem
-        # Some file systems ignore case, or different encodings of é.
-        other = found.setdefault(unicodedata.normalize("NFC", name).casefold(), one)
+        other = found.setdefault(key_of_name(name), one)
         if _real(other.path) != _real(one.path):
             raise InputError(
                 f"two images are called {name}", file=one.path, field="orthos", remedy="rename one of them"

@@ -91,10 +91,9 @@ class _Left:
         size = np.einsum("ek,ekc->kc", shares, self.value)
         for _ in range(_CLIPPED):
             # A cloud that was matched at a few dates must not look like motion.
-            fitted = apart[:, :, None] * size
-            reach = _CLIP * np.sqrt(_noisier(self.value - fitted, self.weight) / np.maximum(self.weight, 1e-12))
-            clipped = np.clip(self.value - fitted, -reach[:, :, None], reach[:, :, None])
-            size = size + np.einsum("ek,ekc->kc", shares, clipped)
+            rest = self.value - apart[:, :, None] * size
+            reach = _CLIP * np.sqrt(_noisier(rest, self.weight) / np.maximum(self.weight, 1e-12))[:, :, None]
+            size = size + np.einsum("ek,ekc->kc", shares, np.clip(rest, -reach, reach))
         of_dates = np.zeros((len(self.scale), shares.shape[1]))
         np.add.at(of_dates, self.first, shares)
         np.add.at(of_dates, self.second, -shares)

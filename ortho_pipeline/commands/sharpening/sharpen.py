@@ -187,6 +187,11 @@ class OrthoPair:
         """The nearest whole ratio, at least 2."""
         return max(2, round(self.ratio))
 
+    @property
+    def small(self) -> int:
+        """Bytes for caches and matching: windows are read once and in order, so a small cache suffices."""
+        return self.output.memory // 2
+
     @cached_property
     def coarse(self) -> Grid:
         """The grid of whole original multispectral pixels within both orthos."""
@@ -205,7 +210,7 @@ class OrthoPair:
     def samples(self) -> list[Sample]:
         """Read windows of both orthos on the coarse grid."""
         memory = self.output.memory
-        limit_cache(memory // 2, 1, *(source.block for source in self.sources))
+        limit_cache(self.small, 1, *(source.block for source in self.sources))
         settings = {"resampling": "average", "memory": memory, **self.scene.access}
         pan, colours = (Regridded(path, self.coarse, **settings) for path in self.paths)
         return read_samples(pan, colours, self.bands, self.coarse, self.whole_ratio)
@@ -295,8 +300,7 @@ def _agreement(pair: OrthoPair, regression: Weights) -> tuple[Agreement | None, 
     alike = regression.explained >= _EXPLAINED
     share = max(regression.explained, 0.0)
     try:
-        less = replace(pair.output, memory=pair.output.memory // 2)
-        agreement = measure_agreement(*pair.paths, pair.scene, less)
+        agreement = measure_agreement(*pair.paths, pair.scene, replace(pair.output, memory=pair.small))
     except (InputError, TooFewPoints) as error:
         if not alike:
             raise InputError(
@@ -333,9 +337,8 @@ def _write(pair: OrthoPair, weights: Sequence[float], path: Path, stage: Progres
     """Write the ortho; return the number of its valid pixels."""
     output, (pan, colours) = pair.output, pair.sources
     profile = Profile.of(colours, output.dtype, output.nodata)
-    # Windows are read once and in order, so a small cache suffices.
-    threads = limit_cache(output.memory // 2, output.threads or os.cpu_count() or 1, pan.block, colours.block)
-    image = Pansharpened(pan, colours, pair.grids, weights, profile, threads=threads, memory=output.memory // 16)
+    threads = limit_cache(pair.small, output.threads or os.cpu_count() or 1, pan.block, colours.block)
+    image = Pansharpened(pan, colours, pair.grids, weights, profile, threads=threads, memory=pair.small // 8)
     grid, valid_pixels = image.overlap.grid, 0
     options: dict[str, Any] = {"driver": output.format, "creation_options": output.creation_options}
     with RasterWriter(path, grid, profile, threads=threads, progress=stage, **options) as writer:
