@@ -12,11 +12,12 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import Any, TypeVar
+from queue import SimpleQueue
+from typing import Any, TypeVar, cast
 
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text
@@ -34,6 +35,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 Job = TypeVar("Job")
 Outcome = TypeVar("Outcome")
+Item = TypeVar("Item")
 
 
 class WorkerDied(OrthoError):
@@ -68,30 +70,32 @@ class Processes:
         self._spawned: list[SpawnProcess] = []
         self._pool: ProcessPoolExecutor | None = None
 
-    def completed(self, work: Callable[[Job], Outcome], jobs: Iterable[Job]) -> Iterator[tuple[Job, Future[Outcome]]]:
-        """Yield jobs and their finished futures, in the order in which they end.
+    def completed(
+        self, work: Callable[[Job], Outcome], jobs: Iterable[Job], ended: Future[Any]
+    ) -> Generator[tuple[Job, Future[Outcome]]]:
+        """Yield jobs and their finished futures, in the order in which they end, until `ended` is set.
 
         A process that dies takes the pool with it. Whatever it was given is done again, one job at a time, so that only
         a job that kills its process every time ends with `WorkerDied`.
         """
         suspects: list[Job] = []
         try:
-            for job, future in self._on_new_pools(2 * self.workers, work, iter(jobs)):
+            for job, future in self._on_new_pools(2 * self.workers, work, iter(jobs), ended):
                 if isinstance(future.exception(), BrokenExecutor):
                     suspects.append(job)
                 else:
                     yield job, future
-            for job, future in self._on_new_pools(1, work, iter(suspects)):
+            for job, future in self._on_new_pools(1, work, iter(suspects), ended):
                 yield job, _died(future)
         finally:
             self.stop()
 
     def _on_new_pools(
-        self, ahead: int, work: Callable[[Job], Outcome], jobs: Iterator[Job]
+        self, ahead: int, work: Callable[[Job], Outcome], jobs: Iterator[Job], ended: Future[Any]
     ) -> Iterator[tuple[Job, Future[Outcome]]]:
         """Yield as `completed`, with a new pool for the rest after one has broken."""
         broken = True
-        while broken:
+        while broken and not ended.done():
             broken = False
             # A pool whose own threads fail to begin is waited for without end.
             require_memory()
@@ -102,7 +106,7 @@ class Processes:
                 initializer=start_worker,
                 initargs=(self.threads,),
             )
-            for job, future in _completed(self._pool, ahead, work, jobs):
+            for job, future in _completed(self._pool, ahead, work, jobs, ended):
                 broken = broken or isinstance(future.exception(), BrokenExecutor)
                 yield job, future
             # Nothing is under way any more; an interpreter takes its time to end by itself.
@@ -137,8 +141,10 @@ class InGroups:
     def __init__(self, executor: Executor, slots: int = 1) -> None:
         self._executor, self._slots = executor, max(1, slots)
 
-    def completed(self, work: Callable[[Job], Outcome], jobs: Iterable[Job]) -> Iterator[tuple[Job, Future[Outcome]]]:
-        """Yield jobs and their finished futures, group by group in the order in which they end.
+    def completed(
+        self, work: Callable[[Job], Outcome], jobs: Iterable[Job], ended: Future[Any]
+    ) -> Generator[tuple[Job, Future[Outcome]]]:
+        """Yield jobs and their finished futures, group by group in the order in which they end, until `ended` is set.
 
         Nobody knows how long a job takes before the second one of a worker has ended, for the first one loads what it
         needs; so few are handed over before. What a group did not begin within its time is handed over anew. The
@@ -160,7 +166,10 @@ class InGroups:
                 if not waiting:
                     return
                 seconds = []
-                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                wait([*waiting, ended], return_when=FIRST_COMPLETED)
+                if ended.done():
+                    return
+                for future in [future for future in waiting if future.done()]:
                     group, answers = waiting.pop(future), answers + 1
                     if future.exception() is None:
                         took, futures = future.result()
@@ -255,19 +264,60 @@ def completed(
 
     An executor of the caller that breaks takes the rest of the jobs with it.
     """
-    if isinstance(executor, Processes | InGroups):
-        yield from executor.completed(work, jobs)
-        return
-    ahead = 1 if isinstance(executor, Sequential) else _AHEAD
-    rest = iter(jobs)
-    for job, future in _completed(executor, ahead, work, rest):
+    ended: Future[Any] = Future()
+    if isinstance(executor, Sequential):
+        for job in jobs:
+            yield job, executor.submit(work, job)
+    elif isinstance(executor, Processes | InGroups):
+        yield from _apart(executor.completed(work, jobs, ended), ended)
+    else:
+        yield from _apart(_of_the_caller(executor, work, iter(jobs), ended), ended)
+
+
+def _apart(source: Generator[Item], ended: Future[Any]) -> Iterator[Item]:
+    """Yield what a generator yields that runs in a thread of its own until `ended` is set.
+
+    Signals interrupt the main thread alone. In the middle of a call to a pool, they would leave one of its locks taken.
+    The threads of the pool would wait for that lock without end.
+    """
+    asked, given = SimpleQueue[bool](), SimpleQueue[tuple[Item, None] | tuple[None, BaseException]]()
+
+    def advance() -> None:
+        with contextlib.closing(source):
+            while asked.get():
+                try:
+                    given.put((next(source), None))
+                except BaseException as error:
+                    given.put((None, error))
+
+    thread = threading.Thread(target=advance, name="pool", daemon=True)
+    thread.start()
+    try:
+        while True:
+            asked.put(True)
+            item, error = given.get()
+            if isinstance(error, StopIteration):
+                return
+            if error is not None:
+                raise error
+            yield cast(Item, item)
+    finally:
+        ended.set_result(None)
+        asked.put(False)
+        thread.join()
+
+
+def _of_the_caller(
+    executor: Executor, work: Callable[[Job], Outcome], jobs: Iterator[Job], ended: Future[Any]
+) -> Generator[tuple[Job, Future[Outcome]]]:
+    for job, future in _completed(executor, _AHEAD, work, jobs, ended):
         yield job, _died(future)
-    for job in rest:
+    for job in () if ended.done() else jobs:
         yield job, _died(_submitted(executor, work, job))
 
 
 def _completed(
-    executor: Executor, ahead: int, work: Callable[[Job], Outcome], jobs: Iterator[Job]
+    executor: Executor, ahead: int, work: Callable[[Job], Outcome], jobs: Iterator[Job], ended: Future[Any]
 ) -> Iterator[tuple[Job, Future[Outcome]]]:
     waiting: dict[Future[Outcome], Job] = {}
     try:
@@ -279,8 +329,10 @@ def _completed(
                     break
             if not waiting:
                 return
-            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
+            wait([*waiting, ended], return_when=FIRST_COMPLETED)
+            if ended.done():
+                return
+            for future in [future for future in waiting if future.done()]:
                 broken = broken or isinstance(future.exception(), BrokenExecutor)
                 yield waiting.pop(future), future
     finally:

@@ -25,7 +25,7 @@ from ortho_pipeline.batch import config as batch_config
 from ortho_pipeline.batch import freshness
 from ortho_pipeline.batch import plan as batch_plan
 from ortho_pipeline.batch import runner as batch
-from ortho_pipeline.batch.executors import Processes, WorkerDied, completed
+from ortho_pipeline.batch.executors import InGroups, Processes, WorkerDied, completed
 from ortho_pipeline.batch.records import RunRecord, locked
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.resolved.ledger import versions
@@ -710,6 +710,26 @@ def test_an_interrupted_run_goes_on_and_ends_with_the_same_bytes(block):
     subprocess.run(["rm", "-r", block.out], check=True)
     block.run()
     assert block.digests() == resumed
+
+
+@pytest.mark.parametrize("crew", [Processes(1, 1), InGroups(ThreadPoolExecutor(1)), ThreadPoolExecutor(1)])
+def test_the_thread_that_a_signal_interrupts_calls_no_pool(crew):
+    called = set()
+
+    def note(frame: Any, event: str, _: Any) -> None:
+        if event == "call" and "concurrent" in frame.f_code.co_filename:
+            called.add(frame.f_code.co_name)
+
+    sys.setprofile(note)
+    try:
+        assert len(list(completed(crew, abs, range(20)))) == 20
+        pairs = completed(crew, abs, range(1000))
+        next(pairs)
+        pairs.close()  # as an interrupt does
+    finally:
+        sys.setprofile(None)
+    assert "set_result" in called
+    assert not called & {"submit", "wait", "cancel", "shutdown"}
 
 
 def test_what_a_killed_process_left_is_removed(block):
