@@ -51,6 +51,8 @@ PARTS = {"plan": ("X_L", "Y_L"), "up": ("Z_L",), "tilt": ("omega", "phi"), "head
 #: Pairs are apart beyond this (px), and warned of above this sigma (px). A pair is beyond chance with this squared
 #: error in sigmas (0.1 %), and outside its 95 % ellipse with this. A flight is off by no more sigmas than `FAR`.
 APART, WEAK, CHANCE, ELLIPSE, FAR = 1.0, 0.5, 13.8, 5.99, 4.0
+#: Tangent of the largest angle off the axis that a photo shows; its corners are at 0.93.
+WIDEST = 1.5
 #: Pairs are judged with so many common points or more.
 COMMON = 8
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
@@ -130,9 +132,11 @@ def turn_of(place: Array, yaw: float, pitch: float, roll: float) -> Array:
 def seen(kind: Kind, position: Array, turn: Array, ground: Array) -> Array:
     """Return pixels of ground in ECEF; NaN outside the photo."""
     x, y, z = turn @ (ground - position).T
-    scale = FOCAL * (1.0 + kind.k1 * (x**2 + y**2) / z**2) / z
+    square = (x**2 + y**2) / z**2
+    scale = FOCAL * (1.0 + kind.k1 * square) / z
     image = np.stack([COLUMNS / 2 + kind.middle[0] + scale * x, ROWS / 2 + kind.middle[1] + scale * y], axis=1)
-    inside = (z > 0) & (image > 0).all(axis=1) & (image < (COLUMNS, ROWS)).all(axis=1)
+    # The polynomial of the distortion bends far rays back into the photo; no lens does.
+    inside = (z > 0) & (square < WIDEST**2) & (image > 0).all(axis=1) & (image < (COLUMNS, ROWS)).all(axis=1)
     image[~inside] = np.nan
     return image
 

@@ -45,6 +45,8 @@ COMPILED_FROM = 20_000
 #: The same if the compiler is already loaded.
 LOADED_FROM = 500
 _NUMBERS = tuple(f"{name}_{part}" for part in ("off", "scale") for name in ("col", "row", "lon", "lat", "h"))
+#: Pixels from coefficients as large as this may be too large for numbers.
+_OVERFLOWING = 1e100
 #: Points that NumPy processes at once: their arrays stay in the second-level cache.
 _PART = 1024
 #: Beyond this many scales from its centre an RPC is meaningless extrapolation, and has false roots.
@@ -105,8 +107,8 @@ class RPC(SensorModel):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (20,):
                 raise InputError(f"an RPC needs 20 coefficients, not {values.size}", field=name)
-            if not np.isfinite(values).all():
-                raise InputError("an RPC needs finite coefficients", field=name)
+            if not (np.abs(values) < _OVERFLOWING).all():
+                raise InputError("an RPC needs finite coefficients, of less than 1e100", field=name)
             if not values.any():
                 raise InputError("all coefficients are zero", field=name)
             values.setflags(write=False)

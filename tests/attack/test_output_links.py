@@ -56,6 +56,8 @@ def test_a_link_in_place_of_any_output_is_refused(sample, tmp_path, monkeypatch,
     if command in ("mosaic", "report"):
         for line in ORTHOS.values():
             assert called(line)[0] == 0
+    for band in ("red.tif", "nir.tif") if command == "register" else ():
+        shutil.copy(work / "scene.tif", work / band)
     line, out = COMMANDS[command], work / ("orbview3" if command == "init" else "out")
     before = set(out.iterdir()) if out.exists() else set()
     code, said = called(line)
