@@ -256,11 +256,14 @@ class _Planner:
         )
 
     def _points(self, settings: Settings, image: Place, where: str) -> PointOptions:
-        values: dict[str, Any] = dict(settings.points)
+        values, match = dict[str, Any](settings.points), dict[str, Any](settings.match)
         if values["gcps"] != OWN_POINTS:
             values["gcps"] = self._file(values["gcps"], image, f"{where}.points.gcps")
         if values["vertical"] is not None:
             values["vertical"] = self._perhaps_file(values["vertical"], image, f"{where}.points.vertical")
+        if values["gcps"] is None and not match["reference"]:
+            # Defaults of all scenes say how points are used; this scene has none.
+            return PointOptions(correction=values["correction"])
         return PointOptions(**values)
 
     def _surface(self, settings: Settings, image: Place, where: str, scene: SceneOptions) -> SurfaceOptions:

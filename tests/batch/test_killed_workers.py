@@ -125,12 +125,12 @@ def test_two_runs_on_one_bucket_make_every_scene_once(nursery: Nursery) -> None:
 
 @pytest.mark.slow
 def test_a_hundred_workers_are_killed(nursery: Nursery) -> None:
-    begin = time.monotonic()
-    victim, _ = nursery.fork("s3://kills/whole", (1, 2))
-    other, _ = nursery.fork("s3://kills/whole", (2, 2))
-    assert nursery.wait(victim) == nursery.wait(other) == 0
+    for address in ("s3://kills/first", "s3://kills/whole"):  # the first pair loads what the others find loaded
+        begin = time.monotonic()
+        pair = [nursery.fork(address, (number, 2))[0] for number in (1, 2)]
+        assert [nursery.wait(process) for process in pair] == [0, 0]
     whole = time.monotonic() - begin
     chance = random.Random(20)
-    at_work = sum(killed(nursery, f"s3://kills/{number}", chance.uniform(0.0, whole)) for number in range(100))
+    at_work = sum(killed(nursery, f"s3://kills/{number}", chance.uniform(0.0, 0.9 * whole)) for number in range(100))
     print(f"{at_work} of 100 were at work")
     assert at_work > 80

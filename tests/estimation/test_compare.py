@@ -528,7 +528,7 @@ def loss(sensor: str, seed: int, count: int) -> float:
     noise = float(np.sqrt(2) * points.sigma_image.mean())
     errors = {}
     for row in done.rows:
-        if row.fit and not row.fit.reservations:
+        if row.fit and "unstable" not in row.fit.reservations:
             model = row.fit.model
             miss = model.ground_to_image(ground_transform("EPSG:4979", model.crs)(ground)) - image
             errors[row.model] = float(np.hypot(np.sqrt((miss**2).sum(axis=1).mean()), noise))

@@ -115,10 +115,16 @@ def test_a_pipeline_file_takes_bands_of_the_reference(tmp_path: Path) -> None:
     assert settings.reference_bands == [4, 3, 2]
 
 
-def test_bands_of_a_reference_that_is_not_given_are_refused(case: Case, tmp_path: Path) -> None:
-    words = ["rectify", str(case.scene_file), "--height", "300", "-o", str(tmp_path / "o"), "--reference-bands", "1"]
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--reference-bands", "1"), ("--check", "every:3"), ("--points-crs", "EPSG:4326"), ("--near", "5")],
+)
+def test_options_of_a_reference_or_of_points_that_are_not_given_are_refused(
+    case: Case, tmp_path: Path, option: str, value: str
+) -> None:
+    words = ["rectify", str(case.scene_file), "--height", "300", "-o", str(tmp_path / "o"), option, value]
     done = CliRunner().invoke(cli, [*words, "--json"])
-    assert (done.exit_code, json.loads(done.stdout)["error"]["field"]) == (2, "--reference-bands")
+    assert (done.exit_code, json.loads(done.stdout)["error"]["field"]) == (2, option)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +66,8 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
                 field="points.gcps",
                 remedy=Text("give a file of points, or match an orthoimage (", Setting("match.reference"), ")"),
             )
+        if points.gcps is None:
+            _refuse_idle_points(points)
         return
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
     if chosen is not None and points.gcps is None:
@@ -96,6 +98,23 @@ def _refuse_idle(match: MatchOptions) -> None:
                 "this option is for matching, and no reference is given",
                 field=f"match.{name}",
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
+            )
+
+
+def _refuse_idle_points(points: PointOptions) -> None:
+    """Refuse options of points without points.
+
+    Raises
+    ------
+    InputError
+        With the option.
+    """
+    for one in fields(points):
+        if one.name not in ("gcps", "correction") and getattr(points, one.name) != one.default:
+            raise InputError(
+                "this option is for control points, and none are given",
+                field=f"points.{one.name}",
+                remedy=Text("leave it out, or give ", Setting("points.gcps")),
             )
 
 
