@@ -96,7 +96,7 @@ RESOLUTION ?= lowest-direct
 test-with: setup
 	@$(BIN)/pip install --quiet --require-hashes -c tools/constraints.txt uv
 	mkdir -p out
-	$(BIN)/uv pip compile --quiet --universal --generate-hashes --upgrade --resolution $(RESOLUTION) --extra dev \
+	$(BIN)/uv pip compile --quiet --universal --generate-hashes --upgrade --resolution $(RESOLUTION) --extra dev --extra wheel \
 	    --python-version "$$($(BIN)/python -c 'import sys; print("%d.%d" % sys.version_info[:2])')" \
 	    -o out/$(RESOLUTION).txt pyproject.toml tools/constraints.in
 	$(MAKE) test VENV=out/venv-$(RESOLUTION) CONSTRAINTS=out/$(RESOLUTION).txt
