@@ -90,7 +90,7 @@ def with_datum(
     on_ground = f" ({_span(ground)} m on the ground)" if len(ground) else ""
     of = f"{'Assumed accuracy' if assumed else 'Accuracy'} of the delivered models: sigma {_span(sigmas)} px in the "
     of += f"image{on_ground}, for {len(held)} of {problem.size} parameters"
-    of += "; other sigmas depend on it" if assumed else ""
+    of += "; the absolute accuracy depends on it" if assumed else ""
     if trusted.any():
         who = "the metadata state" if trusted.all() else f"the metadata of {counted(int(trusted.sum()), 'image')} state"
         of += f"; {who} {_span(stated_m[trusted])} m"

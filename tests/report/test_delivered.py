@@ -26,9 +26,9 @@ WRONG = ("delivered", "Vendors", "5 to 25 m")
 
 
 def rectify(tiny: Any, folder: Path, model: Path | None = None, **points: Any) -> results.Result:
+    stated = {"crs": "EPSG:4979", "vertical": "ellipsoid"} if points else {}
     return commands.rectify(
-        tiny.image, folder, scene=SceneOptions(model=model),
-        points=PointOptions(**{"crs": "EPSG:4979", "vertical": "ellipsoid", **points}),
+        tiny.image, folder, scene=SceneOptions(model=model), points=PointOptions(**stated, **points),
         surface=SurfaceOptions(dem=tiny.dem, vertical="ellipsoid"), output=OutputOptions(format="GTiff"),
     )  # fmt: skip
 
