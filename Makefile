@@ -110,7 +110,9 @@ check: lint
 	@$(PYTEST) -m "not slow"
 
 dist: setup
-	@rm -rf out/dist
+	@strays=$$(git ls-files --others --exclude-standard 2>/dev/null || true)
+	[ -z "$$strays" ] || { echo "Error: files that git does not know would be in the sdist: $$strays" >&2; exit 1; }
+	rm -rf out/dist
 	$(BIN)/python -m hatchling build --directory out/dist
 
 # The list is of an environment that has only the wheel and its requirements.

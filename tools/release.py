@@ -1,6 +1,6 @@
 """Check that the repository is ready for a tag, and print the notes of its release: the version's part of CHANGELOG.md.
 
-    python tools/release.py v0.8.0 > notes.md
+    python tools/release.py v0.8.0
 
 It stops if the package has another version, if CHANGELOG.md has no section of it, or if README.md has relative links,
 which PyPI cannot follow. Needs Python alone.
