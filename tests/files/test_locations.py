@@ -165,7 +165,7 @@ def test_nothing_is_fetched_unasked(tiny, served, tmp_path, option):
     ]
     if option != "image":
         words = [word for word in words if option != "--dem" or word not in ("--height", "500")]
-        words += [option, f"{url}/tiny.tif", *POINTS]
+        words += [option, f"{url}/tiny.tif", *(POINTS if option == "--gcps" else ())]
     done = run(*words)
     assert done.exit_code == 2, done.stderr
     assert "--allow-network" in done.stderr
