@@ -19,7 +19,7 @@ from ortho_pipeline.commands.control.ties import Tied, _points, names_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
-from ortho_pipeline.imaging.matching.search import refuse_accident
+from ortho_pipeline.imaging.matching.agreement import refuse_accident
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
 from ortho_pipeline.imaging.ties.pairs import PairSummary

@@ -58,8 +58,10 @@ def test_a_heading_that_is_wrong_by_40_degrees_is_found(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_headings_are_found_within_what_is_searched(tmp_path: Path, angle: float, within: float) -> None:
     found = tried(turned(tmp_path, angle), search=30.0, rotation_deg=within)
-    assert found.succeeded, found
-    # Of the matches: the correction that is fitted to them does not turn the displacement by relief. It shears chips.
+    assert not found.refused, found
+    # Of matches and parameters: the correction that is fitted to the matches does not turn the displacement by relief.
+    # With relief 0 it is off by 1 sigma at most. It shears chips.
+    assert np.abs(found.z).max() < 4, found
     assert found.rms < (0.05 if within < 10 else 0.15), found
 
 

@@ -1,12 +1,29 @@
-"""Affine corrections of a search: how to combine them, and which one the chips agree on."""
+"""Affine corrections of a search: how to combine them, which one the chips agree on, and whether by accident."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.imaging.matching.targets import Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array
+
+#: Radius (chip px) of the searches after the first.
+NEXT = 4
+#: Significance level of agreement over chance.
+_ACCIDENT = 1e-6
+
+#: A chip fits only one of two positions if its correlation there is at least the first number, and less than half of it
+#: at the other. If the second part of all chips do, and each position has the third part of them, at least the fourth
+#: number, the target is inconsistent: parts of it are displaced.
+_FITS, _DIVIDED, _PART, _FEWEST_PART = 0.15, 0.75, 0.1, 4
 
 
 def agreed(
@@ -64,3 +81,65 @@ def followed_by(correction: ImageCorrection, step: Array) -> ImageCorrection:
     slopes = (matrix - np.eye(2)).ravel()
     coefficients = np.array([shift[0], slopes[0], slopes[1], shift[1], slopes[2], slopes[3]])
     return ImageCorrection(correction.model, "affine", correction.origin, coefficients)
+
+
+def divided_between(
+    best: Mapping[tuple[float, ...], float], other: Mapping[tuple[float, ...], float], far: float
+) -> str:
+    """Return how two positions, `far` (m) apart, divide the chips, by the correlations of each chip at both.
+
+    Returns
+    -------
+    str
+        Empty if they do not, as on repetitive ground, where chips fit both.
+    """
+    centres = np.array([centre for centre in best if centre in other]).reshape(-1, 2)
+    both = np.array([(best[tuple(c)], other[tuple(c)]) for c in centres.tolist()]).reshape(-1, 2)
+    fits = (both.max(axis=1) > _FITS) & (both.min(axis=1) < both.max(axis=1) / 2)
+    second = fits & (both[:, 1] > both[:, 0])
+    first = fits & ~second
+    least = max(_FEWEST_PART, _PART * len(both))
+    if fits.sum() < _DIVIDED * len(both) or min(first.sum(), second.sum()) < least:
+        return ""
+    apart = centres[second].mean(axis=0) - centres[first].mean(axis=0)
+    axis = int(np.abs(apart).argmax())
+    side = (("left", "right"), ("upper", "lower"))[axis][int(apart[axis] > 0)]
+    return (
+        f"{counted(int(first.sum()), 'chip matches', 'chips match')} at one position; "
+        f"{counted(int(second.sum()), 'chip matches', 'chips match')} {far:.0f} m from there, "
+        f"mostly in the {side} part of the scene"
+    )
+
+
+def refuse_accident(
+    agreeing: int, chips: int, tolerance: float, places: float, targets: Sequence[Target], reach: float
+) -> None:
+    """Raise an error if as many chips could agree by chance.
+
+    Parameters
+    ----------
+    tolerance : float
+        Distance (chip px) within which chips agree, in searches with the radius `NEXT`.
+    places : float
+        Number of other corrections that could have been the result.
+
+    Raises
+    ------
+    InputError
+        If the probability is more than one in a million.
+    """
+    share = min(1.0, math.pi * tolerance**2 / (2 * NEXT + 1) ** 2)
+    if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:
+        raise InputError(
+            f"cannot match the scene with {targets[0].called}: only {agreeing} of {counted(chips, 'chip')} agree "
+            f"within {reach:.0f} px, which can be chance",
+            file=targets[0].path,
+            field=targets[0].field,
+            remedy=Text(
+                f"check that {targets[0].called} shows this place. If the model may be farther off, search farther (",
+                Setting("match.search"),
+                "); if it may be rotated, add ",
+                Setting("match.search_rotation", "5"),
+                ". Else measure points by hand",
+            ),
+        )

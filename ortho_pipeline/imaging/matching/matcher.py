@@ -14,7 +14,7 @@ from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.statistics import squared_distances
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.band_shifts import BandShift, spread
-from ortho_pipeline.imaging.matching.agreement import agreed
+from ortho_pipeline.imaging.matching.agreement import agreed, refuse_accident
 from ortho_pipeline.imaging.matching.candidates import at_spots, candidates, cells_of, spots_of
 from ortho_pipeline.imaging.matching.chip_search import (
     FEWEST,
@@ -28,7 +28,7 @@ from ortho_pipeline.imaging.matching.chip_search import (
 )
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
 from ortho_pipeline.imaging.matching.least_squares import measure
-from ortho_pipeline.imaging.matching.search import Level, place, refuse_accident
+from ortho_pipeline.imaging.matching.search import Level, place
 from ortho_pipeline.imaging.matching.sight import HEIGHTS, Chips, across, displacement, placed_along_sight
 from ortho_pipeline.imaging.matching.targets import (
     SAMPLES,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,9 +27,17 @@ from scipy import ndimage, stats
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.imaging.matching.agreement import affine_step, agreed, followed_by, shifted
+from ortho_pipeline.imaging.matching.agreement import (
+    NEXT,
+    affine_step,
+    agreed,
+    divided_between,
+    followed_by,
+    refuse_accident,
+    shifted,
+)
 from ortho_pipeline.imaging.matching.chips import Renderer, scene_chips
-from ortho_pipeline.imaging.matching.correlation import orientation, peaks, surfaces
+from ortho_pipeline.imaging.matching.correlation import Peaks, orientation, peaks, surfaces
 from ortho_pipeline.imaging.matching.targets import SceneView, Target, metres_per_pixel
 from ortho_pipeline.imaging.turns import Turn, margin, renderings, votes
 from ortho_pipeline.models import ImageCorrection, MapGrid
@@ -43,8 +51,6 @@ _SIDE, _LEAST_SIDE = 48, 24
 _FEWEST = 5
 #: Radii of the coarsest search (chip px).
 _COMFORTABLE, _LARGEST_RADIUS = 100, 160
-#: Radius (chip px) of the searches after the first.
-_NEXT = 4
 #: Blur (chip px) of the mean surface, because corrections are not the same everywhere.
 _SMEAR = 1.5
 #: Largest number of hypotheses, and their least part of the highest mean correlation.
@@ -53,17 +59,15 @@ _HYPOTHESES, _WORTH = 5, 0.4
 _APART = 6
 #: Largest number of steps to refine a rotated hypothesis, and the step (chip px) that ends them.
 _SETTLING, _STANDS = 4, 0.3
-#: Significance levels: of the best position over the second best, and of agreement over chance.
-_UNIQUE, _ACCIDENT = 1e-3, 1e-6
+#: Significance level of the best position over the second best.
+_UNIQUE = 1e-3
 #: Largest ratio of the second to the first mean correlation. In a repetitive pattern it is nearly 1, and sub-pixel
 #: positions decide which one is higher.
 _CLEARLY = 0.8
+#: The same of correlations at the best part of a pixel: below 0.4 on ground of all kinds, 0.78 to 0.97 in patterns.
+_REPEATED = 0.6
 #: Chips agree within this distance (chip px).
 _AGREE = 1.5
-#: A chip fits only one of two positions if its correlation there is at least the first number, and less than half of it
-#: at the other. If the second part of all chips do, and each position has the third part of them, at least the fourth
-#: number, the target is inconsistent: parts of it are displaced.
-_FITS, _DIVIDED, _PART, _FEWEST_PART = 0.15, 0.75, 0.1, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +122,7 @@ def place(
         return _refined(view, targets, reach, base, region, (factor, radius), alone)
     except InputError as error:
         # Under clouds, or in another season, few coarse chips may decide nothing; fine ones are more.
-        finest = base, max(_NEXT, math.ceil(reach / base) + 2)
+        finest = base, max(NEXT, math.ceil(reach / base) + 2)
         if factor > base and finest[1] <= _COMFORTABLE:
             with contextlib.suppress(InputError):
                 fine = _shifts_alone(view, targets, region, start, finest)
@@ -183,7 +187,7 @@ def _settled(
     # Small chips, because a fit of slopes needs many.
     side = min(_LEAST_SIDE, _chip_side(region, factor, 3))
     for _ in range(_SETTLING):
-        shown = _correlated(replace(view, model=correction), targets, region, side, factor, _NEXT)
+        shown = _correlated(replace(view, model=correction), targets, region, side, factor, NEXT)
         if len(shown.centres) < _FEWEST:
             break
         peak = peaks(shown.surface, 2)
@@ -231,9 +235,9 @@ def _refined(
     """
     factor, radius = level
     side = _chip_side(region, factor, 3)
-    compared = [_correlated(replace(view, model=model), targets, region, side, factor, _NEXT) for model in corrections]
+    compared = [_correlated(replace(view, model=model), targets, region, side, factor, NEXT) for model in corrections]
     best = _standing_out(compared, corrections, targets, reach, metres_per_pixel(view))
-    correction, shown = corrections[best], compared[best]
+    correction, shown = _unrepeated(view, targets, reach, region, level, corrections[best])
     levels: list[Level] = []
     while True:
         peak = peaks(shown.surface, 2)
@@ -244,11 +248,49 @@ def _refined(
         levels.append(Level(factor, radius, len(agreeing), int(agreeing.sum()), (float(mean[0]), float(mean[1]))))
         if factor <= base:
             return correction, levels
-        factor, radius = max(base, factor // 2), _NEXT
+        factor, radius = max(base, factor // 2), NEXT
         side = _chip_side(region, factor, 1)
         shown = _correlated(replace(view, model=correction), targets, region, side, factor, radius)
         if len(shown.centres) < 3:
             raise _no_overlap(targets, len(shown.centres))
+
+
+def _unrepeated(
+    view: SceneView,
+    targets: Sequence[Target],
+    reach: float,
+    region: Region,
+    level: tuple[int, int],
+    best: ImageCorrection,
+) -> tuple[ImageCorrection, _Shown]:
+    """Return the best position at its part of a pixel, if no other one around it is nearly as good.
+
+    A pattern repeats itself at more positions than there are hypotheses. Between whole pixels they fit less well, and
+    blurred surfaces do not show them.
+
+    Raises
+    ------
+    InputError
+        If another position fits nearly as well.
+    """
+    factor, radius = level
+    side = _chip_side(region, factor, 3)
+
+    def near(model: ImageCorrection, within: int) -> _Shown:
+        return _correlated(replace(view, model=model), targets, region, side, factor, within)
+
+    start = shifted(best, -near(best, NEXT).peak.shift[0] * factor)
+    shown = near(start, NEXT)
+    for shift in _highest(near(start, radius).mean, NEXT - 1):
+        # Half as far, so that the peak of the best position stays outside.
+        rival = shifted(start, -shift * factor)
+        peak = near(rival, NEXT // 2).peak
+        if peak.inside[0] and np.hypot(*shift) > NEXT // 2:
+            peak = near(shifted(rival, -peak.shift[0] * factor), NEXT // 2).peak
+            if peak.score[0] > _REPEATED * shown.peak.score[0]:
+                means = float(shown.peak.score[0]), float(peak.score[0])
+                raise _not_clear(len(shown.centres), means, start, targets, reach)
+    return start, shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,6 +303,16 @@ class _Shown:
     def smooth(self) -> NDArray[np.float32]:
         """Return the surfaces, blurred by the variation of the shift over a scene."""
         return np.asarray(ndimage.gaussian_filter(self.surface, (0, _SMEAR, _SMEAR), mode="nearest"))
+
+    @property
+    def mean(self) -> NDArray[np.float32]:
+        """The mean surface, ``(k, k)``."""
+        return np.asarray(self.surface.mean(axis=0))
+
+    @property
+    def peak(self) -> Peaks:
+        """The peak of the mean surface."""
+        return peaks(self.mean[None])
 
 
 def _extent(region: Region) -> tuple[int, int]:
@@ -283,7 +335,7 @@ def _coarsest(region: Region, reach: float, base: int) -> tuple[int, int]:
         if (across // _LEAST_SIDE) * (along // _LEAST_SIDE) < _FEWEST + 4 or factor >= reach:
             break
         factor = next_factor
-    radius = max(_NEXT, math.ceil(reach / factor) + 2)
+    radius = max(NEXT, math.ceil(reach / factor) + 2)
     if radius > _LARGEST_RADIUS:
         raise InputError(
             f"a search within {reach:.0f} px is too wide for an image of {larger} x {smaller} px",
@@ -322,7 +374,11 @@ def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
     """Return the shifts (chip px) of the highest peaks of the mean surface, the highest first."""
     if len(shown.centres) < _FEWEST:
         raise _no_overlap(targets, len(shown.centres))
-    mean = shown.smooth().mean(axis=0)
+    return _highest(shown.smooth().mean(axis=0), _APART)
+
+
+def _highest(mean: NDArray[np.float32], apart: int) -> list[Array]:
+    """Return the shifts (chip px) of the highest peaks of a surface ``(k, k)``, more than `apart` from each other."""
     radius = (mean.shape[0] - 1) // 2
     highest = float(mean.max())
     shifts: list[Array] = []
@@ -333,7 +389,7 @@ def _hypotheses(shown: _Shown, targets: Sequence[Target]) -> list[Array]:
         if shifts and not left[row, column] > _WORTH * highest:
             break
         shifts.append(np.array([column - radius, row - radius], dtype=float))
-        left[np.maximum(np.abs(rows - row), np.abs(columns - column)) <= _APART] = -2.0
+        left[np.maximum(np.abs(rows - row), np.abs(columns - column)) <= apart] = -2.0
     return shifts
 
 
@@ -389,7 +445,7 @@ def _standing_out(
         if chance < _UNIQUE and means[other] < _CLEARLY * means[best]:
             continue
         far = float(np.hypot(*(corrections[best].coefficients - corrections[other].coefficients)[[0, 3]])) * pixel
-        divided = _divided(values[best], values[other], far)
+        divided = divided_between(values[best], values[other], far)
         if divided:
             raise InputError(
                 f"{targets[0].called} is inconsistent: {divided}",
@@ -397,75 +453,20 @@ def _standing_out(
                 field=targets[0].field,
                 remedy="give another reference, or only the correct part of this one",
             )
-        raise InputError(
-            f"cannot match the scene with {targets[0].called}: no clear best position within {reach:.0f} px "
-            f"(mean correlation of {counted(len(common), 'chip')}: best {means[best]:.2f}, second best "
-            f"{means[other]:.2f})",
-            file=targets[0].path,
-            field=targets[0].field,
-            remedy=_remedy(corrections[best], targets[0]),
-        )
+        raise _not_clear(len(common), (means[best], means[other]), corrections[best], targets, reach)
     return best
 
 
-def _divided(best: Mapping[tuple[float, ...], float], other: Mapping[tuple[float, ...], float], far: float) -> str:
-    """Return how two positions, `far` (m) apart, divide the chips, by the correlations of each chip at both.
-
-    Returns
-    -------
-    str
-        Empty if they do not, as on repetitive ground, where chips fit both.
-    """
-    centres = np.array([centre for centre in best if centre in other]).reshape(-1, 2)
-    both = np.array([(best[tuple(c)], other[tuple(c)]) for c in centres.tolist()]).reshape(-1, 2)
-    fits = (both.max(axis=1) > _FITS) & (both.min(axis=1) < both.max(axis=1) / 2)
-    second = fits & (both[:, 1] > both[:, 0])
-    first = fits & ~second
-    least = max(_FEWEST_PART, _PART * len(both))
-    if fits.sum() < _DIVIDED * len(both) or min(first.sum(), second.sum()) < least:
-        return ""
-    apart = centres[second].mean(axis=0) - centres[first].mean(axis=0)
-    axis = int(np.abs(apart).argmax())
-    side = (("left", "right"), ("upper", "lower"))[axis][int(apart[axis] > 0)]
-    return (
-        f"{counted(int(first.sum()), 'chip matches', 'chips match')} at one position; "
-        f"{counted(int(second.sum()), 'chip matches', 'chips match')} {far:.0f} m from there, "
-        f"mostly in the {side} part of the scene"
+def _not_clear(
+    chips: int, means: tuple[float, float], correction: ImageCorrection, targets: Sequence[Target], reach: float
+) -> InputError:
+    return InputError(
+        f"cannot match the scene with {targets[0].called}: no clear best position within {reach:.0f} px "
+        f"(mean correlation of {counted(chips, 'chip')}: best {means[0]:.2f}, second best {means[1]:.2f})",
+        file=targets[0].path,
+        field=targets[0].field,
+        remedy=_remedy(correction, targets[0]),
     )
-
-
-def refuse_accident(
-    agreeing: int, chips: int, tolerance: float, places: float, targets: Sequence[Target], reach: float
-) -> None:
-    """Raise an error if as many chips could agree by chance.
-
-    Parameters
-    ----------
-    tolerance : float
-        Distance (chip px) within which chips agree, in searches with the radius `_NEXT`.
-    places : float
-        Number of other corrections that could have been the result.
-
-    Raises
-    ------
-    InputError
-        If the probability is more than one in a million.
-    """
-    share = min(1.0, math.pi * tolerance**2 / (2 * _NEXT + 1) ** 2)
-    if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:
-        raise InputError(
-            f"cannot match the scene with {targets[0].called}: only {agreeing} of {counted(chips, 'chip')} agree "
-            f"within {reach:.0f} px, which can be chance",
-            file=targets[0].path,
-            field=targets[0].field,
-            remedy=Text(
-                f"check that {targets[0].called} shows this place. If the model may be farther off, search farther (",
-                Setting("match.search"),
-                "); if it may be rotated, add ",
-                Setting("match.search_rotation", "5"),
-                ". Else measure points by hand",
-            ),
-        )
 
 
 def _no_overlap(targets: Sequence[Target], count: int) -> InputError:
