@@ -217,6 +217,12 @@ def test_what_cannot_be_matched_is_refused(what):
     assert all(row["refused"] for row in rows), told(rows)
 
 
+def test_a_pattern_of_which_one_position_is_at_whole_pixels_is_refused():
+    setting, search = trials.to_refuse("chessboard", 20)[11]
+    (row,) = run([setting], search=search)
+    assert "no clear best position" in row["refused"], told([row])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["place", "chessboard", "water", "beyond", "roofs"])
 def test_what_cannot_be_matched_is_refused_20_times_of_20(what):

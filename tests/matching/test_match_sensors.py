@@ -47,6 +47,6 @@ def test_scenes_without_rpc_are_matched(tmp_path: Path, sensor: str) -> None:
     assert list(ortho("info", scene / files[0])["models"]) == [name]
     found = ortho("fit", scene / files[0], "--reference", made["files"]["ortho"], *dem, *measured,
                   "--match-points", 100, "--correction", correction)  # fmt: skip
-    assert sum(point["used"] for point in found["points"]) > 60
+    assert sum(point["used"] for point in found["points"]) >= 40  # of 62 places with texture at least
     assert found["rmse"]["check"]["n"] >= 20
     assert found["rmse"]["check"]["total"] < within
