@@ -97,6 +97,12 @@ def test_numbers_of_no_scene_on_earth_are_refused_with_their_field(name, value):
     assert name in str(caught.value.field)
 
 
+def test_coefficients_whose_pixels_are_too_large_for_numbers_are_refused():
+    with pytest.raises(InputError, match="finite coefficients") as caught:
+        simple(col_num=np.eye(20)[1] + 1e308 * np.eye(20)[13])
+    assert caught.value.field == "col_num"
+
+
 def test_a_pole_at_heights_far_from_the_middle_takes_these_heights_away():
     # 1 + 1.4 H is zero at H = -0.71, that is 343 m.
     model = simple(row_den=np.eye(20)[0] + 1.4 * np.eye(20)[3])
