@@ -6,7 +6,8 @@ are hypotheses. For each the target is rendered again and compared, because reli
 right model. The best hypothesis is accepted if
 
 - it is *unique*: its mean correlation is clearly higher than that of any other (`_CLEARLY`), also by a paired t-test
-  over the chips; stripes, chessboards and rows of equal roofs fail this test;
+  over the chips, and also where each position is at its best part of a pixel (`_REPEATED`); stripes, chessboards and
+  rows of equal roofs fail this test;
 - its chips *agree* on a smooth correction, at each finer level better than by chance (binomial test);
 - it is *no accident*: the probability that as many chips of the last search (the matcher's) agree by chance, at any
   searched position, is less than one in a million.
@@ -64,7 +65,8 @@ _UNIQUE = 1e-3
 #: Largest ratio of the second to the first mean correlation. In a repetitive pattern it is nearly 1, and sub-pixel
 #: positions decide which one is higher.
 _CLEARLY = 0.8
-#: The same of correlations at the best part of a pixel: below 0.4 on ground of all kinds, 0.78 to 0.97 in patterns.
+#: The same of correlations at the best parts of a pixel: 0.78 to 0.97 in patterns, and less than this in 94 scenes of
+#: other ground.
 _REPEATED = 0.6
 #: Chips agree within this distance (chip px).
 _AGREE = 1.5
@@ -306,8 +308,8 @@ class _Shown:
 
     @property
     def mean(self) -> NDArray[np.float32]:
-        """The mean surface, ``(k, k)``."""
-        return np.asarray(self.surface.mean(axis=0))
+        """The mean surface, ``(k, k)``; zeros without chips."""
+        return np.asarray(self.surface.mean(axis=0) if len(self.surface) else np.zeros(self.surface.shape[1:], "f4"))
 
     @property
     def peak(self) -> Peaks:
