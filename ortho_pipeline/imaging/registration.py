@@ -259,7 +259,7 @@ def _fit_robust(kind: str, reference: Array, moving: Array, name: str) -> tuple[
     for _ in range(10):
         if 2 * used.sum() < TRANSFORMS[kind] + 4 or used.sum() < 0.3 * len(used):
             raise TooFewPoints(
-                f"only {int(used.sum())} of {len(used)} tie points of the band {name} agree, too few for a "
+                f"of {counted(len(used), 'tie point')} of the band {name}, only {int(used.sum())} agree, too few for a "
                 "transformation",
                 field=name,
                 remedy="check that the bands are of one scene, or use larger patches",

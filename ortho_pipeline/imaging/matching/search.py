@@ -239,7 +239,8 @@ def _refined(
     side = _chip_side(region, factor, 3)
     compared = [_correlated(replace(view, model=model), targets, region, side, factor, NEXT) for model in corrections]
     best = _standing_out(compared, corrections, targets, reach, metres_per_pixel(view))
-    correction, shown = _unrepeated(view, targets, reach, region, level, corrections[best])
+    correction, shown = corrections[best], compared[best]
+    _refuse_repeated(view, targets, reach, region, level, shifted(correction, -shown.peak.shift[0] * factor))
     levels: list[Level] = []
     while True:
         peak = peaks(shown.surface, 2)
@@ -257,15 +258,15 @@ def _refined(
             raise _no_overlap(targets, len(shown.centres))
 
 
-def _unrepeated(
+def _refuse_repeated(
     view: SceneView,
     targets: Sequence[Target],
     reach: float,
     region: Region,
     level: tuple[int, int],
     best: ImageCorrection,
-) -> tuple[ImageCorrection, _Shown]:
-    """Return the best position at its part of a pixel, if no other one around it is nearly as good.
+) -> None:
+    """Refuse a position, at its best part of a pixel, if another one around it is nearly as good.
 
     A pattern repeats itself at more positions than there are hypotheses. Between whole pixels they fit less well, and
     blurred surfaces do not show them.
@@ -281,18 +282,16 @@ def _unrepeated(
     def near(model: ImageCorrection, within: int) -> _Shown:
         return _correlated(replace(view, model=model), targets, region, side, factor, within)
 
-    start = shifted(best, -near(best, NEXT).peak.shift[0] * factor)
-    shown = near(start, NEXT)
-    for shift in _highest(near(start, radius).mean, NEXT - 1):
+    around = near(best, radius)
+    highest = float(around.mean.max())
+    for shift in _highest(around.mean, NEXT - 1):
         # Half as far, so that the peak of the best position stays outside.
-        rival = shifted(start, -shift * factor)
+        rival = shifted(best, -shift * factor)
         peak = near(rival, NEXT // 2).peak
         if peak.inside[0] and np.hypot(*shift) > NEXT // 2:
             peak = near(shifted(rival, -peak.shift[0] * factor), NEXT // 2).peak
-            if peak.score[0] > _REPEATED * shown.peak.score[0]:
-                means = float(shown.peak.score[0]), float(peak.score[0])
-                raise _not_clear(len(shown.centres), means, start, targets, reach)
-    return start, shown
+            if peak.score[0] > _REPEATED * highest:
+                raise _not_clear(len(around.centres), (highest, float(peak.score[0])), best, targets, reach)
 
 
 @dataclass(frozen=True, eq=False)
