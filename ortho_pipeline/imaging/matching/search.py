@@ -285,10 +285,12 @@ def _refuse_repeated(
     around = near(best, radius)
     highest = float(around.mean.max())
     for shift in _highest(around.mean, NEXT - 1):
+        if np.hypot(*shift) <= NEXT // 2:
+            continue
         # Half as far, so that the peak of the best position stays outside.
         rival = shifted(best, -shift * factor)
         peak = near(rival, NEXT // 2).peak
-        if peak.inside[0] and np.hypot(*shift) > NEXT // 2:
+        if peak.inside[0]:
             peak = near(shifted(rival, -peak.shift[0] * factor), NEXT // 2).peak
             if peak.score[0] > _REPEATED * highest:
                 raise _not_clear(len(around.centres), (highest, float(peak.score[0])), best, targets, reach)
