@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -25,6 +26,9 @@ from ortho_pipeline.points.rows import OWN_IMAGE
 from ortho_pipeline.points.selection import select_control
 from ortho_pipeline.raster import source as raster
 from ortho_pipeline.surface.base import Surface
+
+#: Options that have no effect without a reference.
+_OF_MATCHING = ("reference_bands", "search", "search_rotation", "points", "reference_sigma", "gcps_as")
 
 
 def control_of(resolved: Resolved) -> tuple[Points, Matched | None]:
@@ -59,7 +63,7 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
         With the option.
     """
     if not match.reference:
-        _refuse_idle(match)
+        _refuse_idle(match, _OF_MATCHING, "this option is for matching, and no reference is given", "match.reference")
         if points.gcps is None and points.correction not in (None, "none"):
             raise InputError(
                 f"the correction {points.correction!r} needs control points",
@@ -67,7 +71,8 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
                 remedy=Text("give a file of points, or match an orthoimage (", Setting("match.reference"), ")"),
             )
         if points.gcps is None:
-            _refuse_idle_points(points)
+            names = [one.name for one in fields(points) if one.name not in ("gcps", "correction")]
+            _refuse_idle(points, names, "this option is for control points, and none are given", "points.gcps")
         return
     chosen = next((name for name in ("select", "check") if getattr(points, name) is not None), None)
     if chosen is not None and points.gcps is None:
@@ -84,38 +89,18 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
         )
 
 
-def _refuse_idle(match: MatchOptions) -> None:
-    """Refuse options of matching without a reference.
+def _refuse_idle(options: PointOptions | MatchOptions, names: Iterable[str], why: str, needed: str) -> None:
+    """Refuse options that have no effect without another one, `needed`.
 
     Raises
     ------
     InputError
         With the option.
     """
-    for name in ("reference_bands", "search", "search_rotation", "points", "reference_sigma", "gcps_as"):
-        if getattr(match, name) != getattr(MatchOptions, name):
-            raise InputError(
-                "this option is for matching, and no reference is given",
-                field=f"match.{name}",
-                remedy=Text("leave it out, or give ", Setting("match.reference")),
-            )
-
-
-def _refuse_idle_points(points: PointOptions) -> None:
-    """Refuse options of points without points.
-
-    Raises
-    ------
-    InputError
-        With the option.
-    """
-    for one in fields(points):
-        if one.name not in ("gcps", "correction") and getattr(points, one.name) != one.default:
-            raise InputError(
-                "this option is for control points, and none are given",
-                field=f"points.{one.name}",
-                remedy=Text("leave it out, or give ", Setting("points.gcps")),
-            )
+    group = needed.partition(".")[0]
+    for name in names:
+        if getattr(options, name) != getattr(type(options), name):
+            raise InputError(why, field=f"{group}.{name}", remedy=Text("leave it out, or give ", Setting(needed)))
 
 
 def _joined(surveyed: Points, matches: Points) -> Points:
