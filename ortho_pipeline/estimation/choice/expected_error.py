@@ -38,7 +38,7 @@ from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.models.base import Array
 
 #: Criteria that are larger than the smallest one by this contradict the model.
-_CONTRADICTED = 10.0
+CONTRADICTED = 10.0
 #: The stated noise counts as this many observations: a stated sigma is rarely accurate to better than 50 %.
 _STATED = 8
 #: Grid positions in the scene, in each direction and in height.
@@ -76,6 +76,31 @@ class Expectation:
         return max(mean_square / (self.stated + self.tested), least) * (self.stated + self.scene) + self.unseen
 
 
+def criterion(squares: float, observations: float, parameters: float) -> float:
+    """Return Akaike's criterion, corrected for few observations; infinite if there are too few for the parameters.
+
+    Parameters
+    ----------
+    squares : float
+        Sum of squares of the whitened residuals.
+    observations : float
+        Their number (one for each coordinate), without the stated noise, which is added here.
+    parameters : float
+        Estimated parameters, without the noise.
+
+    Examples
+    --------
+    >>> criterion(5.0, 15, 3) < criterion(1.0, 15, 7) < criterion(0.05, 15, 11)
+    True
+    """
+    observations, parameters = observations + _STATED, parameters + 1
+    left = observations - parameters - 1
+    if left <= 0:
+        return math.inf
+    penalty = 2 * parameters * (1 + (parameters + 1) / left)
+    return observations * math.log((squares + _STATED) / observations) + penalty
+
+
 def expectation(fit: Fit, tests: NDArray[np.bool_], size: tuple[int, int] | None) -> Expectation:
     """Return the statistics of a fit that the points of the mask `tests` ``(N,)`` test, in an image of this size."""
     points, model = fit.points, fit.model
@@ -105,22 +130,18 @@ def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[s
     names = [
         name
         for name, statistics in expected.items()
-        if statistics.criterion <= lowest + _CONTRADICTED or statistics.noise <= worth**2 * expected[best].noise
+        if statistics.criterion <= lowest + CONTRADICTED or statistics.noise <= worth**2 * expected[best].noise
     ]
     return names, min(1.0, expected[best].noise)
 
 
 def _criterion(fit: Fit) -> float:
     freedom, count = fit.degrees_of_freedom, int(fit.used.sum())
-    parameters = fit.effective_parameters + 1
-    # Points that share errors are fewer observations than their number.
-    observations = 2 * fit.effective_points + _STATED
-    left = observations - parameters - 1
-    if fit.sigma0 is None or not count or left <= 0:
+    if fit.sigma0 is None or not count:
         return math.inf
+    # Points that share errors are fewer observations than their number.
     squares = fit.sigma0**2 * freedom * fit.effective_points / count
-    penalty = 2 * parameters * (1 + (parameters + 1) / left)
-    return observations * math.log((squares + _STATED) / observations) + penalty
+    return criterion(squares, 2 * fit.effective_points, fit.effective_parameters)
 
 
 def _noise(fit: Fit) -> float:

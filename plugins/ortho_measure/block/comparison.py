@@ -1,11 +1,14 @@
 """Compare corrections of a block: adjust each to the same points, test it at left-out points, and recommend one.
 
-The method is like that of `ortho compare` for one scene (`estimation.choice.comparison`): gross errors are left out for
-all corrections. Among corrections within 5 % of the smallest error, the one with the fewest parameters is recommended.
+The method is like that of `ortho compare` for one scene (`estimation.choice`): gross errors are left out for all
+corrections, and a correction that Akaike's criterion contradicts is not recommended. If points with known ground test
+the corrections, one within 5 % of the smallest error is recommended, that with the fewest parameters. Ties alone hardly
+show errors of many parameters: a left-out ray is predicted by its neighbours. Then the criterion alone decides.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +22,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.estimation.choice.expected_error import CONTRADICTED, criterion
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
 
@@ -42,6 +46,13 @@ class _Tried:
         if fit is None or without is None:
             return np.zeros(0)
         return np.asarray(np.linalg.norm(without.ground[fit.points.roles == role], axis=1))
+
+    def criterion(self, observations: int) -> float:
+        """Return Akaike's criterion for the number of observations that are left without any correction."""
+        fit = self.solution.fit
+        if fit is None or fit.sigma0 is None:
+            return math.inf
+        return criterion(fit.sigma0**2 * fit.redundancy, observations, observations - fit.redundancy)
 
     @property
     def rays(self) -> Array:
@@ -104,32 +115,34 @@ def compare_corrections(
 
 def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     """Return the recommended correction, and the reason."""
-    of_ground = {
-        candidate.name: np.concatenate([candidate.errors("check"), candidate.errors("control")]) for candidate in tried
-    }
-    of_rays = {candidate.name: candidate.rays for candidate in tried}
+    observations = max((one.solution.fit.redundancy for one in tried if one.solution.fit is not None), default=0)
+    criteria = {one.name: one.criterion(observations) for one in tried}
+    sound = {name for name, value in criteria.items() if value <= min(criteria.values()) + CONTRADICTED}
+    of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
+    of_rays = {one.name: one.rays for one in tried}
     for errors, what, unit in (
         (of_ground, "points (their ground coordinates left out)", "m"),
         (of_rays, "rays (leave-one-out)", "px"),
     ):
-        tested = {name: values for name, values in errors.items() if np.isfinite(values).any()}
+        tested = {name: values for name, values in errors.items() if name in sound and np.isfinite(values).any()}
         if not tested:
             continue
         common = np.all([np.isfinite(values) for values in tested.values()], axis=0)
         if common.sum() < _FEWEST:
             continue
         sizes = {name: _rms(values[common]) or 0.0 for name, values in tested.items()}
-        smallest = min(sizes.values())
-        able = [
-            candidate for candidate in tried if candidate.name in sizes and sizes[candidate.name] <= _WORTH * smallest
-        ]
-        chosen = min(able, key=lambda candidate: (candidate.parameters, sizes[candidate.name]))
+        able = [one for one in tried if one.name in sizes]
+        if errors is of_rays:
+            chosen = min(able, key=lambda one: (criteria[one.name], one.parameters))
+        else:
+            close = [one for one in able if sizes[one.name] <= _WORTH * min(sizes.values())]
+            chosen = min(close, key=lambda one: (one.parameters, sizes[one.name]))
         text = (
             f"RMSE {sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
         )
-        least = min(sizes, key=lambda name: sizes[name])
-        if least != chosen.name:
-            text += f". {least} has RMSE {smallest:.3g} {unit}, at most 5 % less, but more parameters"
+        least = min(able, key=lambda one: sizes[one.name])
+        if least.parameters > chosen.parameters:
+            text += f". {least.name} has RMSE {sizes[least.name]:.3g} {unit}, but these points do not justify its parameters"
         return chosen.name, text
     return None, "fewer than three points test all corrections, too few for a recommendation"
 
