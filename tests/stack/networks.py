@@ -31,6 +31,8 @@ class Truth:
         Sigma (px) of a single match.
     of_date, of_edge : float
         Sigma (px) of smooth errors that all edges of a date share, and of an edge.
+    of_season : float
+        Sigma (px) of smooth errors that all dates of a quarter of the year share.
     length : float
         Of smooth errors, in parts of the area.
     sharp : bool
@@ -55,6 +57,7 @@ class Truth:
     noise: float = 0.15
     of_date: float = 0.05
     of_edge: float = 0.05
+    of_season: float = 0.0
     length: float = 0.12
     sharp: bool = False
     moving: float = 0.0
@@ -83,6 +86,9 @@ class Truth:
         pairs = np.array(pairs_of(days.tolist()))
         smooth = [self._field(random) * self.of_date for _ in range(self.dates)]
         own = random.normal(0.0, self.noise / 2, (self.dates, count, 2))
+        if self.of_season:
+            looks = [self._field(random) * self.of_season for _ in range(4)]
+            smooth = [one + looks[int(day / 365.25 % 1.0 * 4)] for one, day in zip(smooth, days, strict=True)]
         value = np.empty((len(pairs), count, 2))
         for number, (one, other) in enumerate(pairs):
             value[number] = shift[one] - shift[other] + place @ (slopes[one] - slopes[other])

@@ -214,6 +214,17 @@ def test_what_loops_do_not_show_of_the_stated_error_is_an_error_of_seasons():
         assert np.sqrt(np.median(more)) == pytest.approx(expected, abs=0.012)
 
 
+@pytest.mark.parametrize("of_season", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_sigmas_have_what_dates_of_one_season_share(of_season):
+    """Fields of four seasons close all loops. What they move all places by is seen from what places have of them.
+
+    Four seeds have 24 free means of seasons, so a spread of 1 is seen within 0.15 of it (one sigma).
+    """
+    seeds = range(200, 204 if of_season else 202)
+    stacks = [solved(seed=seed, dates=80, interval=12.0, of_season=of_season, length=0.05) for seed in seeds]
+    assert 0.8 < spread(stacks) < 1.3
+
+
 def _with_stated_error(dates: int, size: float) -> tuple[AdjustedStack, AdjustedStack]:
     """Return the adjustments of edges without a stated error that all values share, and with one."""
     made = Truth(seed=3, dates=dates).made()

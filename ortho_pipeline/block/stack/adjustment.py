@@ -11,8 +11,9 @@ from scipy.stats import chi2
 
 from ortho_pipeline.block.stack.components import ErrorComponents, components_of
 from ortho_pipeline.block.stack.edges import Cells, Edges
-from ortho_pipeline.block.stack.moving import Motion, motion_of
+from ortho_pipeline.block.stack.moving import Left, Motion, left_of, motion_of
 from ortho_pipeline.block.stack.network import Closures, Network, accepted_edges, solve
+from ortho_pipeline.block.stack.seasons import yearly_variances
 from ortho_pipeline.block.stack.steps import DateStep, steps_of
 from ortho_pipeline.block.stack.trends import Trends, design_of, trends_of
 from ortho_pipeline.models.base import Array
@@ -92,14 +93,14 @@ def adjust(
     stable = np.ones(len(place), dtype=bool)
     for _ in range(_ROUNDS):
         solved = _Solved.of(edges, one, place, stable, none)
-        motion = solved.motion(times, steady=True)
+        motion = motion_of(solved.left(times), times, steady=True)
         if (~motion.moving == stable).all():
             break
         stable = ~motion.moving
     sloped = _sloped(edges, three, place, stable, dates) if affine else none
     for _ in range(_ROUNDS):
         solved = _Solved.of(edges, three if sloped.any() else one, place, stable, sloped)
-        motion = solved.motion(times)
+        motion = motion_of(solved.left(times), times)
         if (~motion.moving == stable).all():
             break
         stable = ~motion.moving
@@ -126,12 +127,12 @@ class _Solved:
         network = solve(edges, trends, components, place, closures.accepted, sloped)
         return cls(edges, trends, components, closures, network)
 
-    def motion(self, years: Array, *, steady: bool = False) -> Motion:
-        """Return which places move."""
+    def left(self, years: Array) -> Left:
+        """Return what the network leaves of accepted edges."""
         terms = self.trends.design.shape[1]
         apart = self.network.value[self.edges.first] - self.network.value[self.edges.second]
         predicted = np.einsum("km,emc->ekc", self.trends.design, apart[:, :terms])
-        return motion_of(self.edges, predicted, self.components, self.closures.accepted, years, steady=steady)
+        return left_of(self.edges, predicted, self.components, self.closures.accepted, years)
 
 
 def _sloped(edges: Edges, design: Array, place: Array, stable: NDArray[np.bool_], dates: int) -> NDArray[np.bool_]:
@@ -155,7 +156,9 @@ def _referred(
     cells: Cells, solved: _Solved, motion: Motion, years: Array, datum: int | None, sloped: NDArray[np.bool_]
 ) -> AdjustedStack:
     """Return a stack with its datum."""
-    found, known = solved.network.with_seasons(solved.components.of_seasons, years), np.isfinite(years)
+    yearly = yearly_variances(solved.left(years), solved.trends, solved.components, cells.place, years)
+    found = solved.network.with_seasons(solved.components.of_seasons, yearly, years)
+    known = np.isfinite(years)
     part = found.part
     if datum is None:
         number = int(np.bincount(part).argmax())

@@ -29,7 +29,7 @@ from ortho_pipeline.models.base import Array
 #: the classes of distances.
 _RANGES = 0.2, 0.5, 1.25
 _TERMS = 1 + 2 * len(_RANGES)
-_CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
+CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
 #: Edges and pairs of edges whose products are taken, at most.
 _EDGES, _PAIRS = 120, 180
 #: Limits of the scale of an edge, relative to the mean of its dates.
@@ -79,7 +79,7 @@ class ErrorComponents:
     def covariance(self, axis: int, edges: Edges, trends: Trends, place: Array) -> tuple[sparse.csr_matrix, Array]:
         """Return the covariance of all trends ``(E m, E m)`` along an axis, and the part of each edge ``(E, m, m)``."""
         count, _, terms = trends.weights.shape
-        correlations = _correlations(place)
+        correlations = correlations_of(place)
         root = np.sqrt(edges.relative)
         noisy = trends.weights * root[:, :, None]
         own = self._of_edges(axis, correlations, trends.weights, noisy)
@@ -110,10 +110,15 @@ class ErrorComponents:
         return np.asarray(self.factor[:, None, None] * found)
 
 
-def _correlations(place: Array) -> Array:
+def correlations_of(place: Array) -> Array:
     """Return the correlations ``(2 ranges, K, K)`` of places: exponential, and Gaussian."""
     distance = spatial.distance.cdist(place, place) / np.array(_RANGES)[:, None, None]
     return np.concatenate([np.exp(-distance), np.exp(-(distance**2))])
+
+
+def classes_of(place: Array) -> NDArray[np.int_]:
+    """Return the class ``(K, K)`` of the distance of two places."""
+    return np.searchsorted(CLASSES, spatial.distance.cdist(place, place))
 
 
 def season_correlation(years: Array) -> Array:
@@ -175,9 +180,8 @@ class _Shapes:
 
     def __init__(self, edges: Edges, trends: Trends, place: Array, left: Array) -> None:
         self.edges, self.trends, self.left = edges, trends, left
-        self.correlations = _correlations(place)
-        distance = spatial.distance.cdist(place, place)
-        self.classes = np.searchsorted(_CLASSES, distance)
+        self.correlations = correlations_of(place)
+        self.classes = classes_of(place)
         good = np.flatnonzero(trends.good)
         self.single = _spread([(edge, edge, 1.0) for edge in good.tolist()], _EDGES)
         self.pairs = _spread(_with_common_date(edges, good), _PAIRS)
@@ -200,7 +204,7 @@ class _Shapes:
 
     def _sums(self, pairs: list[tuple[int, int, float]]) -> tuple[Array, Array, Array]:
         """Return expected sums ``(classes, 7)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
-        classes, terms = len(_CLASSES) + 1, _TERMS
+        classes, terms = len(CLASSES) + 1, _TERMS
         expected, seen, number = np.zeros((classes, terms)), np.zeros((classes, 2)), np.zeros(classes)
         design, relative = self.trends.design, np.sqrt(self.edges.relative)
         for one, other, sign in pairs:

@@ -28,7 +28,7 @@ LEAST = 0.1
 _FEWEST, _STEPS = 4, 10
 #: Squared sigmas within which places share a rate.
 _ALIKE = 9.2
-_WAVE = 1.5
+WAVE = 1.5
 #: A step has so many dates on each side. What is left is clipped at so many sigmas, so many times.
 _BESIDE, _CLIP, _CLIPPED = 4, 2.5, 4
 
@@ -71,7 +71,7 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class _Left:
+class Left:
     """What the network leaves of edges, with the variances of it."""
 
     value: Array  # (E, K, 2), 0 where nothing is
@@ -83,31 +83,38 @@ class _Left:
     first: NDArray[np.int_]
     second: NDArray[np.int_]
 
+    @property
+    def tested(self) -> NDArray[np.bool_]:
+        """Which places ``(K,)`` enough edges see."""
+        return np.asarray((self.weight > 0).sum(axis=0) >= _FEWEST)
+
     def change(self, form: Array) -> tuple[Array, Array, Array]:
         """Return how much of a form ``(T,)`` each place has ``(K, 2)``, its variance ``(K,)`` and what is left."""
         apart = (form[self.first] - form[self.second])[:, None]
-        squares = np.maximum((self.weight * apart**2).sum(axis=0), 1e-300)
-        shares = self.weight * apart / squares
+        shares, of_dates = self.shares(form)
         size = np.einsum("ek,ekc->kc", shares, self.value)
         for _ in range(_CLIPPED):
             # A cloud that was matched at a few dates must not look like motion.
             rest = self.value - apart[:, :, None] * size
             reach = _CLIP * np.sqrt(_noisier(rest, self.weight) / np.maximum(self.weight, 1e-12))[:, :, None]
             size = size + np.einsum("ek,ekc->kc", shares, np.clip(rest, -reach, reach))
-        of_dates = np.zeros((len(self.scale), shares.shape[1]))
-        np.add.at(of_dates, self.first, shares)
-        np.add.at(of_dates, self.second, -shares)
         scaled = np.sqrt(self.scale)[:, None] * of_dates
         of_shared = np.maximum((scaled**2).sum(axis=0), (scaled * (self.alike @ scaled)).sum(axis=0))
         variance = self.shared * of_shared + (shares**2 * self.own).sum(axis=0)
         return size, variance, self.value - (apart[:, :, None] * size)
 
+    def shares(self, form: Array) -> tuple[Array, Array]:
+        """Return what the errors of edges ``(E, K)`` and of dates ``(T, K)`` have in how much of a form places have."""
+        apart = (form[self.first] - form[self.second])[:, None]
+        shares = self.weight * apart / np.maximum((self.weight * apart**2).sum(axis=0), 1e-300)
+        of_dates = np.zeros((len(self.scale), shares.shape[1]))
+        np.add.at(of_dates, self.first, shares)
+        np.add.at(of_dates, self.second, -shares)
+        return shares, of_dates
+
 
 def motion_of(
-    edges: Edges,
-    network: Array,
-    components: ErrorComponents,
-    accepted: NDArray[np.bool_],
+    left: Left,
     years: Array,
     *,
     steady: bool = False,
@@ -116,17 +123,12 @@ def motion_of(
 
     Parameters
     ----------
-    network : (E, K, 2)
-        What the corrections of dates predict of the values.
     years : (T,)
         Of the dates; NaN of a date without a time, such as a reference.
     steady : bool
         Try steady motion only.
     """
-    timed = accepted & np.isfinite(years[edges.first] - years[edges.second])
-    left = _left(edges, network, components, timed, years)
-    time = np.where(np.isfinite(years), years, 0.0)
-    tested = (left.weight > 0).sum(axis=0) >= _FEWEST
+    time, tested = np.where(np.isfinite(years), years, 0.0), left.tested
     span = float(np.ptp(years[np.isfinite(years)]))
     rate, variance, rest = left.change(time)
     noisier = _noisier(rest, left.weight)
@@ -154,16 +156,18 @@ def motion_of(
     return Motion(moving, tested, rate, sigma, ratio, form)
 
 
-def _left(
+def left_of(
     edges: Edges, network: Array, components: ErrorComponents, accepted: NDArray[np.bool_], years: Array
-) -> _Left:
-    seen = edges.measured & accepted[:, None]
+) -> Left:
+    """Return what the network leaves of accepted edges; it predicts their values by `network` ``(E, K, 2)``."""
+    timed = accepted & np.isfinite(years[edges.first] - years[edges.second])
+    seen = edges.measured & timed[:, None]
     value = np.where(seen[:, :, None], np.nan_to_num(edges.value) - network, 0.0)
     shared, own = components.at_place(edges)
     scale = components.scale[edges.first] + components.scale[edges.second]
     whole = scale[:, None] * shared + own
     many = np.maximum(seen.sum(axis=0), 1)
-    return _Left(
+    return Left(
         value,
         np.where(seen, 1.0 / np.maximum(whole, 1e-12), 0.0),
         own,
@@ -205,6 +209,6 @@ def _forms(time: Array, known: NDArray[np.bool_], span: float) -> list[tuple[str
     inside = times[_BESIDE : len(times) - _BESIDE + 1]
     chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _STEPS).round().astype(int))]
     found = [("step", (time >= one).astype(float)) for one in chosen]
-    if span >= _WAVE:
+    if span >= WAVE:
         found += [("yearly", 0.5 * wave(2 * np.pi * time)) for wave in (np.cos, np.sin)]
     return found

@@ -87,13 +87,23 @@ class Network:
         value = self.value - np.einsum("t,tmc->mc", weights, self.value)
         return replace(self, value=value, covariance=np.array([change @ one @ change.T for one in self.covariance]))
 
-    def with_seasons(self, variance: Array, years: Array) -> Network:
-        """Return the same corrections, with an error of variance ``(2,)`` px² that dates of one season share.
+    def with_seasons(self, variance: Array, yearly: Array, years: Array) -> Network:
+        """Return the same corrections, with errors that dates of one season share.
 
-        A date without a time (NaN), such as a reference, shares it with no other date.
+        A date without a time (NaN), such as a reference, shares them with no other date.
+
+        Parameters
+        ----------
+        variance : (2,)
+            px², of an error that falls off from season to season.
+        yearly : (h, 2)
+            px², of waves of a year, of half a year and so on.
         """
-        covariance = self.covariance.copy()
+        covariance, apart = self.covariance.copy(), years[:, None] - years
         covariance[:, ::3, ::3] += variance[:, None, None] * season_correlation(years)
+        for number, one in enumerate(yearly, 1):
+            wave = np.nan_to_num(np.cos(2 * np.pi * number * apart))
+            covariance[:, ::3, ::3] += one[:, None, None] * wave
         return replace(self, covariance=covariance)
 
 

@@ -1,0 +1,60 @@
+r"""Errors that the dates of one season share: they close all loops, so the network cannot show them.
+
+The ground looks different through the year, and its looks displace matches alike in all years. What does not move the
+mean of the places is seen: a place has a wave of one year, :math:`a \cos 2\pi t + b \sin 2\pi t`, that other places do
+not have. How much these waves vary from place to place, and how far neighbours share them, gives the variance of their
+mean, which displaces the dates. Errors of dates and of edges are part of the expected products.
+
+Source: Cressie 1993, section 2.4 (moments of a variogram); Lawson and Hanson 1974 (non-negative least squares).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import optimize
+
+from ortho_pipeline.block.stack.components import ErrorComponents, classes_of, correlations_of
+from ortho_pipeline.block.stack.moving import WAVE, Left
+from ortho_pipeline.block.stack.trends import Trends
+from ortho_pipeline.models.base import Array
+
+#: Waves in a year: with two, each of four seasons can differ.
+WAVES = 1, 2
+
+
+def yearly_variances(left: Left, trends: Trends, components: ErrorComponents, place: Array, years: Array) -> Array:
+    """Return the variances ``(2, 2)`` px² of the mean of all places: waves of a year and of half a year, both axes.
+
+    They are zero if the dates span less than one and a half years: then seasons do not repeat.
+    """
+    found, known = np.zeros((len(WAVES), 2)), np.isfinite(years)
+    usual = trends.weights[trends.good, :, 0].mean(axis=0) if trends.good.any() else np.zeros(len(place))
+    seen = np.flatnonzero((usual > 0) & left.tested)
+    if not len(seen) or not known.any() or np.ptp(years[known]) < WAVE:
+        return found
+    weight = usual[seen] / usual[seen].sum()
+    centred = np.eye(len(seen)) - weight
+    classes = classes_of(place[seen]).ravel()
+    matrices = np.concatenate([np.eye(len(seen))[None], correlations_of(place[seen])])
+    expected = np.stack([np.bincount(classes, (centred @ one @ centred.T).ravel()) for one in matrices], axis=1)
+    size, of_mean = np.maximum(np.linalg.norm(expected, axis=0), 1e-12), matrices @ weight @ weight
+    time = np.where(known, years, 0.0)
+    without = replace(left, value=left.change(time)[2])
+    for row, number in enumerate(WAVES):
+        products = np.zeros((2, len(expected)))
+        for wave in (np.cos, np.sin):
+            form = wave(2 * np.pi * number * time)
+            apart = centred @ without.change(form)[0][seen]
+            shares, of_dates = (one[:, seen] for one in left.shares(form))
+            dates = of_dates.T @ (components.scale[:, None] * of_dates)
+            own = shares.T @ (components.factor[:, None] * shares)
+            for axis in (0, 1):
+                noise = dates * np.tensordot(components.shared[axis], matrices, 1)
+                noise += own * np.tensordot(components.own[axis], matrices, 1)
+                rest = np.outer(apart[:, axis], apart[:, axis]) - centred @ noise @ centred.T
+                products[axis] += np.bincount(classes, rest.ravel()) / 2
+        for axis in (0, 1):
+            found[row, axis] = of_mean @ (optimize.nnls(expected / size, products[axis])[0] / size)
+    return found
