@@ -55,7 +55,9 @@ def test_what_has_no_value_is_transparent_and_does_not_count() -> None:
 @pytest.mark.parametrize(
     ("size", "side", "reduced"), [((1000, 400), 100, (100, 40)), ((3, 2000), 100, (1, 100)), ((50, 30), 100, (50, 30))]
 )
-def test_a_picture_covers_its_raster(tmp_path: Path, size: tuple[int, int], side: int, reduced: tuple[int, int]) -> None:
+def test_a_picture_covers_its_raster(
+    tmp_path: Path, size: tuple[int, int], side: int, reduced: tuple[int, int]
+) -> None:
     grid = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 2.0, 5.0, *size)
     small = reduced_grid(grid, side)
     assert (small.width, small.height) == reduced
