@@ -47,7 +47,7 @@ def test_places_of_the_frame_are_those_of_proj(frame: GroundFrame) -> None:
 
 def test_differences_are_east_north_up_at_the_point_itself(frame: GroundFrame) -> None:
     """Forty kilometres from the origin, up differs by a third of a degree."""
-    moved = GROUND + [2e-5, -3e-5, 4.0]
+    moved = GROUND + np.array([2e-5, -3e-5, 4.0])
     apart = frame.apart(GROUND, frame.of_geodetic(moved))
     for ground, there, found in zip(GROUND, moved, apart, strict=True):
         np.testing.assert_allclose(found, -topocentric(ground, there[None])[0], atol=1e-6)
