@@ -22,6 +22,8 @@ def middles(grid: Grid) -> np.ndarray:
 
 
 GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 10.0, 20.0, 60, 40)
+#: A place within it in the zone beside it.
+AT = np.round(pyproj.Transformer.from_crs("EPSG:32633", "EPSG:32632").transform(500_150, 3_999_800)).tolist()
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +62,7 @@ def test_pixels_of_the_same_grid_are_copied(ortho: Path) -> None:
     "grid",
     [
         Grid(GRID.crs, 500_103.0, 3_999_907.0, 10.0, 20.0, 20, 20),
-        Grid(parse_crs("EPSG:32632"), *np.round(pyproj.Transformer.from_crs(32633, 32632).transform(500_150, 3_999_800)),
+        Grid(parse_crs("EPSG:32632"), *AT,
              7.0, 11.0, 30, 30),
     ],
 )  # fmt: skip
