@@ -117,6 +117,21 @@ def test_a_coarse_copy_shows_pixels_where_they_are(tmp_path: Path) -> None:
             assert np.abs(found - wanted).max() <= (8.5 if factor < 16 else 1.0)
 
 
+def test_a_raster_lower_than_a_step_has_a_coarse_copy(tmp_path: Path) -> None:
+    columns = np.tile(np.arange(40, dtype=np.float32), (1, 10, 1))
+    coarse = Pyramid(raster(tmp_path / "a.tif", columns)).coarse
+    assert coarse.shape == (1, 2)
+    assert np.abs(coarse - [[10, 30]]).max() <= 1
+
+
+def test_reduced_pixels_need_a_value_in_all_bands(tmp_path: Path) -> None:
+    bands = np.ones((2, 64, 64), dtype=np.float32)
+    bands[0, :32, :32] = -9.0
+    found = Intensity(raster(tmp_path / "a.tif", bands, -9.0), (1, 2)).read(0, 0, 4, 4, 16)
+    np.testing.assert_array_equal(np.isnan(found), (np.indices((4, 4)) < 2).all(axis=0))
+    assert np.nanmax(found) == 1.0
+
+
 def test_the_stretch_is_from_percentile_1_to_99() -> None:
     values = np.random.default_rng(0).permutation(np.arange(1001, dtype=np.float32))
     assert stretch(np.append(values, np.nan)) == pytest.approx((10.0, 990.0))

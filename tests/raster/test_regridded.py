@@ -44,6 +44,17 @@ def test_the_grid_is_that_of_the_file(ortho: Path) -> None:
     assert (found.extent, found.dx, found.dy) == ((500_000.0, 3_999_200.0, 500_600.0, 4_000_000.0), 10.0, 20.0)
 
 
+@pytest.mark.parametrize("turned", [(0.0, 10.0, 0.1, 0.0, 0.0, -20.0), (0.0, 10.0, 0.0, 0.0, 0.1, -20.0), None])
+def test_a_raster_that_is_turned_or_has_no_crs_is_no_ortho(tmp_path: Path, turned: tuple[float, ...] | None) -> None:
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 6, 4, 1)
+    if turned:
+        dataset.SetProjection(GRID.crs.to_wkt())
+    dataset.SetGeoTransform(turned or (0.0, 10.0, 0.0, 0.0, 0.0, -20.0))
+    del dataset
+    with pytest.raises(InputError):
+        grid_of(tmp_path / "a.tif")
+
+
 def test_pixels_of_the_same_grid_are_copied(ortho: Path) -> None:
     """The ortho begins at column 3, row -2 of the grid; outside of it nothing is valid."""
     grid = Grid(GRID.crs, 499_970.0, 3_999_960.0, 10.0, 20.0, 50, 50)
@@ -61,7 +72,12 @@ def test_pixels_of_the_same_grid_are_copied(ortho: Path) -> None:
 @pytest.mark.parametrize(
     "grid",
     [
-        Grid(GRID.crs, 500_103.0, 3_999_907.0, 10.0, 20.0, 20, 20),
+        # Three tenths of a pixel to either side along one axis, and other pixels along one axis.
+        Grid(GRID.crs, 500_103.0, 3_999_900.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_107.0, 3_999_900.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_100.0, 3_999_906.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_100.0, 3_999_914.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_100.0, 3_999_900.0, 10.0, 10.0, 20, 20),
         Grid(parse_crs("EPSG:32632"), *AT,
              7.0, 11.0, 30, 30),
     ],

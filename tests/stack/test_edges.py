@@ -34,6 +34,15 @@ def test_a_cell_has_the_mean_of_its_matches_without_those_far_from_the_median() 
     assert np.isnan(variance[2:]).all()
 
 
+@pytest.mark.parametrize(("far", "sigma", "kept"), [(3.9, 0.1, True), (4.1, 0.1, False), (4.1, 1.4, True)])
+def test_a_match_is_far_at_four_medians_or_three_sigmas(far: float, sigma: float, kept: bool) -> None:
+    ring = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
+    value = np.array([*ring, *ring, (far, 0.0), (-far, 0.0)])
+    cells = Cells.over(np.zeros(2), np.array([1200.0, 1200.0]))
+    _, variance = cells.sampled(np.full((10, 2), 5.0), value, np.full(10, sigma))
+    assert variance[0] == pytest.approx(sigma**2 / (10 if kept else 8))
+
+
 def edges_of(value: np.ndarray, variance: float | np.ndarray = 0.01) -> Edges:
     count = len(value)
     spread = np.broadcast_to(variance, value.shape[:2]).copy()
@@ -83,6 +92,17 @@ def test_a_trend_is_that_of_the_places_that_agree() -> None:
     assert not trends.residual[0, ~kept].any()
 
 
+def test_a_place_is_apart_at_three_and_a_half_sigmas() -> None:
+    """If half of the residuals are shorter than 1, sigma is 1 / sqrt(2 ln 2) per axis: 3.5 sigmas are 2.97."""
+    angle = np.linspace(0, 2 * np.pi, 144, endpoint=False)
+    value = np.column_stack([np.cos(angle), np.sin(angle)])[None] * 1.0
+    value[0, [0, 72]] *= 2.85
+    value[0, [36, 108]] *= 3.1
+    cells = Cells.over(np.zeros(2), np.array([1200.0, 1200.0]))
+    used = trends_of(edges_of(value), design_of(cells.place, 1), np.ones(144, bool)).used[0]
+    assert np.flatnonzero(~used).tolist() == [36, 108]
+
+
 @pytest.mark.parametrize(("terms", "count", "good"), [(1, 5, False), (1, 6, True), (3, 11, False), (3, 12, True)])
 def test_a_trend_needs_six_places_and_four_a_term(terms: int, count: int, good: bool) -> None:
     cells = Cells.over(np.zeros(2), np.array([1200.0, 1200.0]))
@@ -113,7 +133,13 @@ def test_clouds_count_by_what_is_left() -> None:
 
 
 def test_the_same_season_of_other_years_is_within_forty_days() -> None:
-    for gap, season in ((365.25 + 39, True), (365.25 + 41, False), (365.25 - 39, True), (1826.25 + 39, True)):
+    for gap, season in (
+        (365.25 + 39, True),
+        (365.25 + 41, False),
+        (365.25 - 39, True),
+        (1826.25 + 39, True),
+        (1826.25 + 41, False),
+    ):
         days = [0.0, *(gap - 60 + 10 * k for k in range(4)), gap]
         assert ((5, 0) in pairs_of(days, 3)) == season, gap
 
@@ -133,3 +159,21 @@ def test_a_step_has_its_date_and_its_size() -> None:
     (more,) = steps_of(value, np.full((2, 1, 1), 0.01) * np.eye(40))
     np.testing.assert_allclose(np.square(more.sigma) - np.square(step.sigma), 0.01 * (1 / 23 + 1 / 17), rtol=1e-6)
     assert steps_of(value[20:27], np.zeros((2, 7, 7))) == []
+
+
+def test_a_step_needs_four_dates_on_each_side() -> None:
+    value = np.random.default_rng(1).normal(0, 0.01, (8, 2))
+    value[4:] += 5.0
+    assert [step.date for step in steps_of(value, np.zeros((2, 8, 8)))] == [4]
+
+
+def test_a_single_date_changes_a_step_by_three_sigmas_at_most() -> None:
+    value = np.random.default_rng(1).normal(0, 0.05, (40, 2))
+    value[23:] += (0.6, -0.4)
+    value[30] = np.median(value[23:], axis=0)
+    (step,) = steps_of(value, np.zeros((2, 40, 40)))
+    value[30] += 8.0
+    (other,) = steps_of(value, np.zeros((2, 40, 40)))
+    scatter = np.array(other.sigma) / np.sqrt(1 / 23 + 1 / 17)
+    change = (np.array(other.size) - step.size) * 17 / scatter
+    assert (np.abs(change - 3) < 1).all()
