@@ -64,6 +64,15 @@ def test_the_table_of_an_image_has_its_points() -> None:
     assert again.point.tolist() == [0, 1, 0, 2, 1]
 
 
+def test_other_sigmas_and_roles_are_those_of_a_new_table() -> None:
+    points = block()
+    other = points.with_image_sigmas(np.full(5, 9.0))
+    assert other.sigma_image.tolist() == [9.0] * 5
+    assert points.sigma_image.tolist() == [0.1, 0.2, 0.3, 0.4, 0.5]
+    assert [mask.tolist() for mask in (points.control, points.check, points.tie)] == np.eye(3, dtype=bool).tolist()
+    assert points.with_roles(["tie", "check", "tie"]).tie.tolist() == [True, False, True]
+
+
 def test_only_ground_without_a_sigma_gets_one() -> None:
     found = block().with_ground_sigma(0.7, 0.9).sigma_ground
     assert found.tolist() == [[0.7, 0.2, 0.9], [0.1, 0.7, 0.5], [0.7, 0.7, 0.9]]

@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.comparison import choose_models, compare
 from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
-from ortho_pipeline.estimation.choice.recommendation import recommend
+from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.points import Points
@@ -105,6 +105,8 @@ def test_the_expected_square_is_that_of_the_formula() -> None:
     assert expected().square(9.0, 1.0) == 3 * (2 + 4) + 5
     assert expected().square(9.0, 5.0) == 5 * (2 + 4) + 5, "no less than the noise"
     assert expected(unseen=0.0, tested=2.0).square(8.0, 0.5) == 2 * 6
+    found = expected_errors({"a": np.array([6.0, 12.0])}, {"a": expected(unseen=7.0)})
+    assert found == {"a": math.sqrt(3 * 6 + 7)}, "a root mean square"
 
 
 def test_support_ends_ten_above_the_best_criterion_unless_the_noise_is_alike() -> None:
@@ -122,9 +124,9 @@ def test_support_ends_ten_above_the_best_criterion_unless_the_noise_is_alike() -
 
 
 def as_if(base: Fit, name: str, parameters: int, squares: np.ndarray) -> ComparedModel:
-    """Return a row whose check points have these squared errors."""
+    """Return a row whose check points have these squared errors, to the left and to the right."""
     residuals = np.zeros((len(base.points), 2))
-    residuals[base.points.check, 0] = np.sqrt(squares)
+    residuals[base.points.check, 0] = np.sqrt(squares) * (-1.0) ** np.arange(len(squares))
     lost = np.full_like(residuals, np.nan)
     found = dataclasses.replace(base, residuals=residuals, loo_residuals=lost, outlying=(), corner_ratio=1.0)
     return ComparedModel.of(name, (parameters, 4, 3), found)
@@ -147,6 +149,16 @@ def test_three_points_are_enough_to_recommend_and_two_are_not(affine: Fit) -> No
         assert recommend([as_if(affine, "one", 8, squares)])[0] == model
 
 
+def test_an_unsuited_model_is_not_recommended_and_fewer_parameters_are_within_two_per_cent(affine: Fit) -> None:
+    squares = np.array([4.0, 5.0, 6.0, 5.0, 4.5])
+    rows = [as_if(affine, "few", 8, 1.03 * squares), as_if(affine, "many", 20, squares)]
+    assert recommend(rows)[0] == "few", "1.5 % in errors are 3 % in squares"
+    assert recommend(rows, unsuited=("few",))[0] == "many"
+    assert recommend(rows, unsuited=("few", "many"))[0] is None
+    rows[0] = as_if(affine, "few", 8, 1.05 * squares)
+    assert recommend(rows)[0] == "many"
+
+
 def test_a_named_model_is_compared_once() -> None:
     assert choose_models(" dlt, affine3d,,dlt ") == ("dlt", "affine3d")
     for text in ("", " , "):
@@ -159,6 +171,8 @@ def test_counts_are_those_of_the_points_that_were_used() -> None:
     points = points_of(random.uniform(LOW, HIGH, (17, 3)))
     image = points.image.copy()
     image[2] += 60.0
-    done = compare(dataclasses.replace(points, image=image), ("affine3d",), size=SIZE)
+    done = compare(dataclasses.replace(points, image=image), ("affine3d", "affine2d"), size=SIZE)
+    assert done.best is not None
+    assert done.best.model == done.recommended == "affine3d", "heights displace by 300 px"
     assert (done.points.control, done.points.check) == (11, 5)
     assert (done.rows[0].parameters, done.rows[0].redundancy) == (8, 2 * 11 - 8)

@@ -22,6 +22,7 @@ def test_numbers_are_those_of_the_text(tmp_path: Path) -> None:
     assert [found.number(".", one) for one in found.all("list/x")] == [1.0, 2.0]
     assert [found.has(name) for name in ("gain", "list/x", "list/y")] == [True, True, False]
     assert (found.said("gain"), found.said("empty"), found.said("none")) == ("1.5 -2e-3 +.5 4.", None, None)
+    assert len(found.all("list/x", most=2)) == 2
     with pytest.raises(InputError, match="too many"):
         found.all("list/x", most=1)
     for name, count in (("gain", 3), ("gain", 5), ("empty", 1), ("none", 1)):
@@ -33,6 +34,23 @@ def test_numbers_are_those_of_the_text(tmp_path: Path) -> None:
 def test_what_is_no_finite_number_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError):
         fields(tmp_path, f"<x>1 {text}</x>").numbers("x", 2)
+
+
+def test_a_number_has_sixty_characters_at_most(tmp_path: Path) -> None:
+    assert fields(tmp_path, f"<x>0.{'3' * 58}</x>").number("x") == pytest.approx(1 / 3, rel=1e-15)
+    with pytest.raises(InputError, match="not a number"):
+        fields(tmp_path, f"<x>0.{'3' * 56}e-1</x>").number("x")
+
+
+def test_a_dtd_is_refused_and_an_error_has_the_remedy_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.xml"
+    path.write_text("<!DOCTYPE a><a><b>x</b></a>")
+    with pytest.raises(InputError, match="not well-formed"):
+        XmlFields(path, remedy="order it again")
+    path.write_text("<a><b>x</b></a>")
+    with pytest.raises(InputError) as caught:
+        XmlFields(path, remedy="order it again").number("b")
+    assert (caught.value.field, caught.value.remedy) == ("b", "order it again")
 
 
 def test_a_field_has_a_limited_number_of_numbers(tmp_path: Path) -> None:
