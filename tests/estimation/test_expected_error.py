@@ -44,20 +44,6 @@ def affine() -> Fit:
     return fit_family("affine3d", points, size=SIZE, heights=(200.0, 800.0), robust=False)
 
 
-def test_the_criterion_and_the_noise_are_those_of_plain_least_squares(affine: Fit) -> None:
-    """Hurvich and Tsai 1989, with eight observations more for the stated noise; the noise is a parameter, too."""
-    points = affine.points.select(affine.used)
-    design = design_of(points.ground)
-    left = (points.image - design @ np.linalg.lstsq(design, points.image, rcond=None)[0]) / SIGMA
-    squares, number, parameters = float((left**2).sum()), 24 + 8, 8 + 1
-    akaike = number * math.log((squares + 8) / number) + 2 * parameters
-    akaike += 2 * parameters * (parameters + 1) / (number - parameters - 1)
-    found = expectation(affine, affine.points.check, SIZE)
-    assert found.criterion == pytest.approx(akaike, rel=1e-6)
-    assert found.noise == pytest.approx(squares / (24 - 8), rel=1e-6)
-    assert found.unseen == 0.0
-
-
 def test_variances_are_those_of_plain_least_squares(affine: Fit) -> None:
     """Of both axes: of measuring a point, of the parameters at the tests, and over the part of the box in the image."""
     points = affine.points

@@ -98,6 +98,18 @@ def test_coarser_pixels_are_means_of_what_they_cover(ortho: Path) -> None:
     np.testing.assert_allclose(pixels[1, :, 0], 3_999_760.0 - 80.0 * np.arange(5))
 
 
+def test_the_kernel_is_as_wide_as_the_coarser_pixels(tmp_path: Path) -> None:
+    """A line of one column, in pixels four times as wide: a triangle that ends four columns from its middle."""
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 60, 40, 1, gdal.GDT_Float64)
+    dataset.SetProjection(GRID.crs.to_wkt())
+    dataset.SetGeoTransform((500_000.0, 10.0, 0.0, 4_000_000.0, 0.0, -20.0))
+    dataset.WriteArray(np.tile(np.arange(60) == 30, (40, 1)) * 1.0)
+    del dataset
+    pixels, _ = Regridded(tmp_path / "a.tif", Grid(GRID.crs, 500_000.0, 4e6, 40.0, 20.0, 15, 40)).read(0, 0, 15, 40)
+    apart = np.abs(30.5 - 4 * (np.arange(15) + 0.5)) / 4
+    np.testing.assert_allclose(pixels[0, 20], np.maximum(1 - apart, 0) / 4, atol=1e-6)
+
+
 def test_an_ortho_of_another_place_is_refused(ortho: Path) -> None:
     for left, top in ((500_600.0, 4e6), (499_400.0, 4e6), (500_000.0, 3_999_200.0), (500_000.0, 4_000_800.0)):
         with pytest.raises(InputError, match="does not overlap"):
