@@ -454,7 +454,7 @@ def _result(
 ) -> Fit:
     predicted = solution.model.ground_to_image(points.ground)
     loo = np.full((len(points), 2), np.nan)
-    loo[used] = solution.leave_one_out()
+    loo[used] = solution.leave_one_out(None if common is None else common.beyond_parameters(solution))
     sigma0 = solution.sigma0
     shared = shared_errors(solution, points.image[used], common, points.sigma_alike[used])
     usual = common.cofactors(solution) if common is not None else solution.cofactors

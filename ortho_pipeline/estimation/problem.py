@@ -74,17 +74,21 @@ class Solution:
         white = self.errors.whitened(self.jacobian)
         return np.eye(2) - white @ self.cofactors @ white.transpose(0, 2, 1)
 
-    def leave_one_out(self) -> Array:
+    def leave_one_out(self, further: Array | None = None) -> Array:
         """Return leave-one-out residuals ``(n, 2)`` px; points of a group are left out together.
 
-        NaN if the point or group is indispensable.
+        NaN if the point or group is indispensable. `further` ``(n, 2, k)`` are what independent unknowns besides the
+        parameters add to whitened observations, in their standard deviations.
         """
-        left, white = self.leave_each_out(), self.errors.whitened(self.residuals)
+        white = self.errors.whitened(self.residuals)
         design = self.errors.whitened(self.jacobian)
+        further = design[:, :, :0] if further is None else further
+        redundancy = self.redundancy_blocks() - further @ further.transpose(0, 2, 1)
+        left = self.errors.restored(left_out(redundancy, white, known=INDISPENSABLE).whole)
         for group in sorted({*self.groups.tolist()} - {-1}):
             of = self.groups == group
-            rows = design[of].reshape(2 * int(of.sum()), -1)
-            redundancy = np.eye(len(rows)) - rows @ self.cofactors @ rows.T
+            rows, more = (part[of].reshape(2 * int(of.sum()), part.shape[2]) for part in (design, further))
+            redundancy = np.eye(len(rows)) - rows @ self.cofactors @ rows.T - more @ more.T
             together = left_out(redundancy[None], white[of].reshape(1, -1), known=INDISPENSABLE).whole
             left[of] = self.errors[of].restored(together.reshape(-1, 2))
         return left

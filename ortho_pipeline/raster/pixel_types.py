@@ -28,7 +28,8 @@ def nodata_of(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
 def holds(dtype: np.dtype[Any], value: float) -> bool:
     """Return whether a pixel of this type can have a value (approximately, for floating point)."""
     if dtype.kind == "f":
-        return math.isnan(value) or math.isinf(value) or abs(value) <= np.finfo(dtype).max
+        with np.errstate(over="ignore"):
+            return not math.isfinite(value) or math.isfinite(dtype.type(value))
     limits = np.iinfo(dtype)
     return float(value).is_integer() and bool(limits.min <= value <= limits.max)
 

@@ -120,6 +120,22 @@ def test_points_without_it_correct_it_as_generalised_least_squares_does(rpc: RPC
     assert found.rmse("control").total < 0.6
 
 
+@pytest.mark.parametrize(("kind", "surveyed"), [("shift", 4), ("shift", 1), ("affine", 4)])
+def test_leaving_out_a_point_is_a_fit_without_it(rpc: RPC, kind: str, surveyed: int) -> None:
+    """A surveyed point corrects the reference: without it the others predict it with an error that is less corrected.
+
+    Matches of a group are left out together.
+    """
+    points = scene(rpc, np.random.default_rng(3), 16, surveyed, sigma=2.0, off=np.array([2.5, -1.5]))
+    found = adjusted(rpc, points, kind, robust=False)
+    for k in (0, 7, 16, 15 + surveyed):
+        left = points.groups == points.groups[k] if points.groups[k] >= 0 else np.arange(len(points)) == k
+        others = adjusted(rpc, points.select(~left), kind, robust=False)
+        alone = points.select([k])
+        predicted = others.model.ground_to_image(alone.ground) + others.common_error.offset(others.model, alone)
+        np.testing.assert_allclose(found.loo_residuals[k], (alone.image - predicted)[0], atol=2e-3)
+
+
 def test_few_surveyed_points_are_no_gross_errors_beside_many_matches(rpc: RPC) -> None:
     """Of 300 matches whose reference is off by 1.5 sigmas, four surveyed points, and one that is really wrong."""
     points = scene(rpc, np.random.default_rng(5), 300, 5, sigma=4.0, off=np.array([5.0, 3.0]))

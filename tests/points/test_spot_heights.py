@@ -23,6 +23,12 @@ def test_a_plain_table(tmp_path: Path) -> None:
     assert spots.ids == ("lake", "hill")
 
 
+def test_no_height_is_better_than_a_millimetre(tmp_path: Path) -> None:
+    path = tmp_path / "spots.csv"
+    path.write_text("x,y,h,sigma\n33.5,36.5,1042.5,0.0001\n33.6,36.5,1042.5,0.0012\n")
+    assert read_spot_heights(path, "EPSG:4326", "ellipsoid").sigmas.tolist() == [0.001, 0.0012]
+
+
 def test_heights_above_a_geoid_become_ellipsoidal(tmp_path: Path) -> None:
     path = tmp_path / "spots.csv"
     path.write_text("x,y,h,sigma\n24.4,-33.65,100,0.3\n")

@@ -134,10 +134,21 @@ class ImageCommonError(CommonGroundError):
 
     def influence(self, solution: Solution) -> Array:
         """Return the influence of each whitened observation on the parameters ``(n, 2, P)``."""
+        design = solution.errors.whitened(solution.jacobian)
+        return design @ solution.cofactors - self._beyond(solution) @ self.gain.T
+
+    def beyond_parameters(self, solution: Solution) -> Array:
+        """Return what the error adds to whitened observations ``(n, 2, 2)`` besides what the parameters absorb.
+
+        The last axis has two independent parts of what is uncertain of it, one standard deviation of each.
+        """
+        return self._beyond(solution) @ np.linalg.cholesky(self.left)
+
+    def _beyond(self, solution: Solution) -> Array:
+        """Return what the parameters do not absorb of the displacement by one sigma ``(n, 2, 2)``, whitened."""
         design, moved = solution.errors.whitened(solution.jacobian), self.moved(solution)
         cross = np.einsum("nip,nik->pk", design, moved)
-        left = moved - design @ (solution.cofactors @ cross)
-        return design @ solution.cofactors - left @ self.gain.T
+        return moved - design @ (solution.cofactors @ cross)
 
     @property
     def covariance(self) -> Array:

@@ -1,0 +1,140 @@
+"""Intensities of rasters: means of blocks by plain loops, bands that show something, and copies for display."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.raster.intensity import Intensity, contents, enlarged
+from ortho_pipeline.raster.pyramid import Pyramid, stretch
+from ortho_pipeline.raster.source import RasterSource
+
+
+def raster(path: Path, bands: np.ndarray, nodata: float | None = None, alpha: bool = False) -> RasterSource:
+    count, height, width = bands.shape
+    kind = gdal.GDT_UInt16 if bands.dtype == np.uint16 else gdal.GDT_Float32
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), width, height, count, kind, options=["ALPHA=NO"])
+    dataset.WriteArray(bands)
+    if nodata is not None:
+        dataset.GetRasterBand(1).SetNoDataValue(nodata)
+    if alpha:
+        dataset.GetRasterBand(count).SetColorInterpretation(gdal.GCI_AlphaBand)
+    del dataset
+    return RasterSource(path)
+
+
+def texture(seed: int, height: int, width: int) -> np.ndarray:
+    """Return smooth noise from 100 to 1000."""
+    noise = np.fft.rfft2(np.random.default_rng(seed).normal(size=(height, width)))
+    distance = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width))
+    smooth = np.fft.irfft2(noise * np.exp(-((distance / 0.15) ** 2)), (height, width))
+    return 100 + 900 * (smooth - smooth.min()) / np.ptp(smooth)
+
+
+@pytest.mark.parametrize("factor", [1, 3, 8, 9])
+def test_windows_are_means_of_whole_blocks_with_values(tmp_path: Path, factor: int) -> None:
+    """By loops over pixels: a block that is partly outside, or has a pixel without a value, has none."""
+    bands = np.random.default_rng(1).uniform(1, 100, (2, 50, 60)).astype(np.float32)
+    bands[:, 20, 31] = -9.0
+    view = Intensity(raster(tmp_path / "a.tif", bands, -9.0), (1, 2))
+    mean = np.where(bands[0] == -9.0, np.nan, bands.mean(axis=0))
+    left, top, width, height = -factor - 1, -1, 60 // factor + 4, 50 // factor + 3
+    wanted = np.full((height, width), np.nan)
+    for row in range(height):
+        for column in range(width):
+            first, above = left + column * factor, top + row * factor
+            if first >= 0 and above >= 0 and first + factor <= 60 and above + factor <= 50:
+                wanted[row, column] = mean[above : above + factor, first : first + factor].mean()
+    found = view.read(left, top, width, height, factor)
+    if factor <= 8:
+        np.testing.assert_array_equal(np.isnan(found), np.isnan(wanted))
+    both = np.isfinite(wanted)
+    assert np.isfinite(found[both]).all()
+    np.testing.assert_allclose(found[both], wanted[both], rtol=1e-5)
+    assert both.sum() > 10
+    assert np.isnan(view.read(61, 0, 3, 3, factor)).all()
+
+
+def test_largest_integers_are_saturated(tmp_path: Path) -> None:
+    assert Intensity(raster(tmp_path / "a.tif", np.ones((1, 8, 8), np.uint16))).saturated == 65535
+    assert Intensity(raster(tmp_path / "b.tif", np.ones((1, 8, 8), np.float32))).saturated == np.inf
+
+
+def test_bands_without_content_are_not_averaged(tmp_path: Path) -> None:
+    """Of texture, one value, noise, texture again, and an alpha band with texture."""
+    shown = [texture(seed, 128, 128) for seed in (1, 2, 3)]
+    noise = np.random.default_rng(4).uniform(100, 1000, (128, 128))
+    bands = np.stack([shown[0], np.full((128, 128), 7.0), noise, shown[1], shown[2]]).astype(np.uint16)
+    view = Intensity(raster(tmp_path / "a.tif", bands, alpha=True))
+    assert view.averaged == (1, 4)
+    assert view.best(1) in ((1,), (4,))
+    flat = np.full((6, 40, 40), 9, np.uint16)
+    assert Intensity(raster(tmp_path / "b.tif", flat)).averaged == (1, 3, 4, 6), "from the whole spectrum"
+    assert Intensity(raster(tmp_path / "c.tif", flat[:2], alpha=True)).averaged == (1,)
+
+
+def test_the_content_of_a_band_is_its_entropy_times_its_correlation() -> None:
+    """Neighbours along rows differ by -1 or 1 with the same frequency, one bit; along columns by nothing."""
+    steps = np.tile([1.0, 1.0, -1.0, 1.0, -1.0, -1.0, -1.0, 1.0], 32)
+    course = np.concatenate([[0.0], np.cumsum(steps)])
+    band = np.tile(course, (64, 1))
+    alike = 1 - 1.0 / (2 * course.var())
+    low, high = np.percentile(course, (1, 99))
+    assert (low, high) == (course.min(), course.max())
+    found = contents(np.stack([band, 0 * band])[:, None].astype(np.float32))
+    np.testing.assert_allclose(found, [alike * 1.0 / 2, 0.0], rtol=1e-4)
+    empty = band.copy()
+    empty[: 64 // 4] = np.nan
+    assert contents(np.stack([band, empty])[:, None].astype(np.float32))[1] == 0.0, "it would cost a quarter of values"
+
+
+def test_what_was_enlarged_by_two_is_recognised_along_both_axes() -> None:
+    small = np.random.default_rng(2).normal(0, 1, (32, 32))
+
+    def twice(values: np.ndarray, axis: int) -> np.ndarray:
+        spectrum, size = np.fft.rfft(values, axis=axis), 2 * values.shape[axis]
+        return np.fft.irfft(spectrum, size, axis=axis)
+
+    assert enlarged(twice(twice(small, 0), 1)[None])
+    for values in (small, twice(small, 0), twice(small, 1)):
+        assert not enlarged(values[None])
+
+
+def test_a_coarse_copy_shows_pixels_where_they_are(tmp_path: Path) -> None:
+    """Bands of columns and rows: any reduction shows at its middle what is there."""
+    rows, columns = np.indices((480, 640)).astype(np.float32)
+    source = raster(tmp_path / "a.tif", np.stack([columns, rows]))
+    for band, axis in ((1, 1), (2, 0)):
+        pyramid = Pyramid(source, (band,))
+        assert pyramid.coarse.shape == (30, 40)
+        for factor, left, top in ((12, 0, 0), (16, 64, 32), (32, 64, 32), (64, 128, 64)):
+            found = pyramid.read(left, top, 5, 4, factor)
+            middle = (left if axis else top) + (np.arange(5 if axis else 4) + 0.5) * factor
+            wanted = np.broadcast_to(middle if axis else middle[:, None], (4, 5))
+            assert np.abs(found - wanted).max() <= (8.5 if factor < 16 else 1.0)
+
+
+def test_a_raster_lower_than_a_step_has_a_coarse_copy(tmp_path: Path) -> None:
+    columns = np.tile(np.arange(40, dtype=np.float32), (1, 10, 1))
+    coarse = Pyramid(raster(tmp_path / "a.tif", columns)).coarse
+    assert coarse.shape == (1, 2)
+    assert np.abs(coarse - [[10, 30]]).max() <= 1
+
+
+def test_reduced_pixels_need_a_value_in_all_bands(tmp_path: Path) -> None:
+    bands = np.ones((2, 64, 64), dtype=np.float32)
+    bands[0, :32, :32] = -9.0
+    found = Intensity(raster(tmp_path / "a.tif", bands, -9.0), (1, 2)).read(0, 0, 4, 4, 16)
+    np.testing.assert_array_equal(np.isnan(found), (np.indices((4, 4)) < 2).all(axis=0))
+    assert np.nanmax(found) == 1.0
+
+
+def test_the_stretch_is_from_percentile_1_to_99() -> None:
+    values = np.random.default_rng(0).permutation(np.arange(1001, dtype=np.float32))
+    assert stretch(np.append(values, np.nan)) == pytest.approx((10.0, 990.0))
+    assert stretch(np.full(3, np.nan, np.float32)) is None
+    low, high = stretch(np.full(3, 5.0, np.float32)) or (0.0, 0.0)
+    assert low == 5.0 < high < 5.001

@@ -1,0 +1,131 @@
+"""An ortho on another grid: the same pixels where they are the same, else values that PROJ says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import parse_crs
+from ortho_pipeline.raster.regridded import Regridded, coarser, grid_of, part_of, warped_bounds
+from ortho_pipeline.raster.source import Grid
+
+
+def middles(grid: Grid) -> np.ndarray:
+    """Return x and y of the middles of the pixels of a grid ``(2, h, w)``."""
+    rows, columns = np.indices((grid.height, grid.width)) + 0.5
+    return np.stack(grid.xy(columns, rows))
+
+
+GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 10.0, 20.0, 60, 40)
+#: A place within it in the zone beside it.
+AT = np.round(pyproj.Transformer.from_crs("EPSG:32633", "EPSG:32632").transform(500_150, 3_999_800)).tolist()
+
+
+@pytest.fixture(scope="module")
+def ortho(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two bands: easting and northing of the middle of each pixel; one pixel of the first has no value."""
+    path = tmp_path_factory.mktemp("ortho") / "a.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 60, 40, 2, gdal.GDT_Float64)
+    dataset.SetProjection(GRID.crs.to_wkt())
+    dataset.SetGeoTransform((500_000.0, 10.0, 0.0, 4_000_000.0, 0.0, -20.0))
+    dataset.WriteArray(middles(GRID))
+    dataset.GetRasterBand(1).SetNoDataValue(-1.0)
+    dataset.GetRasterBand(1).WriteArray(np.array([[-1.0]]), 7, 5)
+    return path
+
+
+def test_the_grid_is_that_of_the_file(ortho: Path) -> None:
+    found = grid_of(ortho)
+    assert (found.extent, found.dx, found.dy) == ((500_000.0, 3_999_200.0, 500_600.0, 4_000_000.0), 10.0, 20.0)
+
+
+@pytest.mark.parametrize("turned", [(0.0, 10.0, 0.1, 0.0, 0.0, -20.0), (0.0, 10.0, 0.0, 0.0, 0.1, -20.0), None])
+def test_a_raster_that_is_turned_or_has_no_crs_is_no_ortho(tmp_path: Path, turned: tuple[float, ...] | None) -> None:
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 6, 4, 1)
+    if turned:
+        dataset.SetProjection(GRID.crs.to_wkt())
+    dataset.SetGeoTransform(turned or (0.0, 10.0, 0.0, 0.0, 0.0, -20.0))
+    del dataset
+    with pytest.raises(InputError):
+        grid_of(tmp_path / "a.tif")
+
+
+def test_pixels_of_the_same_grid_are_copied(ortho: Path) -> None:
+    """The ortho begins at column 3, row -2 of the grid; outside of it nothing is valid."""
+    grid = Grid(GRID.crs, 499_970.0, 3_999_960.0, 10.0, 20.0, 50, 50)
+    pixels, valid = Regridded(ortho, grid).read(1, 1, 20, 45)
+    x, y = middles(grid)[:, 1:46, 1:21]
+    inside = (x > 500_000) & (y > 3_999_200)
+    np.testing.assert_array_equal(valid[1], inside)
+    np.testing.assert_array_equal(pixels[:, valid[0]], np.stack([x, y])[:, valid[0]])
+    # Its pixel (7, 5) is at (10, 3) of the grid.
+    wanted = inside.copy()
+    wanted[3 - 1, 10 - 1] = False
+    np.testing.assert_array_equal(valid[0], wanted)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        # Three tenths of a pixel to either side along one axis, and other pixels along one axis.
+        Grid(GRID.crs, 500_103.0, 3_999_900.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_107.0, 3_999_900.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_100.0, 3_999_906.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_100.0, 3_999_914.0, 10.0, 20.0, 20, 20),
+        Grid(GRID.crs, 500_100.0, 3_999_900.0, 10.0, 10.0, 20, 20),
+        Grid(parse_crs("EPSG:32632"), *AT,
+             7.0, 11.0, 30, 30),
+    ],
+)  # fmt: skip
+def test_pixels_of_another_grid_have_the_coordinates_of_their_middle(ortho: Path, grid: Grid) -> None:
+    """Bilinear interpolation of coordinates is exact."""
+    pixels, valid = Regridded(ortho, grid).read(0, 0, grid.width, grid.height)
+    assert valid.all()
+    there = pyproj.Transformer.from_crs(grid.crs, GRID.crs, always_xy=True).transform(*middles(grid))
+    np.testing.assert_allclose(pixels, np.stack(there), rtol=0, atol=0.02)
+
+
+def test_coarser_pixels_are_means_of_what_they_cover(ortho: Path) -> None:
+    grid = Grid(GRID.crs, 500_200.0, 3_999_800.0, 40.0, 80.0, 5, 5)
+    pixels, valid = Regridded(ortho, grid, resampling="average").read(0, 0, 5, 5)
+    assert valid.all()
+    np.testing.assert_allclose(pixels[0, 0], 500_220.0 + 40.0 * np.arange(5))
+    np.testing.assert_allclose(pixels[1, :, 0], 3_999_760.0 - 80.0 * np.arange(5))
+
+
+def test_the_kernel_is_as_wide_as_the_coarser_pixels(tmp_path: Path) -> None:
+    """A line of one column, in pixels four times as wide: a triangle that ends four columns from its middle."""
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 60, 40, 1, gdal.GDT_Float64)
+    dataset.SetProjection(GRID.crs.to_wkt())
+    dataset.SetGeoTransform((500_000.0, 10.0, 0.0, 4_000_000.0, 0.0, -20.0))
+    dataset.WriteArray(np.tile(np.arange(60) == 30, (40, 1)) * 1.0)
+    del dataset
+    pixels, _ = Regridded(tmp_path / "a.tif", Grid(GRID.crs, 500_000.0, 4e6, 40.0, 20.0, 15, 40)).read(0, 0, 15, 40)
+    apart = np.abs(30.5 - 4 * (np.arange(15) + 0.5)) / 4
+    np.testing.assert_allclose(pixels[0, 20], np.maximum(1 - apart, 0) / 4, atol=1e-6)
+
+
+def test_an_ortho_of_another_place_is_refused(ortho: Path) -> None:
+    for left, top in ((500_600.0, 4e6), (499_400.0, 4e6), (500_000.0, 3_999_200.0), (500_000.0, 4_000_800.0)):
+        with pytest.raises(InputError, match="does not overlap"):
+            Regridded(ortho, Grid(GRID.crs, left, top, 10.0, 20.0, 60, 40))
+
+
+def test_windows_and_coarser_grids_are_where_they_belong() -> None:
+    part = part_of(GRID, -2, 3, 10, 5)
+    assert part.extent == (499_980.0, 3_999_840.0, 500_080.0, 3_999_940.0)
+    half = coarser(GRID, 2, 30, 20)
+    assert (half.extent, half.dx, half.dy) == (GRID.extent, 20.0, 40.0)
+
+
+def test_bounds_in_another_crs_hold_the_whole_grid() -> None:
+    assert warped_bounds(GRID, GRID.crs) == GRID.extent
+    way = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
+    lon, lat = way.transform(*GRID.xy(*np.meshgrid(np.linspace(0, 60, 21), np.linspace(0, 40, 21))))
+    wanted = (lon.min(), lat.min(), lon.max(), lat.max())
+    assert warped_bounds(GRID, parse_crs("EPSG:4326")) == pytest.approx(wanted, abs=1e-7)
