@@ -43,9 +43,7 @@ def test_the_axis_of_the_earth_has_its_two_ends():
 
 def test_local_axes_are_those_of_proj():
     for lon, lat, h in PLACES:
-        local = pyproj.Transformer.from_pipeline(
-            f"+proj=topocentric +ellps=WGS84 +lon_0={lon} +lat_0={lat} +h_0={h}"
-        )
+        local = pyproj.Transformer.from_pipeline(f"+proj=topocentric +ellps=WGS84 +lon_0={lon} +lat_0={lat} +h_0={h}")
         origin = in_space(np.array([[lon, lat, h]]))
         axes = np.column_stack(local.transform(*(origin + 1e3 * np.eye(3)).T)) / 1e3
         np.testing.assert_allclose(enu_from_ecef(np.array([[lon, lat]]))[0].T, axes, rtol=0, atol=1e-9)
@@ -79,7 +77,10 @@ def test_a_degree_is_as_long_as_on_the_ellipsoid_and_grows_with_height(height):
 
 def test_rays_meet_a_height_on_their_way_and_nowhere_else():
     """The point is on the ray by PROJ, at the height, and the nearer of two."""
-    random, target = np.random.default_rng(4), np.array([[32.8, 39.9, 1200.0], [-70.0, -20.0, 0.0], [15.0, 70.0, 8000.0]])
+    random, target = (
+        np.random.default_rng(4),
+        np.array([[32.8, 39.9, 1200.0], [-70.0, -20.0, 0.0], [15.0, 70.0, 8000.0]]),
+    )
     up = enu_from_ecef(target)
     for _ in range(5):
         leaning = np.column_stack([random.uniform(-1.5, 1.5, (3, 2)), np.ones(3)])
