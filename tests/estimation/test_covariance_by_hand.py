@@ -36,6 +36,8 @@ def test_classes_have_all_pairs_up_to_the_farthest():
     xy, values = drawn(9)
     found = analyse(xy, values, near=150.0)
     distance = [math.dist(xy[i], xy[j]) for i in range(9) for j in range(i)]
+    # Fewer than 30 pairs beyond the neighbours are one class.
+    assert len(found.classes) == 2
     assert sum(one.pairs for one in found.classes) == 36
     assert found.classes[-1].to_m == pytest.approx(max(distance))
     assert found.pairs_near == sum(one <= 150.0 for one in distance)
@@ -116,7 +118,10 @@ def test_a_function_takes_ninety_pairs():
     xy, _ = drawn(14, seed=3)
     values = np.column_stack([xy[:, 0], xy[:, 0] + xy[:, 1]]) / 300
     assert analyse(xy[:13], values[:13]).functions == (None, None)
-    assert None not in analyse(xy, values).functions
+    functions = analyse(xy, values).functions
+    assert None not in functions
+    assert functions[0] != functions[1]
+    assert analyse(xy, values[:, ::-1]).functions == functions[::-1]
 
 
 def test_a_function_keeps_a_part_of_its_covariance():
