@@ -94,6 +94,7 @@ def test_a_wider_extent_has_twelve_samples_and_the_metres_more(lat):
 def test_near_a_pole_an_extent_has_all_longitudes():
     assert Extent(10.0, 89.0, 10.1, 89.95).widened()[::2] == (-180.0, 180.0)
     assert Extent(10.0, 89.0, 10.1, 89.99).widened().north == 90.0
+    assert Extent(10.0, 89.0, 10.1, 89.99).widened(0.0).south == pytest.approx(89.0 - 12 / 3600)
     assert Extent(10.0, -89.99, 10.1, -89.0).widened().south == -90.0
     assert Extent(-179.99, 0.0, 179.99, 1.0).widened()[::2] == (-180.0, 180.0)
 
