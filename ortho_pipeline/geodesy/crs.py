@@ -271,7 +271,8 @@ def _vertical_of_code(code: str) -> Vertical:
         crs = pyproj.CRS.from_user_input(code)
     except CRSError as error:
         raise DatumError(f"{code} does not exist", field="vertical", remedy=f"give {VERTICAL_FORMS}") from error
-    if crs.is_geographic and len(crs.axis_info) == 3:
+    # pyproj calls a compound of a geographic and a vertical system geographic too.
+    if crs.is_geographic and len(crs.axis_info) == 3 and not crs.is_compound:
         return Vertical("ellipsoid")
     part = crs.sub_crs_list[1] if crs.is_compound else crs
     authority = part.to_authority()

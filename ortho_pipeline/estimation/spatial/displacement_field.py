@@ -109,9 +109,9 @@ class DisplacementField:
         Raises
         ------
         TooFewPoints
-            If there are fewer than 12, or they are all at one place.
+            If there are fewer than 12, or they are all on one line.
         """
-        if len(place) < FEWEST_POINTS or not np.ptp(place, axis=0).min() > 0:
+        if len(place) < FEWEST_POINTS or _on_a_line(place):
             raise TooFewPoints(f"{len(place)} displacements do not determine a field", remedy="give more matches")
         weight = np.ones(len(place)) if sigma is None else (sigma / np.median(sigma)) ** 2
         weight = np.clip(weight, 0.25, 16.0)
@@ -304,6 +304,12 @@ class DisplacementField:
             alone = inverse.T @ (inverse @ self.value[:, axis]) / precision
             found += alone**2 * precision / (one.squares[one.best] / one.freedom)
         return found
+
+
+def _on_a_line(place: Array) -> bool:
+    """Return whether places are on one line, up to a millionth of their extent: they determine no slopes."""
+    spread = np.cov(place.T)
+    return not np.linalg.det(spread) > 1e-12 * np.trace(spread) ** 2
 
 
 def _design(place: Array) -> Array:
