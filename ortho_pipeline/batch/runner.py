@@ -34,7 +34,7 @@ from ortho_pipeline.batch.plan import RUN_FILES, STATE, Job, Plan, for_run, plan
 from ortho_pipeline.batch.records import FileState, RunRecord, key_of, locked, siblings
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, run_shared
-from ortho_pipeline.batch.summary import paths_of
+from ortho_pipeline.batch.summary import paths_of, provenance_of
 from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.results import Result
@@ -350,7 +350,8 @@ class _Run:
         result = BatchResult(ordered, files, time.monotonic() - self.begin, mosaic)
         if not self.part:
             write_json(files["summary"], result.to_json())
-            write_run_page(files["index"], self.planned.path.stem, result.to_json()["scenes"])
+            scenes, name = result.to_json()["scenes"], self.planned.path.stem
+            write_run_page(files["index"], name, scenes, provenance_of(self.planned))
         self.log("run finished", counts=result.to_json()["counts"], seconds=result.seconds)
         return result
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ortho_pipeline.batch.freshness import as_recorded, untouched
 from ortho_pipeline.batch.plan import RUN_FILES, Job, Plan, plan
 from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.batch.results import BatchResult, Outcome
 from ortho_pipeline.batch.shared.run import SharedFolder, summary_of
+from ortho_pipeline.commands.resolved.ledger import software
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files import write_json
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.report.page.run import write_run_page
 
 
@@ -41,8 +45,15 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
     files = {kind: planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
     result = BatchResult(tuple(outcomes), files, time.monotonic() - begin)
     write_json(files["summary"], result.to_json())
-    write_run_page(files["index"], planned.path.stem, result.to_json()["scenes"])
+    write_run_page(files["index"], planned.path.stem, result.to_json()["scenes"], provenance_of(planned))
     return result
+
+
+def provenance_of(planned: Plan) -> dict[str, Any]:
+    """Return the command, the pipeline file and the versions that a run was made with; scenes have their own."""
+    name, content = planned.path.name, planned.path.read_bytes()
+    file = {"role": "pipeline file", "path": name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    return {"command": f"ortho run {typed(name)}", "software": software(), "inputs": [file]}
 
 
 def paths_of(record: RunRecord, job: Job) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import replace
 
 import click
@@ -13,8 +13,8 @@ from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options.flags import FLAGGED, FLAGS, flag_of, value_of
 
 
-def flags_of(command: click.Command) -> dict[str, str]:
-    """Return the names that messages give the options of a command, and the flag of each.
+def flags_of(command: click.Command, words: Container[str] = ()) -> dict[str, str]:
+    """Return the names that messages give the options of a command, and the flag of each: if possible one of `words`.
 
     An option of a group is ``group.field``, any other has the name of its argument. `ortho run` has few of the groups'
     options: the names of the others are the keys of its file.
@@ -24,10 +24,11 @@ def flags_of(command: click.Command) -> dict[str, str]:
         group, _, field = str(param.name).partition("_")
         if not isinstance(param, click.Option):
             continue
+        flag = next((option for option in param.opts if option in words), param.opts[0])
         if group in FLAGGED and field:
-            flags[f"{group}.{field}"] = param.opts[0]
+            flags[f"{group}.{field}"] = flag
         else:
-            flags[str(param.name)] = param.opts[0]
+            flags[str(param.name)] = flag
             plain |= set(param.opts)
     return {**{name: flag for name, flag in FLAGS.items() if flag in plain}, **flags}
 
@@ -42,18 +43,23 @@ def with_flags(text: str, flags: Mapping[str, str]) -> str:
 def as_typed(text: str) -> str:
     """Return a text with the options that it names as they are typed in the command that runs."""
     ctx = click.get_current_context(silent=True)
-    return text if ctx is None else with_flags(text, flags_of(ctx.command))
+    return text if ctx is None else with_flags(text, flags_of(ctx.command, _words(ctx)))
 
 
 def name_as_typed(error: OrthoError, command: click.Command) -> None:
     """Let an error name the options of a command as they are typed there."""
-    flags = flags_of(command)
+    flags = flags_of(command, _words(click.get_current_context()))
     if error.choices:
         _offer(error, command, flags)
     error.message = with_flags(error.message, flags)
     error.remedy = None if error.remedy is None else with_flags(error.remedy, flags)
     if error.field is not None:
         error.field = ", ".join(flags.get(part, part) for part in error.field.split(", "))
+
+
+def _words(ctx: click.Context) -> list[str]:
+    """Return the words that were typed: whoever wrote -tr looks for -tr in a message, not for --resolution."""
+    return shlex.split(ctx.meta.get("command", ""))
 
 
 def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) -> None:

@@ -82,7 +82,15 @@ def verify(
     require_page("-o DIR", folder)
     groups = grouped_options(grouped, "points", "scene", "output")
     result = verifying.verify(
-        ortho, folder, match=match, surface=surface, masks=masks, band=band, require=require, **groups
+        ortho,
+        folder,
+        match=match,
+        surface=surface,
+        masks=masks,
+        band=band,
+        require=require,
+        command=click.get_current_context().meta["command"],
+        **groups,
     )
     print_result(result, as_json)
     if not all(requirement["met"] for requirement in result.document["requirements"]):
@@ -148,6 +156,7 @@ def align(
         shift_only=shift_only,
         bending=bending,
         resample=not no_resample,
+        command=click.get_current_context().meta["command"],
         **groups,
     )
     print_result(result, as_json)

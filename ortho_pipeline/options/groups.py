@@ -97,7 +97,7 @@ PIXEL_ORIGIN = Option(
     "place is (1, 1).",
     choices=tuple(PIXEL_ORIGINS),
 )
-CHECK = Option("--check", "Reserve these points as check points: every Nth, or by id.", "every:N|ids:A,B")
+CHECK = Option("--check", "Reserve these control points as check points: every Nth, or by id.", "every:N|ids:A,B")
 MODEL_CRS = "Ground CRS of fitted models: geocentric, geographic, utm or EPSG:n."
 
 
@@ -135,7 +135,7 @@ class PointOptions:
         str | None,
         Option(
             "--select",
-            "Points to use as control: N well spread, N of one region, by id, or N at random. The others check.",
+            "Points to use as control: N well spread, N of one region, by id, or N at random. Others are check points.",
             "even:N|cluster:N|ids:A,B|random:N:SEED",
         ),
     ] = None
@@ -294,8 +294,8 @@ class MatchOptions:
             "M",
             kind="number",
             above=0,
-            unset="three times the stated accuracy; without one, 100 (an ortho: or 30 pixels) or a quarter of the "
-            "image, whichever is smaller",
+            unset="three times the stated accuracy; if none is stated, 100 m (of an ortho, at least 30 pixels), but at "
+            "most a quarter of the image",
         ),
     ] = None
     search_rotation: Annotated[

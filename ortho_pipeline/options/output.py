@@ -141,8 +141,8 @@ class OutputOptions:
         str | None,
         Option(
             "--visibility",
-            "Find ground that other terrain hides: write a mask of it, or leave its pixels empty. With a DSM, the "
-            "latter gives a true ortho, whose pixels are empty at gaps of the DSM, too.",
+            "Find ground that other terrain hides: write a mask of it, or leave its pixels empty (nodata). With a "
+            "DSM, nodata gives a true ortho; gaps of the DSM are then empty, too.",
             choices=("mask", "nodata"),
         ),
     ] = None

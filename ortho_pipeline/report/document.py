@@ -281,7 +281,8 @@ def _undulation_there(ground: Array, crs: pyproj.CRS) -> str:
         undulation = float(np.nanmean(Vertical.parse("egm96").undulation(there[:, 0], there[:, 1])))
     except OrthoError:
         return ""
-    return f" (the geoid is {undulation:+.1f} m from the ellipsoid there)"
+    side = "above" if undulation > 0 else "below"
+    return f" (the geoid is {metres(abs(undulation))} {side} the ellipsoid there)"
 
 
 def _ortho(grid: Grid, warp: WarpRecord | None) -> OrthoRecord:

@@ -13,6 +13,11 @@ from osgeo import gdal
 from ortho_pipeline.report.page.run import write_run_page
 
 HOSTILE = '<script>alert("x")</script>'
+MADE = {
+    "command": "ortho run june.yaml",
+    "software": {"gdal": "3.99"},
+    "inputs": [{"role": "pipeline file", "path": "june.yaml", "bytes": 10, "sha256": "c0ffee"}],
+}
 
 
 def scene(
@@ -41,7 +46,7 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     scenes = [scene("good", 0.2, ortho=ortho), scene("bad", 3.0), scene(HOSTILE, error=f"{HOSTILE} is no DEM")]
     untested = scene("untested")
     untested["facts"]["rmse_px"]["loo"] = None
-    write_run_page(tmp_path / "index.html", "june", [*scenes, untested])
+    write_run_page(tmp_path / "index.html", "june", [*scenes, untested], MADE)
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     rows = re.findall(r"<tr[ >].*?</tr>", page.split("<tbody>")[1], re.DOTALL)
     assert ["Failed" in rows[0], "untested" in rows[1], "bad" in rows[2], "good" in rows[3]] == [True] * 4
@@ -52,10 +57,11 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     assert "Add check points, or an orthoimage" in rows[1]
     assert "Look." in rows[2]
     assert "<th>tested at</th>" in page
-    write_run_page(tmp_path / "part.html", "june", [{**scene("late"), "status": "missing", "facts": {}}])
+    write_run_page(tmp_path / "part.html", "june", [{**scene("late"), "status": "missing", "facts": {}}], MADE)
     assert "this scene is not made yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
     assert "Give a DEM." in rows[0]
     assert page.count("<script") == 1
+    assert [text in page for text in ("<code>ortho run june.yaml</code>", "3.99", "c0ffee")] == [True] * 3
     assert 'href="scenes/a%20b_report.html"' in rows[3]
     assert rows[3].count("data:image/png;base64,") == 1
 
@@ -76,7 +82,7 @@ def test_check_points_that_contradict_have_another_mark_than_a_formality(tmp_pat
     ]
     untested = scene("untested")
     untested["facts"]["rmse_px"]["loo"] = None
-    write_run_page(tmp_path / "index.html", "june", [formal, untested, apart])
+    write_run_page(tmp_path / "index.html", "june", [formal, untested, apart], MADE)
     rows = re.findall(r"<tr[ >].*?</tr>", (tmp_path / "index.html").read_text().split("<tbody>")[1], re.DOTALL)
     assert '<li class="stop">' in rows[0]
     assert "Error:</b> 3 of 6" in rows[0]
@@ -95,18 +101,18 @@ def test_the_headline_counts_orthos_and_not_scenes(tmp_path):
         ([untested], "1 scene: 1 ortho of unknown accuracy"),
         ([failed], "1 scene: 1 failed"),
     ):
-        write_run_page(tmp_path / "index.html", "june", scenes)
+        write_run_page(tmp_path / "index.html", "june", scenes, MADE)
         assert f">{head}</p>" in (tmp_path / "index.html").read_text()
 
 
 def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, monkeypatch):
     page = tmp_path / "index.html"
-    write_run_page(page, "june", [scene("one", 0.2, ortho=ortho)])
+    write_run_page(page, "june", [scene("one", 0.2, ortho=ortho)], MADE)
     first, made = page.read_bytes(), page.stat().st_mtime_ns
     found = {**scene("one", 0.2, ortho=ortho), "status": "unchanged", "seconds": 0.0}
     monkeypatch.setattr("ortho_pipeline.report.page.run.preview_png", pytest.fail)
-    write_run_page(page, "june", [found])
+    write_run_page(page, "june", [found], MADE)
     assert (page.read_bytes(), page.stat().st_mtime_ns) == (first, made)
     monkeypatch.undo()
-    write_run_page(page, "june", [scene("one", 0.3, ortho=ortho)])
+    write_run_page(page, "june", [scene("one", 0.3, ortho=ortho)], MADE)
     assert page.read_bytes() != first

@@ -194,7 +194,7 @@ def test_a_nan_as_nodata_goes_into_the_report(tiny, tmp_path):
 def test_nodata_has_to_fit(tiny, tmp_path, value):
     done = run("rectify", tiny.image, "--height", "500", "-ot", "Byte", "-dstnodata", value, "-o", tmp_path / "out")
     assert done.exit_code == 2
-    assert "--nodata" in done.stderr
+    assert "-dstnodata" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -331,7 +331,7 @@ def test_like_takes_the_grid_of_another_raster(tiny, tmp_path):
     assert np.array_equal(again.ReadAsArray(), first.ReadAsArray())
     both = run(*words, "-tr", 5, "-o", tmp_path / "x")
     assert both.exit_code == 2
-    assert "--resolution" in both.stderr
+    assert "--like sets the grid, which -tr would change" in both.stderr
     document = json.loads((tmp_path / "again" / f"{tiny.image.stem}_report.json").read_text())
     assert first.GetDescription() in {one["path"] for one in document["provenance"]["inputs"] if one["role"] == "grid"}
     assert document["provenance"]["options"]["output"]["like"] == first.GetDescription()
@@ -352,8 +352,8 @@ def test_metres_given_as_degrees_are_refused_with_the_usual_size(refused, tmp_pa
     said = refused("-t_srs", "EPSG:4326", "-tr", 30, 30, "-o", tmp_path / "out")
     assert "a resolution of 30 means 30 degrees" in said
     # 400 x 300 pixels cover 0.02 x 0.013 degrees.
-    assert "for 30 m give --resolution 0.00029 (the scene's own pixel is 0.000047, 4.8 m)" in said
-    assert "or choose a CRS in metres with --output-crs EPSG:" in said
+    assert "for 30 m give -tr 0.00029 (the scene's own pixel is 0.000047, 4.8 m)" in said
+    assert "or choose a CRS in metres with -t_srs EPSG:" in said
 
 
 def test_outputs_named_as_a_file_are_refused(refused, tmp_path):

@@ -49,7 +49,11 @@ def test_a_bent_ortho_is_aligned_by_a_field(bent, tmp_path):
     assert np.sqrt((left_by(BENT, tmp_path) ** 2).sum(axis=1).mean()) < 0.1
     assert document["before"]["rmse_m"]["value"] > 5
     assert document["relative"]["rmse_m"]["value"] < 0.15
-    assert "Before and after" in (tmp_path / "ortho_align.html").read_text()
+    page = (tmp_path / "ortho_align.html").read_text()
+    assert "Before and after" in page
+    made = document["provenance"]
+    assert [one["path"] for one in made["inputs"]] == list(map(str, bent))
+    assert [made["inputs"][0]["sha256"] in page, f" align {bent[0]} " in page] == [True, True]
 
 
 def test_a_shifted_ortho_is_aligned_by_a_shift(shifted, tmp_path):

@@ -85,6 +85,10 @@ def test_it_writes_page_numbers_and_displacements(verified):
     assert "<svg" in page
     numbers = json.loads((folder / "ortho_verify.json").read_text())
     assert numbers["relative"] == document["relative"]
+    made = numbers["provenance"]
+    assert " verify " in made["command"]
+    assert [one["role"] for one in made["inputs"]] == ["image", "reference"]
+    assert [made["command"].split()[2] in page, made["inputs"][1]["sha256"] in page] == [True, True]
     places = json.loads((folder / "ortho_displacements.geojson").read_text())["features"]
     assert len(places) == document["matches"]["kept"]
     to_map = ground_transform("EPSG:4979", "EPSG:32735")

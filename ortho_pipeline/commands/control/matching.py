@@ -176,8 +176,9 @@ class Matched:
         sigma = self.options.reference_sigma
         return [
             (
-                "accuracy",
-                f"{px(record.sigma_px)} (median of the matches), relative to the reference: {record.components.text()}",
+                "matching",
+                f"sigma of one match {px(record.sigma_px)} (median), relative to the reference: "
+                f"{record.components.text()}",
             ),
             (
                 "reference",

@@ -17,7 +17,7 @@ from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.measuring import BENDING, MeasuredOrtho, affine_of, measure_ortho, smooth_field
 from ortho_pipeline.commands.orthos.resampling import write_resampled
 from ortho_pipeline.commands.orthos.statistics import Verified, tested_cells
-from ortho_pipeline.commands.orthos.verifying import displacements, document_of
+from ortho_pipeline.commands.orthos.verifying import displacements, document_of, provenance_of
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, to_store
 from ortho_pipeline.commands.scene_fit import by_matches
@@ -70,6 +70,7 @@ def align(
     bending: float = BENDING,
     resample: bool = True,
     progress: Progress | None = None,
+    command: str | None = None,
 ) -> Result:
     """Move a finished ortho onto references, with one resampling on its own grid.
 
@@ -83,6 +84,8 @@ def align(
         Largest change of a field's displacement per pixel.
     resample : bool
         If False, correct a shift only: keep the pixels and move the map grid (a VRT, or a copy with the format GTiff).
+    command : str, optional
+        The command line, for the report.
 
     Raises
     ------
@@ -109,7 +112,9 @@ def align(
     for name, ending in (("model", "_aligned_model.json"), ("json", "_align.json"), ("html", "_align.html"),
                          ("displacements", "_displacements.geojson")):  # fmt: skip
         files[name] = Path(folder) / f"{stem}{ending}"
-    check_paths(files, Request(ortho, scene, match=match, output=output))
+    request = Request(ortho, scene, match=match, output=output)
+    check_paths(files, request)
+    record = provenance_of(request, measured.scene, None, hidden, command)
     # The ortho gets its name first: what is left is measured in it.
     if resample:
         write_resampled(measured.scene, chosen.model, _output_grid(measured), files["ortho"], output, scene, progress)
@@ -120,6 +125,7 @@ def align(
     document = _after(files["ortho"], measured, match, scene, output, band) | {"before": before}
     document["correction"] = _described(chosen)
     document["resampled"] = resample
+    document["provenance"] = record
     with together(folder, stem):
         write_json(files["json"], document)
         write_json(files["displacements"], displacements(measured))

@@ -24,6 +24,7 @@ from ortho_pipeline.commands.orthos.measuring import CELLS, MeasuredOrtho, measu
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import FEWEST_POINTS, Accuracy, Verified, profile
+from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import SCHEMA_VERSION, Result, to_store
 from ortho_pipeline.display.notices import Notice, to_document
@@ -64,6 +65,7 @@ def verify(
     masks: Sequence[str | os.PathLike[str]] = (),
     band: int | None = None,
     require: Sequence[str] = (),
+    command: str | None = None,
 ) -> Result:
     """Measure how accurate a finished ortho is: relative to references, and at points on the ground.
 
@@ -79,6 +81,8 @@ def verify(
         The band of the ortho to compare.
     require : sequence of str
         Such as ``ce90<5``; the document says in `requirements` whether they are met.
+    command : str, optional
+        The command line, for the report.
 
     Raises
     ------
@@ -104,7 +108,7 @@ def verify(
         )  # fmt: skip
     required = [Requirement.parse(text) for text in require]
     hidden = [ClassMask.parse(text) for text in masks]
-    one = _Job(match, points, surface, scene, output, hidden, band, required)
+    one = _Job(match, points, surface, scene, output, hidden, band, required, command)
     if os.path.isdir(ortho):
         return _verify_folder(Path(ortho), folder, one)
     document, measured = one.document(ortho)
@@ -124,9 +128,10 @@ class _Job:
         masks: Sequence[ClassMask],
         band: int | None,
         required: Sequence[Requirement],
+        command: str | None,
     ) -> None:
         self.match, self.points, self.surface, self.scene, self.output = match, points, surface, scene, output
-        self.masks, self.band, self.required = masks, band, required
+        self.masks, self.band, self.required, self.command = masks, band, required, command
 
     def document(self, ortho: str | os.PathLike[str]) -> tuple[dict[str, Any], MeasuredOrtho | None]:
         """Return the document of one ortho, and its matches."""
@@ -138,8 +143,11 @@ class _Job:
             )
         errors = self._point_errors(opened)
         filled = 1.0 if measured else float(filled_of(opened, self.scene, CELLS).mean())
-        document = document_of(measured or opened, self.match, self._heights(opened), errors, filled=filled)
+        heights = self._heights(opened)
+        document = document_of(measured or opened, self.match, heights, errors, filled=filled)
         document["requirements"] = [one.judged(document) for one in self.required]
+        request = Request(ortho, self.scene, self.points, self.surface, self.match)
+        document["provenance"] = provenance_of(request, opened, heights, self.masks, self.command)
         return document, measured
 
     def _heights(self, opened: Scene) -> Surface | None:
@@ -166,6 +174,16 @@ class PointErrors(NamedTuple):
 
     ids: tuple[str, ...]
     errors: Array
+
+
+def provenance_of(
+    request: Request, scene: Scene, surface: Surface | None, masks: Sequence[ClassMask], command: str | None
+) -> dict[str, Any]:
+    """Return the record of the files, options and versions that the document of an ortho was made with."""
+    hiding = Ledger({Path(mask.path): "mask" for mask in masks if Path(mask.path).is_file()})
+    inputs = Ledger.of(request, scene, surface).joined(hiding).hashed()
+    settings = request.asked("scene", "surface", "match", "output")
+    return dict(json_value(provenance(request, scene, surface, inputs, command, settings)))
 
 
 def document_of(

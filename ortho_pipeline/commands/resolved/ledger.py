@@ -175,6 +175,15 @@ def versions() -> dict[str, Any]:
     }
 
 
+def software() -> dict[str, str]:
+    """Return the versions that a report names."""
+    return {
+        "ortho-pipeline": software_version(),
+        "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
+        "proj": pyproj.proj_version_str,
+    }
+
+
 def provenance(
     request: Request,
     scene: Scene,
@@ -201,11 +210,7 @@ def provenance(
         "points": None if request.points.gcps is None else _as_asked(request.points),
         "surface": None if surface is None else dict(surface.provenance),
         "options": {name: _as_asked(value) for name, value in settings.items()},
-        "software": {
-            "ortho-pipeline": software_version(),
-            "gdal": raster.gdal.VersionInfo("RELEASE_NAME"),
-            "proj": pyproj.proj_version_str,
-        },
+        "software": software(),
     }
 
 

@@ -475,7 +475,7 @@ def _sentences(analysis: Covariance) -> list[str]:
     if analysis.relative is not None:
         numbers = (
             "{:.2f} in x and {:.2f} in y".format(*analysis.relative),
-            "{:.2f} and {:.2f}".format(*analysis.absolute),
+            "{:.2f} in x and {:.2f} in y".format(*analysis.absolute),
         )
         sentences.append(
             f"Between points closer than {analysis.near_m:g} m ({counted(analysis.pairs_near, 'pair')}) the relative "

@@ -80,8 +80,9 @@ def _(scene: Scene) -> str:
 @html.register
 def _(block: BlockFit) -> str:
     record = block.record
+    names = {"control": "control points (the fit)", "check": "check points"}
     ground = [
-        (f"{role} points", str(found.n), f"{found.x:.3f}", f"{found.y:.3f}", f"{found.h:.3f}")
+        (names[role], str(found.n), f"{found.x:.3f}", f"{found.y:.3f}", f"{found.h:.3f}")
         for role, found in record.object_rms
         if found
     ]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, style_sheet
-from ortho_pipeline.display.numbers import size_m
+from ortho_pipeline.display.numbers import flat, size_m
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files import write_text
@@ -54,6 +54,7 @@ def write_page(
         profiles=profiles,
         picture=picture,
         before=document.get("before"),
+        provenance=list(flat({key: value for key, value in document["provenance"].items() if key != "inputs"})),
         signals=signals(document["warnings"], document["notices"]),
         levels=WORDS,
         interval=interval_text,

@@ -59,7 +59,7 @@ def errors_of(document: Mapping[str, Any]) -> list[RoleErrors]:
     if document["points"] is not None:
         kinds.append(("check", "check points", document["points"]["residuals"]))
     if document["relative"] is not None:
-        kinds.append(("matched", "cells (most likely displacement)", document["field"]["cells"]))
+        kinds.append(("matched", "cells of the ortho", document["field"]["cells"]))
     return [
         RoleErrors.of(role, title, np.array([[one["east_m"], one["north_m"]] for one in places]))
         for role, title, places in kinds

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ortho_pipeline.display.numbers import metres
+from ortho_pipeline.display.numbers import flat, metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.errors.texts import counted
@@ -75,7 +75,9 @@ class SceneRow:
         return tested_at(self.facts)
 
 
-def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]]) -> None:
+def write_run_page(
+    path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]], provenance: Mapping[str, Any]
+) -> None:
     """Write the page of a run, unless it is there and of the same scenes and results.
 
     Parameters
@@ -83,11 +85,14 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
     scenes : sequence of mapping
         As in ``run.json``: name, files (paths), facts, error. What differs between runs of one result (seconds, and
         whether a scene was made or found) is no part of the page.
+    provenance : mapping
+        The command, versions, and the pipeline file among the inputs.
     """
     folder = Path(path).parent
     rows = sorted((_row(one, folder) for one in scenes), key=_order)
     told = [[row.name, row.error, row.facts, row.page] for row in rows]
-    key = hashlib.sha256(json.dumps([title, told, script()], sort_keys=True, default=str).encode()).hexdigest()
+    content = [title, told, script(), dict(provenance)]
+    key = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
     if _is_of(Path(path), key):
         return
     orthos = {one["name"]: one["files"].get("ortho") for one in scenes}
@@ -106,6 +111,8 @@ def write_run_page(path: str | os.PathLike[str], title: str, scenes: Sequence[Ma
         levels=WORDS,
         said=_summary(rows),
         about=_about(rows),
+        provenance=list(flat({key: value for key, value in provenance.items() if key != "inputs"})),
+        inputs=provenance["inputs"],
     )
     write_text(path, page)
 
@@ -182,7 +189,7 @@ def tested_at(facts: Mapping[str, Any]) -> str:
     """Return the points that tell the accuracy of a scene, in words with their number."""
     kind = evidence_in(facts)
     if kind is None:
-        why = "see the error" if refuted(facts.get("notices") or ()) else "no check points"
+        why = "see the error" if refuted(facts.get("notices") or ()) else "untested"
         return f"accuracy unknown: {why}"
     number, (one, many) = (facts.get("rmse_points") or {}).get(kind), EVIDENCE[kind]
     return many if number is None else counted(number, one, many)
