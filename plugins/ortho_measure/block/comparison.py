@@ -142,7 +142,8 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
         )
         least = min(able, key=lambda one: sizes[one.name])
         if least.parameters > chosen.parameters:
-            text += f". {least.name} has RMSE {sizes[least.name]:.3g} {unit}, but these points do not justify its parameters"
+            more = f"{least.name} has RMSE {sizes[least.name]:.3g} {unit}"
+            text += f". {more}, but these points do not justify its parameters"
         return chosen.name, text
     return None, "fewer than three points test all corrections, too few for a recommendation"
 
