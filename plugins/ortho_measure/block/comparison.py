@@ -3,7 +3,8 @@
 The method is like that of `ortho compare` for one scene (`estimation.choice`): gross errors are left out for all
 corrections, and a correction that Akaike's criterion contradicts is not recommended. If points with known ground test
 the corrections, one within 5 % of the smallest error is recommended, that with the fewest parameters. Ties alone hardly
-show errors of many parameters: a left-out ray is predicted by its neighbours. Then the criterion alone decides.
+show errors of many parameters: a left-out ray is predicted by its neighbours. Then the criterion decides, unless a
+correction with fewer parameters has a sigma0 within 5 %.
 """
 
 from __future__ import annotations
@@ -47,12 +48,22 @@ class _Tried:
             return np.zeros(0)
         return np.asarray(np.linalg.norm(without.ground[fit.points.roles == role], axis=1))
 
+    @property
+    def redundancy(self) -> int:
+        """Redundancy of the adjustment; 0 without one."""
+        return 0 if self.solution.fit is None else self.solution.fit.redundancy
+
+    @property
+    def sigma0(self) -> float:
+        """Factor of the stated sigmas; infinite without redundancy."""
+        fit = self.solution.fit
+        return math.inf if fit is None or fit.sigma0 is None else fit.sigma0
+
     def criterion(self, observations: int) -> float:
         """Return Akaike's criterion for the number of observations that are left without any correction."""
-        fit = self.solution.fit
-        if fit is None or fit.sigma0 is None:
+        if not math.isfinite(self.sigma0):
             return math.inf
-        return criterion(fit.sigma0**2 * fit.redundancy, observations, observations - fit.redundancy)
+        return criterion(self.sigma0**2 * self.redundancy, observations, observations - self.redundancy)
 
     @property
     def rays(self) -> Array:
@@ -115,9 +126,13 @@ def compare_corrections(
 
 def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     """Return the recommended correction, and the reason."""
-    observations = max((one.solution.fit.redundancy for one in tried if one.solution.fit is not None), default=0)
+    observations = max((one.redundancy for one in tried), default=0)
     criteria = {one.name: one.criterion(observations) for one in tried}
-    sound = {name for name, value in criteria.items() if value <= min(criteria.values()) + CONTRADICTED}
+    lowest = min(criteria.values(), default=math.inf)
+    # Many points prove differences that do not matter.
+    least_noise = min((one.sigma0 for one in tried if criteria[one.name] == lowest), default=math.inf)
+    as_good = {one.name for one in tried if criteria[one.name] == lowest or one.sigma0 <= _WORTH * least_noise}
+    sound = as_good | {name for name, value in criteria.items() if value <= lowest + CONTRADICTED}
     of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
     of_rays = {one.name: one.rays for one in tried}
     for errors, what, unit in (
@@ -132,11 +147,10 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
             continue
         sizes = {name: _rms(values[common]) or 0.0 for name, values in tested.items()}
         able = [one for one in tried if one.name in sizes]
+        close = {name for name, size in sizes.items() if size <= _WORTH * min(sizes.values())}
         if errors is of_rays:
-            chosen = min(able, key=lambda one: (criteria[one.name], one.parameters))
-        else:
-            close = [one for one in able if sizes[one.name] <= _WORTH * min(sizes.values())]
-            chosen = min(close, key=lambda one: (one.parameters, sizes[one.name]))
+            close = as_good & {*sizes} or close
+        chosen = min((one for one in able if one.name in close), key=lambda one: (one.parameters, sizes[one.name]))
         text = (
             f"RMSE {sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
         )
