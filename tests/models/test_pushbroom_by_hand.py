@@ -159,6 +159,24 @@ def test_what_a_camera_states_of_itself() -> None:
         _ = replace(model, mounting=MOUNTING * [1.0, -1.0, -1.0]).domain
 
 
+def test_a_camera_that_also_sees_the_sky_has_the_box_of_its_ground() -> None:
+    """The horizon is 66 degrees from straight down, and the ends of this line 68: they see no ground."""
+    model = north()
+    wide = replace(model, camera=replace(model.camera, focal_length=200.0))
+    ends = wide.corners
+    assert np.isnan(ends).all()
+    centre, half = wide.domain
+    inner = wide.image_to_ground([[250.0, 600.0], [750.0, 600.0]], 0.0)
+    np.testing.assert_allclose([centre[0] + half[0], centre[0] - half[0]], inner[:, 0], atol=1e-9)
+
+
+def test_numbers_of_a_file_are_plain_numbers() -> None:
+    model = north(line_period=np.float32(0.5), heights=[np.int64(1), 2])
+    assert (type(model.line_period), model.line_period) == (float, 0.5)
+    assert model.heights == (1.0, 2.0)
+    assert isinstance(model.heights[0], float)
+
+
 @pytest.mark.parametrize(
     ("free", "observed", "least"),
     [
