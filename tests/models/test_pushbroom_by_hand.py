@@ -212,10 +212,12 @@ def test_names_of_groups_free_their_parameters_once() -> None:
 
 
 def test_near_the_antimeridian_longitudes_stay_near_the_satellite() -> None:
-    image = [[0.0, 300.0], [1000.0, 300.0]]
-    plain = north(lon=20.0).image_to_ground(image, 0.0)
-    for lon in (180.0, -179.999, 179.999, -180.0):
-        shifted = north(lon=lon).image_to_ground(image, 0.0)
+    """Also at the ends of a line that sees five degrees to both sides."""
+    camera, image = LineCamera(WIDTH, HEIGHT, 500.0, 0.0, 600.0), [[0.0, 300.0], [1000.0, 300.0]]
+    plain = north(lon=20.0, camera=camera).image_to_ground(image, 0.0)
+    assert (np.abs(plain[:, 0] - 20.0) > 4.0).all()
+    for lon in (180.0, -179.0, 179.0, -180.0):
+        shifted = north(lon=lon, camera=camera).image_to_ground(image, 0.0)
         foot = 180.0 if lon == -180.0 and shifted[0, 0] > 0 else lon
         np.testing.assert_allclose(shifted - [foot, 0, 0], plain - [20.0, 0, 0], atol=1e-9)
 
