@@ -351,3 +351,23 @@ def test_an_observation_of_what_is_not_free_is_left_out() -> None:
     assert turned.fictitious.all()
     # Observations are without offset and drift: these do not change them.
     assert len(model.freed("attitude_drift", "path_offset").constraints()) == 0
+
+
+def test_the_shape_of_an_orbit_is_that_between_first_and_last_row() -> None:
+    """A straight line at 7500 m/s from its lowest point: it is longer by the time, and climbs by its cosine."""
+    level = 6378137.0 + ALTITUDE
+    model = north(shape=OrbitShape(circular=1e-3, radius=level, radius_sigma=5.0, samples=2)).freed("path_offset")
+    found = model.constraints()
+    # Two samples, in the middles of both halves of 1.2 s.
+    rising = [SPEED * time / math.hypot(level, SPEED * time) for time in (0.3, 0.9)]
+    far = math.hypot(level, SPEED * 0.6)
+    np.testing.assert_allclose(found.residuals, [*(-np.array(rising)), level - far], atol=1e-8)
+    assert found.sigma.tolist() == [1e-3, 1e-3, 5.0]
+    # Farther up by a metre; ahead by one.
+    np.testing.assert_allclose(found.jacobian[2], [SPEED * 0.6 / far, 0.0, level / far], atol=1e-9)
+
+
+def test_a_model_never_changes() -> None:
+    for array in (north().origin, north().path_line, north().camera.dx, north().path.coefficients):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 1.0
