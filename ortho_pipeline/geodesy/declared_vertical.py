@@ -44,15 +44,15 @@ def declared_vertical(crs: pyproj.CRS) -> DeclaredVertical | None:
     DatumError
         If the vertical axis points down.
     """
-    if not crs.is_compound:
-        if len(crs.axis_info) < 3:
-            return None
-        return DeclaredVertical(crs.name, Vertical("ellipsoid"), True, crs.axis_info[2].unit_conversion_factor)
-    part = crs.sub_crs_list[1]
+    if not crs.is_compound and len(crs.axis_info) < 3:
+        return None
+    part = crs.sub_crs_list[1] if crs.is_compound else crs
     plain = part.source_crs if part.is_bound and part.source_crs is not None else part
-    axis = plain.axis_info[0]
+    axis = plain.axis_info[-1]
     if axis.direction.lower() == "down":
         raise DatumError(f"{plain.name!r} gives depths, not heights", field="vertical CRS")
+    if not crs.is_compound:
+        return DeclaredVertical(crs.name, Vertical("ellipsoid"), True, axis.unit_conversion_factor)
     authority = plain.to_authority(min_confidence=90)
     if authority is not None and authority[0] == "EPSG":
         # PROJ also finds a code by comparing names; only a code that is written there is certain.

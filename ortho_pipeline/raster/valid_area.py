@@ -59,14 +59,23 @@ def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], 
         ring = shapely.get_coordinates(shapely.segmentize(polygon.exterior, step))
         degrees = to_degrees(np.column_stack([ring, np.zeros(len(ring))]))[:, :2]
         parts += _polygons(shapely.make_valid(shapely.Polygon(_unwrapped(degrees))))
-    centre = np.mean([polygon.centroid.x for polygon in parts])
-    # All parts to one side of the world before they are cut.
-    moved = [shapely.transform(p, lambda xy, p=p: xy - [360 * round((p.centroid.x - centre) / 360), 0]) for p in parts]
+    # Parts on both sides of the antimeridian are neighbours: count all longitudes from the widest gap between parts.
+    lons = np.array([polygon.centroid.x for polygon in parts])
+    turns = np.floor((lons - _beyond_widest_gap(lons)) / 360)
+    moved = [shapely.transform(p, lambda xy, t=t: xy - [360 * t, 0]) for p, t in zip(parts, turns, strict=True)]
     area = shapely.union_all(moved)
     west, south, east, north = area.bounds
     cut = _cut(area, west, east)
     box = [-180.0, south, 180.0, north] if east - west >= 360 else [_in_range(west), south, _in_range(east), north]
     return _listed(shapely.geometry.mapping(cut)), [round(float(value), _DECIMALS) for value in box]
+
+
+def _beyond_widest_gap(lons: NDArray[np.float64]) -> float:
+    """Return the first longitude (0 to 360) to the east of the widest gap between longitudes."""
+    around = np.sort(np.mod(lons, 360))
+    gaps = np.diff(around, prepend=around[-1] - 360)
+    # Less a rounding error.
+    return float(around[np.argmax(gaps)]) - 1e-9
 
 
 def _polygons(geometry: BaseGeometry) -> list[Any]:

@@ -9,11 +9,14 @@ import pyproj
 import pytest
 from osgeo import gdal
 
-from ortho_pipeline.models import RPC
+from ortho_pipeline.models import RPC, FrameCamera
+from ortho_pipeline.models.frame.camera import MAP
+from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.surface import rays
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.rays import MANY, meet_surface
+from ortho_pipeline.surface.writing import write_dem
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +170,24 @@ def test_polynomials_in_height_go_through_their_values(count):
     powers = np.vander(rays.levels(count), increasing=True)
     np.testing.assert_allclose(np.einsum("lk,...ka->...la", powers, rays.polynomials(values)), values, atol=1e-13)
     assert rays.levels(count)[[0, -1]].tolist() == [-1.0, 1.0]
+
+
+@pytest.mark.parametrize("many", [1, MANY])
+def test_terrain_above_the_heights_of_a_model_is_met_step_by_step(tmp_path: Path, many: int) -> None:
+    """A model of 0 to 100 m that looks down at 45 degrees, and terraces of 50, 300 and 600 m towards the camera.
+
+    Where its rays are 100 m high they are over the second terrace; at 300 m over the third, which they meet.
+    """
+    interior, x, y = Interior(1000, 1000, 0.01, 1e-6, 1e-6), 300_000.0, 2_700_000.0
+    exterior = [x, y, 5000.0, np.pi / 4, 0.0, 0.0]
+    model = FrameCamera.from_map(interior, "EPSG:32651", exterior, frame=MAP, heights=(0.0, 100.0))
+    foot, above = model.image_to_ground([[500.0, 500.0]] * 2, [0.0, 600.0])
+    towards = np.sign(above[1] - foot[1])
+    assert above[1] - foot[1] == pytest.approx(600 * towards, rel=1e-3)
+    rows = np.indices((300, 60))[0] * 10.0 + 5.0
+    along = towards * (1500.0 - rows)
+    heights = np.select([along < 80, along < 250], [50.0, 300.0], 600.0)
+    write_dem(tmp_path / "dem.tif", heights, (foot[0] - 300.0, foot[1] + 1500.0), 10.0, "EPSG:32651")
+    image = np.full((many, 2), 500.0) + np.linspace(-3, 3, many)[:, None] * [1.0, 0.0]
+    found = meet_surface(model, image, open_dem(tmp_path / "dem.tif", "ellipsoid", fill="mask"))
+    np.testing.assert_allclose(found, model.image_to_ground(image, 600.0), atol=2e-3)

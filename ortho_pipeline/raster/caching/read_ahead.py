@@ -165,15 +165,16 @@ def _rectangles(places: set[tuple[int, int]]) -> list[tuple[int, int, int, int]]
     """Return rectangles (first row, last row + 1, first column, last column + 1) that are these places together."""
     open_runs: dict[tuple[int, int], int] = {}
     rectangles = []
-    rows = sorted({row for row, _ in places})
-    for row in rows:
+    below = 0  # the row after the one before, where its runs end
+    for row in sorted({row for row, _ in places}):
         columns = sorted(column for one, column in places if one == row)
         ends = [k for k in range(len(columns)) if k + 1 == len(columns) or columns[k + 1] != columns[k] + 1]
         starts = [0, *(k + 1 for k in ends[:-1])]
         runs = {(columns[a], columns[b] + 1) for a, b in zip(starts, ends, strict=True)}
-        for run in [run for run in open_runs if run not in runs or row - 1 not in rows]:
-            rectangles.append((open_runs.pop(run), row, *run))
+        for run in [run for run in open_runs if run not in runs or row != below]:
+            rectangles.append((open_runs.pop(run), below, *run))
         for run in runs:
             open_runs.setdefault(run, row)
-    rectangles += [(first, rows[-1] + 1, *run) for run, first in open_runs.items()]
+        below = row + 1
+    rectangles += [(first, below, *run) for run, first in open_runs.items()]
     return rectangles
