@@ -40,7 +40,7 @@ class Made:
         return DemHeights(surface, **more)
 
     def at(self, *places: tuple[float, float]) -> np.ndarray:
-        xy = np.array(places, dtype=float) + (EAST, NORTH)
+        xy = np.array(places, dtype=float) + np.array([EAST, NORTH])
         return ground_transform(CRS, "EPSG:4979")(np.column_stack([xy, np.zeros(len(xy))]))
 
 
