@@ -17,7 +17,7 @@ from ortho_pipeline.block import adjustment
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations import elimination
 from ortho_pipeline.block.equations.cofactors import Cofactors
-from ortho_pipeline.block.equations.elimination import Elimination, step_of
+from ortho_pipeline.block.equations.elimination import Elimination, step_of, weakest
 from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.equations.linear import Linear
@@ -160,7 +160,9 @@ def test_the_condition_is_that_of_the_design_without_the_points(linear: Linear) 
     design, size = dense(linear)[0], linear.problem.size
     of_points = np.linalg.qr(design[:, size:])[0]
     left = design[:, :size] - of_points @ (of_points.T @ design[:, :size])
-    assert step_of(linear).condition == pytest.approx(np.linalg.cond(left / np.linalg.norm(left, axis=0)), rel=1e-8)
+    scaled = left / np.linalg.norm(left, axis=0)
+    assert step_of(linear).condition == pytest.approx(np.linalg.cond(scaled), rel=1e-8)
+    assert abs(weakest(linear) @ np.linalg.svd(scaled)[2][-1]) == pytest.approx(1.0, rel=1e-8)
 
 
 def test_damped_steps_are_those_of_a_longer_diagonal(linear: Linear) -> None:
