@@ -22,6 +22,7 @@ from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.reliability.suspects import Trusted, _Limits, judge
 from ortho_pipeline.block.variances.components import Variances
+from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 
@@ -181,6 +182,36 @@ def test_a_pixel_of_an_image_is_one_ray_to_a_millionth(tmp_path: Path, column: f
         return
     with pytest.raises(InputError, match=r"line 3.*the same pixel.*line 2.*'a'"):
         read_block_points(path, crs="EPSG:4979")
+
+
+def test_a_group_of_few_points_counts_as_one_point(prepared: Any) -> None:
+    """The covariance of the parameters grows by as many times as points are more than groups."""
+    problem, state, selection = prepared
+    points = problem.points
+    groups, control = np.full(points.rays, -1), np.flatnonzero(points.control)
+    mine = [np.flatnonzero((points.image == 0) & (points.point == point))[0] for point in control]
+    groups[mine], tie = (0, 0, 0, 1), np.flatnonzero(points.tie)[0]
+    # Neighbours on ground that is not known say nothing.
+    groups[np.flatnonzero((points.image == 0) & (points.point == tie))] = 2
+    grouped = replace(problem, points=replace(points, groups=groups))
+    solved = attempt(grouped, state, selection)
+    found = SharedByImage.of(solved)
+    assert found is not None
+    assert [(name, one.points, one.groups) for name, one in found.images.items()] == [("i0", 4, 2)]
+    linear, flat = solved.linear, np.zeros((8, 2))
+    for k, ray in enumerate(mine):
+        rows = np.vstack([linear.by_point[ray], linear.ground_by_point[points.point[ray]]])
+        own = np.vstack([linear.by_params[ray][:, :2], np.zeros((3, 2))])
+        flat[2 * k : 2 * k + 2] = (own - rows @ np.linalg.lstsq(rows, own, rcond=None)[0])[:2]
+    sigma0 = solved.unit_weight()[0]
+    assert sigma0 is not None
+    # All of them are off by 0.002 px together.
+    alike = 0.002 * flat.T @ np.tile(np.eye(2), (4, 1)) / 0.1
+    inner = (4 / 2 - 1) * sigma0**2 * flat.T @ flat + alike @ alike.T
+    own = solved.cofactors.matrix[:, :2]
+    wanted = solved.cofactors.matrix + own @ inner @ own.T
+    np.testing.assert_allclose(found.added(solved.cofactors).matrix, wanted, rtol=1e-9, atol=1e-15)
+    assert SharedByImage.of(attempt(problem, state, selection)) is None
 
 
 # -- suspects ----------------------------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ from ortho_pipeline.block.intersection import frame_of, meet
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability import blunders
 from ortho_pipeline.block.variances import control_equations
+from ortho_pipeline.block.variances.grid import posterior
 from ortho_pipeline.estimation.observations.on_points import OnPoints
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import as_ground
@@ -328,6 +329,39 @@ def test_nodes_are_the_least_squares_problems_with_their_variances() -> None:
     nodes = np.exp(np.random.default_rng(0).normal(size=(200, 3)))
     alone = [equations.likelihoods(node[None])[0] for node in nodes]
     np.testing.assert_allclose(equations.likelihoods(nodes), alone, rtol=1e-13)
+
+
+def test_covariances_are_means_over_the_factors_that_are_possible() -> None:
+    """Of stated ground and few measurements: by the restricted likelihood of dense problems, and the prior."""
+    models, points = strip(4, 24, seed=4)
+    ordered, frame = tuple(models.values()), frame_of(tuple(models.values()), points)
+    problem = BlockProblem(points, ordered, frame, np.where(points.control[:, None], points.ground, np.nan))
+    rays = np.ones(points.rays, dtype=bool)
+    local = meet(frame, ordered, points, rays)
+    rays &= np.isfinite(local).all(axis=1)[points.point]
+    solved = solve(problem, State(ordered, local), Selection.of(rays, points.control))
+    (design, misfits), count, size = dense(solved.linear), solved.linear.ordering.observations, problem.size
+    freedom = len(misfits) - design.shape[1]
+    assert freedom < 30
+    logs = np.linspace(-1.5, 2.5, 400)
+    chances, squares = np.zeros(400), np.zeros((400, size, size))
+    for k, log in enumerate(logs):
+        factor = np.where(np.arange(len(misfits)) < count, np.exp(-log), 1.0)
+        a, r = design * factor[:, None], misfits * factor
+        cofactors = np.linalg.inv(a.T @ a)
+        step = cofactors @ (a.T @ r)
+        left = r - a @ step
+        squares[k] = (cofactors + np.outer(step, step))[:size, :size]
+        chances[k] = np.log(factor).sum() + 0.5 * np.linalg.slogdet(cofactors)[1] - 0.5 * left @ left
+        chances[k] -= np.log1p(0.1 / np.exp(log)) + np.log1p(np.exp(2 * log) / 10.0**2)
+    chances = np.exp(chances - chances.max())
+    chances /= chances.sum()
+    found = posterior(solved)
+    assert found.image_square == pytest.approx(chances @ np.exp(2 * logs), rel=2e-3)
+    wanted = np.tensordot(chances, squares, 1)
+    sigmas = np.sqrt(np.diag(wanted))
+    apart = (found.covariance.matrix - wanted) / np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(apart, 0.0, atol=3e-3)
 
 
 def test_equations_with_a_few_points_elsewhere_are_those_of_the_state(linear: Linear) -> None:
