@@ -18,12 +18,14 @@ from ortho_pipeline.block.determination import uncertain_images
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem, Misfits, Pseudo, Selection
 from ortho_pipeline.block.equations.solver import Solved, attempt
+from ortho_pipeline.block.heights.settling import _stable
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.reliability.suspects import Trusted, _Limits, judge
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.errors import DegeneratePoints, InputError
+from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.geodesy.crs import ground_transform
 
 
@@ -182,6 +184,33 @@ def test_a_pixel_of_an_image_is_one_ray_to_a_millionth(tmp_path: Path, column: f
         return
     with pytest.raises(InputError, match=r"line 3.*the same pixel.*line 2.*'a'"):
         read_block_points(path, crs="EPSG:4979")
+
+
+def planes(above: np.ndarray, on: np.ndarray, sigma: float) -> Planes:
+    """Return level planes so far above the middle of the frame."""
+    places = np.column_stack([np.zeros((len(above), 2)), above])
+    return Planes(places, np.tile(np.eye(3), (len(above), 1, 1)), np.where(on, sigma, np.inf))
+
+
+@pytest.mark.parametrize("sigma", [0.25, 4.0])
+def test_heights_are_stable_if_two_per_cent_moved_by_two_per_cent_of_their_sigma(sigma: float) -> None:
+    on, count = np.arange(2000) < 1000, np.arange(2000)
+    before = planes(np.zeros(2000), on, sigma)
+    solved: Any = SimpleNamespace(
+        problem=SimpleNamespace(heights=before), state=SimpleNamespace(local=np.ones((2000, 3)))
+    )
+
+    def stable(moved: np.ndarray, used: np.ndarray = on) -> bool:
+        problem: Any = SimpleNamespace(heights=planes(moved, used, sigma))
+        return _stable(solved, problem)
+
+    assert stable(np.full(2000, 0.019 * sigma))
+    assert not stable(np.full(2000, -0.021 * sigma))
+    assert stable(9.0 * sigma * (count < 20))
+    assert not stable(9.0 * sigma * (count < 21))
+    # One of a thousand may be left out anew or take part again.
+    assert stable(np.zeros(2000), on ^ (count == 1000))
+    assert not stable(np.zeros(2000), on ^ ((count >= 999) & (count <= 1001)))
 
 
 def test_a_group_of_few_points_counts_as_one_point(prepared: Any) -> None:
