@@ -15,11 +15,12 @@ from ortho_pipeline.estimation.blunders import _together_apart, are_alike, contr
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
+from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.problem import Problem
 from ortho_pipeline.estimation.records import CommonError
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.correlation import _default_near, _edges, _function, _mean_p, _moran, analyse
-from ortho_pipeline.models import RPC, start_model
+from ortho_pipeline.models import RPC, ImageCorrection, start_model
 from ortho_pipeline.points import Points
 
 
@@ -134,6 +135,34 @@ def test_the_regularisation_is_an_observation_of_zero_with_this_sigma(family: st
         order = sum(int(power or 1) for power in re.findall(r"[XYZ](\d?)", name))
         grade = 10.0 ** (order - (1 if "den_" in name else 2))
         assert sigma == pytest.approx(0.4 / (grade * half * math.sqrt(strength))), name
+
+
+def test_one_step_of_a_linear_model_is_its_whole_solution(level: RPC) -> None:
+    """Residuals of points and of what is known before, sigma0 and redundancy: by plain least squares."""
+    random = np.random.default_rng(5)
+    ground = np.column_stack(
+        [random.uniform(19.992, 20.008, 9), random.uniform(-30.008, -29.992, 9), np.full(9, 400.0)]
+    )
+    image = level.ground_to_image(ground) + (7.0, -4.0) + random.normal(0, 0.5, (9, 2))
+    points = Points.of(image, ground, "EPSG:4979", sigma_image=0.5)
+    model = ImageCorrection.identity(level, "shift-drift", (1000.0, 1000.0))
+    names = model.param_names
+    known = {names[0]: Prior(5.0, 0.4), names[-1]: Prior(-2e-3, 1e-3)}
+    problem = Problem.of(model, points, np.ones(9, dtype=bool), known)
+    keep = np.arange(9) != 4
+    step, whole = problem.solve(keep, linear=True), problem.solve(keep)
+    rows = np.zeros((2, len(names)))
+    rows[0, 0], rows[1, -1] = 1 / 0.4, 1 / 1e-3
+    design = np.vstack([model.param_partials(ground[keep]).reshape(16, -1) / 0.5, rows])
+    observed = np.concatenate([(image - level.ground_to_image(ground))[keep].ravel() / 0.5, [5 / 0.4, -2.0]])
+    values, (square,), *_ = np.linalg.lstsq(design, observed, rcond=None)
+    np.testing.assert_allclose(whole.model.params, values, rtol=1e-8)
+    for found in (step, whole):
+        assert found.freedom == 18 - len(names)
+        assert found.sigma0 == pytest.approx(math.sqrt(square / (18 - len(names))))
+        np.testing.assert_allclose(found.residuals.ravel(), (observed - design @ values)[:16] * 0.5, atol=1e-8)
+        np.testing.assert_allclose(found.cofactors, np.linalg.inv(design.T @ design), rtol=1e-8, atol=1e-15)
+    np.testing.assert_array_equal(step.model.params, model.params)
 
 
 # -- errors of neighbours ----------------------------------------------------------------------------------------------
