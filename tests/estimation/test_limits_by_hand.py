@@ -140,10 +140,8 @@ def test_the_regularisation_is_an_observation_of_zero_with_this_sigma(family: st
 def test_one_step_of_a_linear_model_is_its_whole_solution(level: RPC) -> None:
     """Residuals of points and of what is known before, sigma0 and redundancy: by plain least squares."""
     random = np.random.default_rng(5)
-    ground = np.column_stack(
-        [random.uniform(19.992, 20.008, 9), random.uniform(-30.008, -29.992, 9), np.full(9, 400.0)]
-    )
-    image = level.ground_to_image(ground) + (7.0, -4.0) + random.normal(0, 0.5, (9, 2))
+    ground = np.column_stack([random.uniform([19.992, -30.008], [20.008, -29.992], (9, 2)), np.full(9, 400.0)])
+    image = level.ground_to_image(ground) + random.normal((7.0, -4.0), 0.5, (9, 2))
     points = Points.of(image, ground, "EPSG:4979", sigma_image=0.5)
     model = ImageCorrection.identity(level, "shift-drift", (1000.0, 1000.0))
     names = model.param_names
