@@ -19,6 +19,7 @@ from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem, Misfits, Pseudo, Selection
 from ortho_pipeline.block.equations.solver import Solved, attempt
 from ortho_pipeline.block.heights.settling import _stable
+from ortho_pipeline.block.heights.terrain import LocalTerrain
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.block.reliability.suspects import Trusted, _Limits, judge
@@ -313,3 +314,39 @@ def test_limits_are_those_of_fishers_distribution(solved: Solved, prepared: Any)
         edge = size * f.isf(0.01 / 4, size, 6.0)
         assert limits.passes_ground(np.array([0.999, 1.001]) * edge, size).tolist() == [True, False]
     assert not limits.passes(np.zeros(1), 0).any()
+
+
+# -- planes of a DEM ---------------------------------------------------------------------------------------------------
+
+
+def test_planes_of_a_dem_are_along_its_slopes(prepared: Any) -> None:
+    """A point that moves over its plane stays on it; one that is known in plan has the error of its plan in height."""
+    problem, state, _ = prepared
+    count, placed = len(problem.points), int(np.flatnonzero(problem.points.control)[0])
+    known = problem.known.copy()
+    known[placed, 2] = np.nan
+    problem = replace(problem, known=known)
+    ground = problem.frame.geodetic(state.local)
+    slopes, heights = np.tile([0.3, -0.4], (count, 1)), ground[:, 2] + 5.0
+    tie = np.flatnonzero(problem.points.tie)
+    heights[tie[0]] = slopes[tie[1], 1] = np.nan
+    sigmas = np.full(count, 2.0)
+    sigmas[tie[2]] = np.inf
+    none = np.zeros(count, dtype=bool)
+    terrain = LocalTerrain(ground, heights, slopes, ground[:, :2], slopes, none, none, 10.0)
+    of = problem.points.tie | (np.arange(count) == placed)
+    of[tie[3]] = False
+    found = terrain.planes(problem, of, sigmas, np.full(count, 1.0))
+    assert np.flatnonzero(~found.on & of).tolist() == tie[:3].tolist()
+    assert not found.on[tie[3]]
+    length, enu = math.sqrt(1.25), problem.frame.enu_at(ground)
+    axes = found.axes[tie[4:]]
+    np.testing.assert_allclose(axes @ axes.swapaxes(1, 2), [np.eye(3)] * len(axes), atol=1e-12)
+    for moved, above in (((0.0, 0.0, 0.0), 4.0), ((10.0, 0.0, 3.0), 4.0), ((0.0, 10.0, -4.0), 4.0), ((0, 0, 2.5), 1.5)):
+        off = found.above(state.local + np.einsum("nij,i->nj", enu, np.array(moved, dtype=float)))
+        np.testing.assert_allclose(off[tie[4:]], above / length, atol=1e-3)
+    np.testing.assert_allclose(found.sigmas[tie[4:]], 2.0 / length)
+    # With a sigma of 0.1 m in plan.
+    assert found.sigmas[placed] == pytest.approx(math.sqrt(4.0 + 0.25 * 0.1**2))
+    off = found.above(state.local + np.einsum("nij,i->nj", enu, np.array([10.0, 7.0, 1.0])))
+    assert off[placed] == pytest.approx(3.0, abs=1e-3)
