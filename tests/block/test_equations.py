@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pyproj
 import pytest
+from chains import dense
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from ortho_pipeline.block import adjustment
@@ -108,30 +109,6 @@ def linear() -> Linear:
         ground_weights=random.uniform(1e-8, 1, len(points)),
     )  # fmt: skip
     return Linear.at(problem, State(ordered, local), weights)
-
-
-def dense(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of all equations by parameters, then points that take part, and their misfits."""
-    problem, points, numbers = linear.problem, linear.problem.points, linear.ordering.numbers
-    place = np.full(len(points), -1)
-    place[numbers] = problem.size + 3 * np.arange(len(numbers))
-    design, misfits = [], []
-    for ray in linear.ordering.rays:
-        rows = np.zeros((2, problem.size + 3 * len(numbers)))
-        of_image = problem.columns.of_image(points.image[ray])
-        rows[:, of_image] = linear.by_params[ray][:, : len(of_image)]
-        rows[:, place[points.point[ray]] + np.arange(3)] = linear.by_point[ray]
-        design.append(rows)
-        misfits.append(linear.misfits.rays[ray])
-    for point in linear.ordering.grounded:
-        rows = np.zeros((3, problem.size + 3 * len(numbers)))
-        rows[:, place[point] + np.arange(3)] = linear.ground_by_point[point]
-        design.append(rows)
-        misfits.append(linear.misfits.ground[point])
-    known = linear.pseudo_design
-    design.append(np.pad(known, ((0, 0), (0, 3 * len(numbers)))))
-    misfits.append(linear.misfits.pseudo)
-    return np.concatenate(design), np.concatenate(misfits)
 
 
 def test_a_step_is_that_of_one_least_squares_problem_of_all_unknowns(linear: Linear) -> None:
