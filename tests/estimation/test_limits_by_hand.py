@@ -14,12 +14,14 @@ from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.blunders import _together_apart, are_alike, contradicting, refuse_many
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
+from ortho_pipeline.estimation.least_squares import solve_linear
 from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.problem import Problem
 from ortho_pipeline.estimation.records import CommonError
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.spatial.correlation import _default_near, _edges, _function, _mean_p, _moran, analyse
+from ortho_pipeline.estimation.spatial.shared_errors import _cell_means
 from ortho_pipeline.models import RPC, ImageCorrection, start_model
 from ortho_pipeline.points import Points
 
@@ -163,6 +165,25 @@ def test_one_step_of_a_linear_model_is_its_whole_solution(level: RPC) -> None:
     np.testing.assert_array_equal(step.model.params, model.params)
 
 
+@pytest.mark.parametrize("rows", [2, 3, 5])
+def test_a_straight_line_has_the_sigmas_of_the_textbook(rows: int) -> None:
+    """With one observation more than unknowns there is a sigma0, with as many there is none."""
+    x = np.arange(rows, dtype=float)
+    y = 3.0 + 2.0 * x + np.array([0.3, -0.5, 0.4, 0.1, -0.2])[:rows]
+    found = solve_linear(np.column_stack([np.ones(rows), x]), y)
+    fitted = np.polyfit(x, y, 1)[::-1]
+    np.testing.assert_allclose(found.values, fitted, rtol=1e-12)
+    if rows == 2:
+        assert math.isnan(found.sigma0)
+        return
+    left = y - fitted[0] - fitted[1] * x
+    assert found.sigma0 == pytest.approx(math.sqrt(left @ left / (rows - 2)))
+    spread = ((x - x.mean()) ** 2).sum()
+    assert found.sigmas == pytest.approx(found.sigma0 * np.sqrt([1 / rows + x.mean() ** 2 / spread, 1 / spread]))
+    length = np.array([math.sqrt(rows), math.sqrt(float(x @ x))])
+    assert found.condition == pytest.approx(np.linalg.cond(np.column_stack([np.ones(rows), x]) / length))
+
+
 # -- errors of neighbours ----------------------------------------------------------------------------------------------
 
 
@@ -238,3 +259,23 @@ def test_moran_is_of_the_four_nearest() -> None:
     wanted = np.mean([about[k] * about[j] for k in range(15) for j in nearest[k]], axis=0) / (about**2).mean(axis=0)
     found = analyse(np.column_stack([x, 0 * x]), values, draws=19)
     assert found.moran == pytest.approx(tuple(wanted))
+
+
+@pytest.mark.parametrize(("across", "down", "cells"), [(24, 24, 144), (36, 16, 144), (600, 1, 144), (5, 5, 25)])
+def test_points_are_averaged_over_square_cells(across: int, down: int, cells: int) -> None:
+    """About 144, as long as wide; noise stays as it is."""
+    x, y = np.meshgrid(np.arange(across) + 0.5, np.arange(down) + 0.5)
+    image = np.column_stack([x.ravel(), y.ravel()]) * 10.0 + (1000.0, -500.0)
+    means = _cell_means(image[np.random.default_rng(1).permutation(len(image))])
+    assert len(means) == cells
+    np.testing.assert_allclose(means @ means.T, np.eye(cells), atol=1e-12)
+    each = (means > 0).sum(axis=1)
+    assert each.sum() == len(image)
+    assert each.max() - each.min() <= 1
+    np.testing.assert_allclose(means.sum(axis=1), np.sqrt(each))
+
+
+def test_the_points_of_a_cell_are_neighbours() -> None:
+    image = np.random.default_rng(2).uniform(0, 1000, (900, 2))
+    for row in _cell_means(image):
+        assert np.ptp(image[row > 0], axis=0).max() <= 1000 / 12 + 1
