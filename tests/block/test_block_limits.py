@@ -16,7 +16,7 @@ from ortho_pipeline.block.adjustment import _prepared
 from ortho_pipeline.block.datum import _held, _missed, _pixels_per_metre, with_start_errors
 from ortho_pipeline.block.determination import uncertain_images
 from ortho_pipeline.block.equations.linear import Linear
-from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem, Misfits, Pseudo, Selection
+from ortho_pipeline.block.equations.problem import PERFECT_GROUND, BlockProblem, Misfits, Pseudo, Selection, State
 from ortho_pipeline.block.equations.solver import Solved, attempt
 from ortho_pipeline.block.heights.settling import _stable
 from ortho_pipeline.block.heights.terrain import LocalTerrain
@@ -28,6 +28,7 @@ from ortho_pipeline.block.variances.shared_errors import SharedByImage
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.observations.on_points import Planes
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.models.base import Constraints
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +112,19 @@ def test_held_parameters_outweigh_an_error_that_all_rays_share(prepared: Any) ->
     of_start[[1, 3], [0, 1]] = roots[1:] ** 2 * 4.0 * np.sqrt(1 - 1 / found.firmness[1:])
     wanted = covariance + covariance @ of_start @ of_start.T @ covariance
     np.testing.assert_allclose(with_start_errors(linear, solved.cofactors).matrix, wanted, rtol=1e-9, atol=1e-15)
+
+
+def test_constraints_of_models_are_equations_of_their_images(prepared: Any) -> None:
+    problem, state, _ = prepared
+    jacobian = np.array([[1.0, 0.0], [2.0, -3.0]])
+    known = Constraints(np.array([4.0, 6.0]), jacobian, np.array([0.5, 2.0]), np.array([True, False]))
+    models = (state.models[0], SimpleNamespace(constraints=lambda: known, params=np.zeros(2)))
+    held = replace(problem, pseudo=(Pseudo(1, 0.0, 4.0, held=True), Pseudo(2, 1.0, 5.0)))
+    found = held.pseudo_equations(State(models, state.local))  # type: ignore[arg-type]
+    assert found.image.tolist() == [0, 1, 1, 1]
+    assert found.true.tolist() == [False, True, False, True]
+    np.testing.assert_allclose(found.misfit[1:], [0.2, 8.0, 3.0])
+    np.testing.assert_allclose(found.rows, [[0.0, 0.25], [0.2, 0.0], [2.0, 0.0], [1.0, -1.5]])
 
 
 def test_the_datum_is_measured_by_how_far_rays_miss_each_other(prepared: Any) -> None:
