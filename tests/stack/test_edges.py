@@ -181,7 +181,7 @@ def test_a_single_date_changes_a_step_by_three_sigmas_at_most() -> None:
 
 
 def test_the_variance_of_a_value_is_the_sum_of_all_that_errs() -> None:
-    """Noise by the variance that each value has, correlations alike, an edge's part by its factor, and what is alike."""
+    """Noise by the variance of each value, correlations alike, an edge's part by its factor, and what is alike."""
     relative = np.array([[1.0, 2.0], [0.5, 4.0]])
     edges = Edges(np.array([0, 1]), np.array([1, 2]), np.zeros((2, 2, 2)), relative, np.array([0.3, 0.0]))
     np.testing.assert_allclose(edges.relative, relative / 1.5)
