@@ -14,6 +14,7 @@ from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.blunders import _together_apart, are_alike, contradicting, refuse_many
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
+from ortho_pipeline.estimation.fit import fit
 from ortho_pipeline.estimation.least_squares import solve_linear
 from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.observations.prior import Prior
@@ -99,6 +100,29 @@ def test_contradicting_points_are_counted_and_the_worst_named() -> None:
         "4 of 9 check points contradict the block (worst: a, b, c)"
     )
     assert contradicting(0, 3, list("abc")) == "3 check points together contradict the control points (a, b, c)"
+
+
+def test_check_points_that_are_apart_are_compared_with_what_control_lets_expect(level: RPC) -> None:
+    """The scatter of control is three times what is stated: a point off a mean of nine varies by 10/9 of its square."""
+    random = np.random.default_rng(4)
+    ground = np.column_stack([random.uniform([19.992, -30.008], [20.008, -29.992], (13, 2)), np.full(13, 400.0)])
+    image = level.ground_to_image(ground) + random.normal((7.0, -4.0), 0.6, (13, 2))
+    image[9:11] += 30.0, 40.0
+    roles = ["control"] * 9 + ["check"] * 4
+    points = Points.of(image, ground, "EPSG:4979", roles=roles, sigma_image=0.2)
+    found = fit(ImageCorrection.identity(level, "shift", (1000.0, 1000.0)), points, robust=False)
+    misses = (image - level.ground_to_image(ground))[9:] - (image - level.ground_to_image(ground))[:9].mean(axis=0)
+    squares = (misses**2).sum(axis=1)
+    scatter = (image - level.ground_to_image(ground))[:9].var(axis=0, ddof=1).sum()
+    assert found.sigma0 == pytest.approx(math.sqrt(scatter / 2) / 0.2)
+    assert found.sigma0 > 2.0
+    (notice,) = [one for one in found.warnings if one.code == "checks-apart"]
+    fields = notice.fields
+    assert (fields["count"], fields["off"], sorted(fields["points"])) == (4, 2, ["10", "11"])
+    assert fields["rmse"] == pytest.approx(math.sqrt(squares.mean()))
+    assert fields["rest"] == pytest.approx(math.sqrt(squares[2:].mean()))
+    assert fields["expected"] == pytest.approx(math.sqrt(scatter * 10 / 9))
+    assert fields["alike"] is True
 
 
 def test_a_common_error_is_published_in_metres() -> None:
