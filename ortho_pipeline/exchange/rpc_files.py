@@ -157,9 +157,6 @@ def _rpc(fields: Mapping[str, str], file: str | PathLike[str] | None, origin: fl
         values[name] = _coefficients(fields, key, file)
     for key, name in ERRORS.items():
         values[name] = _error(fields.get(key), file, key)
-    lat, lon = values["lat_off"], values["lon_off"]
-    if abs(lat) > 90.0 or abs(lon) > 540.0:  # type: ignore[arg-type]
-        raise InputError(f"latitude {lat}, longitude {lon} is not on Earth", file=file, field="LAT_OFF, LONG_OFF")
     for name in ("row_off", "col_off"):
         values[name] += _CENTRE - origin  # type: ignore[operator]
     try:

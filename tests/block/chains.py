@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 from ortho_studies.simulation.scanner import LineScanner
 
+from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.points import BlockPoints
@@ -293,3 +294,27 @@ def neighbours(block: Block) -> list[tuple[str, str]]:
 def misfits(block: Block, fit: BlockFit) -> Array:
     """Return how far (px) neighbours are from each other."""
     return np.array([float(np.hypot(*apart(block, fit, *pair))) for pair in neighbours(block)])
+
+
+def dense(linear: Linear) -> tuple[Array, Array]:
+    """Return the rows of all equations by parameters, then points that take part, and their misfits."""
+    problem, points, numbers = linear.problem, linear.problem.points, linear.ordering.numbers
+    place = np.full(len(points), -1)
+    place[numbers] = problem.size + 3 * np.arange(len(numbers))
+    design, misfits = [], []
+    for ray in linear.ordering.rays:
+        rows = np.zeros((2, problem.size + 3 * len(numbers)))
+        of_image = problem.columns.of_image(points.image[ray])
+        rows[:, of_image] = linear.by_params[ray][:, : len(of_image)]
+        rows[:, place[points.point[ray]] + np.arange(3)] = linear.by_point[ray]
+        design.append(rows)
+        misfits.append(linear.misfits.rays[ray])
+    for point in linear.ordering.grounded:
+        rows = np.zeros((3, problem.size + 3 * len(numbers)))
+        rows[:, place[point] + np.arange(3)] = linear.ground_by_point[point]
+        design.append(rows)
+        misfits.append(linear.misfits.ground[point])
+    known = linear.pseudo_design
+    design.append(np.pad(known, ((0, 0), (0, 3 * len(numbers)))))
+    misfits.append(linear.misfits.pseudo)
+    return np.concatenate(design), np.concatenate(misfits)

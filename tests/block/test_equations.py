@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pyproj
 import pytest
+from chains import dense
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from ortho_pipeline.block import adjustment
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations import elimination
 from ortho_pipeline.block.equations.cofactors import Cofactors
-from ortho_pipeline.block.equations.elimination import Elimination, step_of
+from ortho_pipeline.block.equations.elimination import Elimination, step_of, weakest
 from ortho_pipeline.block.equations.image_pairs import ImagePairs, Levels
 from ortho_pipeline.block.equations.level_factor import LevelFactor
 from ortho_pipeline.block.equations.linear import Linear
@@ -29,6 +30,7 @@ from ortho_pipeline.block.intersection import frame_of, meet
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.reliability import blunders
 from ortho_pipeline.block.variances import control_equations
+from ortho_pipeline.block.variances.grid import posterior
 from ortho_pipeline.estimation.observations.on_points import OnPoints
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import as_ground
@@ -109,30 +111,6 @@ def linear() -> Linear:
     return Linear.at(problem, State(ordered, local), weights)
 
 
-def dense(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of all equations by parameters, then points that take part, and their misfits."""
-    problem, points, numbers = linear.problem, linear.problem.points, linear.ordering.numbers
-    place = np.full(len(points), -1)
-    place[numbers] = problem.size + 3 * np.arange(len(numbers))
-    design, misfits = [], []
-    for ray in linear.ordering.rays:
-        rows = np.zeros((2, problem.size + 3 * len(numbers)))
-        of_image = problem.columns.of_image(points.image[ray])
-        rows[:, of_image] = linear.by_params[ray][:, : len(of_image)]
-        rows[:, place[points.point[ray]] + np.arange(3)] = linear.by_point[ray]
-        design.append(rows)
-        misfits.append(linear.misfits.rays[ray])
-    for point in linear.ordering.grounded:
-        rows = np.zeros((3, problem.size + 3 * len(numbers)))
-        rows[:, place[point] + np.arange(3)] = linear.ground_by_point[point]
-        design.append(rows)
-        misfits.append(linear.misfits.ground[point])
-    known = linear.pseudo_design
-    design.append(np.pad(known, ((0, 0), (0, 3 * len(numbers)))))
-    misfits.append(linear.misfits.pseudo)
-    return np.concatenate(design), np.concatenate(misfits)
-
-
 def test_a_step_is_that_of_one_least_squares_problem_of_all_unknowns(linear: Linear) -> None:
     design, misfits = dense(linear)
     size, numbers = linear.problem.size, linear.ordering.numbers
@@ -160,7 +138,9 @@ def test_the_condition_is_that_of_the_design_without_the_points(linear: Linear) 
     design, size = dense(linear)[0], linear.problem.size
     of_points = np.linalg.qr(design[:, size:])[0]
     left = design[:, :size] - of_points @ (of_points.T @ design[:, :size])
-    assert step_of(linear).condition == pytest.approx(np.linalg.cond(left / np.linalg.norm(left, axis=0)), rel=1e-8)
+    scaled = left / np.linalg.norm(left, axis=0)
+    assert step_of(linear).condition == pytest.approx(np.linalg.cond(scaled), rel=1e-8)
+    assert abs(weakest(linear) @ np.linalg.svd(scaled)[2][-1]) == pytest.approx(1.0, rel=1e-8)
 
 
 def test_damped_steps_are_those_of_a_longer_diagonal(linear: Linear) -> None:
@@ -326,6 +306,39 @@ def test_nodes_are_the_least_squares_problems_with_their_variances() -> None:
     nodes = np.exp(np.random.default_rng(0).normal(size=(200, 3)))
     alone = [equations.likelihoods(node[None])[0] for node in nodes]
     np.testing.assert_allclose(equations.likelihoods(nodes), alone, rtol=1e-13)
+
+
+def test_covariances_are_means_over_the_factors_that_are_possible() -> None:
+    """Of stated ground and few measurements: by the restricted likelihood of dense problems, and the prior."""
+    models, points = strip(4, 24, seed=4)
+    ordered, frame = tuple(models.values()), frame_of(tuple(models.values()), points)
+    problem = BlockProblem(points, ordered, frame, np.where(points.control[:, None], points.ground, np.nan))
+    rays = np.ones(points.rays, dtype=bool)
+    local = meet(frame, ordered, points, rays)
+    rays &= np.isfinite(local).all(axis=1)[points.point]
+    solved = solve(problem, State(ordered, local), Selection.of(rays, points.control))
+    (design, misfits), count, size = dense(solved.linear), solved.linear.ordering.observations, problem.size
+    freedom = len(misfits) - design.shape[1]
+    assert freedom < 30
+    logs = np.linspace(-1.5, 2.5, 400)
+    chances, squares = np.zeros(400), np.zeros((400, size, size))
+    for k, log in enumerate(logs):
+        factor = np.where(np.arange(len(misfits)) < count, np.exp(-log), 1.0)
+        a, r = design * factor[:, None], misfits * factor
+        cofactors = np.linalg.inv(a.T @ a)
+        step = cofactors @ (a.T @ r)
+        left = r - a @ step
+        squares[k] = (cofactors + np.outer(step, step))[:size, :size]
+        chances[k] = np.log(factor).sum() + 0.5 * np.linalg.slogdet(cofactors)[1] - 0.5 * left @ left
+        chances[k] -= np.log1p(0.1 / np.exp(log)) + np.log1p(np.exp(2 * log) / 10.0**2)
+    chances = np.exp(chances - chances.max())
+    chances /= chances.sum()
+    found = posterior(solved)
+    assert found.image_square == pytest.approx(chances @ np.exp(2 * logs), rel=2e-3)
+    wanted = np.tensordot(chances, squares, 1)
+    sigmas = np.sqrt(np.diag(wanted))
+    apart = (found.covariance.matrix - wanted) / np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(apart, 0.0, atol=3e-3)
 
 
 def test_equations_with_a_few_points_elsewhere_are_those_of_the_state(linear: Linear) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -73,3 +74,17 @@ def test_angles_are_those_between_the_places_of_the_cameras(block):
 
 def test_images_without_points_in_common_are_parts_of_their_own(block):
     assert network_of(block[1]).parts == (("a", "b", "c"), ("d",))
+
+
+def test_points_without_a_place_leave_the_others_their_angles(block):
+    _, fit, _ = block
+    ground = fit.ground.copy()
+    ground[3] = np.nan
+    before, found = network_of(fit), network_of(dataclasses.replace(fit, ground=ground))
+    assert found.largest_deg[3] is None
+    np.testing.assert_allclose(np.delete(np.array(found.largest_deg, dtype=float), 3),
+                               np.delete(np.array(before.largest_deg, dtype=float), 3), atol=1e-6)  # fmt: skip
+    assert [pair.points for pair in found.pairs] == [pair.points - 1 for pair in before.pairs]
+    assert found.angles is not None
+    assert found.angles.points == 14
+    assert network_of(dataclasses.replace(fit, ground=np.full_like(ground, np.nan))).angles is None

@@ -118,7 +118,7 @@ def as_if(base: Fit, name: str, parameters: int, squares: np.ndarray) -> Compare
     return ComparedModel.of(name, (parameters, 4, 3), found)
 
 
-@pytest.mark.parametrize(("goal", "chosen"), [(0.04, "free"), (0.06, "own")])
+@pytest.mark.parametrize(("goal", "chosen"), [(0.048, "free"), (0.052, "own")])
 def test_the_scenes_own_model_gives_way_at_five_per_cent(affine: Fit, goal: float, chosen: str) -> None:
     """One-sided, by the paired test of SciPy on five differences."""
     best, noise = np.array([2.0, 3.0, 2.5, 3.5, 2.2]), np.array([1.0, -1.0, 0.3, -0.6, 0.8])

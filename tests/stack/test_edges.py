@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.graph import pairs_of
 from ortho_pipeline.block.stack.steps import steps_of
@@ -177,3 +178,23 @@ def test_a_single_date_changes_a_step_by_three_sigmas_at_most() -> None:
     scatter = np.array(other.sigma) / np.sqrt(1 / 23 + 1 / 17)
     change = (np.array(other.size) - step.size) * 17 / scatter
     assert (np.abs(change - 3) < 1).all()
+
+
+def test_the_variance_of_a_value_is_the_sum_of_all_that_errs() -> None:
+    """Noise by the variance of each value, correlations alike, an edge's part by its factor, and what is alike."""
+    relative = np.array([[1.0, 2.0], [0.5, 4.0]])
+    edges = Edges(np.array([0, 1]), np.array([1, 2]), np.zeros((2, 2, 2)), relative, np.array([0.3, 0.0]))
+    np.testing.assert_allclose(edges.relative, relative / 1.5)
+    shared, own = np.arange(14.0).reshape(2, 7), np.arange(14.0).reshape(2, 7)[::-1] ** 2
+    made = ErrorComponents(shared, own, np.ones(3), np.array([2.0, 5.0]), np.array([0.1, 0.3]))
+    of_date, of_edge = made.at_place(edges)
+    for edge in range(2):
+        for place in range(2):
+            noise, rest = (shared[0] + shared[1]) / 2, (own[0] + own[1]) / 2
+            value = relative[edge, place] / 1.5
+            assert of_date[edge, place] == pytest.approx(noise[0] * value + noise[1:].sum())
+            wanted = (2.0, 5.0)[edge] * (rest[0] * value + rest[1:].sum()) + 0.2 + (0.09, 0.0)[edge]
+            assert of_edge[edge, place] == pytest.approx(wanted)
+    np.testing.assert_allclose(made.of_seasons, [0.0, 0.0])
+    less = ErrorComponents(shared, own, np.ones(3), np.ones(2), np.array([-0.4, 0.3]))
+    np.testing.assert_allclose(less.of_seasons, [0.2, 0.0])
