@@ -21,7 +21,7 @@ from urllib.parse import unquote
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.files.traffic import COUNTING
+from ortho_pipeline.files.traffic import count_gdal
 
 #: Schemes of web servers, which give files and neither list nor take any, and GDAL's file systems that read them.
 WEB = {"https": "/vsicurl/https://", "http": "/vsicurl/http://"}
@@ -258,7 +258,7 @@ _CLOSED = {
 }
 _closed_with: dict[str, str | None] = {}
 #: A request that fails in passing (429, 502, 503, 504, no answer) is repeated by GDAL too, if nobody says otherwise.
-_PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10", **COUNTING}
+_PATIENT = {"GDAL_HTTP_MAX_RETRY": "5", "GDAL_HTTP_RETRY_DELAY": "0.2", "GDAL_HTTP_CONNECTTIMEOUT": "10"}
 
 
 def close_network() -> None:
@@ -285,6 +285,7 @@ def _open_network() -> None:
     _closed_with.clear()
     for key, value in _PATIENT.items():
         os.environ.setdefault(key, value)
+    count_gdal()
 
 
 #: What readers of metadata take.
@@ -294,8 +295,7 @@ AnyPath = str | os.PathLike[str]
 class Location(str):
     """What a user or a document calls a file or a folder: the same text, which knows what kind of place it is.
 
-    A path on this machine, an address of `SCHEMES`, or a name of GDAL's. Nothing is opened; only `archive` looks at
-    the disk.
+    A path on this machine, an address of `SCHEMES`, or a name of GDAL's. Only `archive` looks at the disk.
     """
 
     __slots__ = ()

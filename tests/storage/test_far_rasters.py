@@ -85,6 +85,20 @@ def test_an_ortho_of_far_files_waits_for_few_answers_and_reads_no_byte_twice(
     assert local.document["report"]["provenance"]["network_bytes"] is None
 
 
+def test_bytes_are_counted_though_others_asked_gdal_first(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GDAL decides at the first request of a process whether it counts."""
+    monkeypatch.delenv("CPL_VSIL_NETWORK_STATS_ENABLED", raising=False)
+    gdal.NetworkStatsReset()
+    with serving(scene.parent.parent) as public:
+        gdal.Open(f"/vsicurl/{public.address}/bucket/dem.tif").ReadAsArray()
+        sent = public.sent
+        far = made(f"{public.address}/bucket", tmp_path / "far")
+    counted = far.document["report"]["provenance"]["network_bytes"]
+    assert counted == pytest.approx(public.sent - sent, rel=0.01)
+
+
 def share_read(folder: Path, tmp_path: Path) -> float:
     """Make an ortho of a twentieth of a scene that is served; return the share of its bytes that was read."""
     place = {"scene": SceneOptions(), "surface": SurfaceOptions(dem=folder / "dem.tif", vertical="ellipsoid")}
