@@ -65,7 +65,7 @@ def test_what_is_installed_from_it_works(unpacked, tmp_path):
     assert not json.loads(run(ortho, "doctor", "--json", cwd=tmp_path)).get("broken")
     sensors = json.loads(run(ortho, "sensors", "--json", cwd=tmp_path))
     bundled = {path.name.removeprefix("ortho_") for path in (ROOT / "plugins").glob("ortho_*")}
-    assert {one["name"] for one in sensors["sensors"]} >= bundled - {"asp", "measure", "studies"}
+    assert {one["name"] for one in sensors["sensors"]} >= bundled - {"csm", "measure", "stereo", "studies"}
     assert all(f"\n  {name} " in run(ortho, "--help", cwd=tmp_path) for name in ("measure", "reproduce", "simulate"))
     made = json.loads(run(ortho, "simulate", "bilsat", "--size", 256, "-o", "simulated", "--json", cwd=tmp_path))
     assert (tmp_path / made["files"]["image"]).is_file()
