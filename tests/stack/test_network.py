@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from networks import Made, Truth
 
+from ortho_pipeline.block.stack import adjustment
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
-from ortho_pipeline.block.stack.components import ErrorComponents
+from ortho_pipeline.block.stack.components import WAVES, ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells
 from ortho_pipeline.block.stack.graph import pairs_of
+from ortho_pipeline.block.stack.network import Network
+from ortho_pipeline.block.stack.seasons import _forms
 from ortho_pipeline.block.stack.steps import steps_of
 
 
@@ -214,7 +217,7 @@ def test_what_loops_do_not_show_of_the_stated_error_is_an_error_of_seasons():
         assert np.sqrt(np.median(more)) == pytest.approx(expected, abs=0.012)
 
 
-@pytest.mark.parametrize("of_season", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("of_season", [0.0, 0.1])
 def test_sigmas_have_what_dates_of_one_season_share(of_season):
     """Fields of four seasons close all loops. What they move all places by is seen from what places have of them.
 
@@ -223,6 +226,41 @@ def test_sigmas_have_what_dates_of_one_season_share(of_season):
     seeds = range(200, 204 if of_season else 202)
     stacks = [solved(seed=seed, dates=80, interval=12.0, of_season=of_season, length=0.05) for seed in seeds]
     assert 0.8 < spread(stacks) < 1.3
+
+
+@pytest.mark.parametrize(
+    ("days", "forms"),
+    [
+        (np.arange(8) * 365.25, (0, 0)),
+        (np.arange(5) * 4 * 365.25, (0, 0)),
+        (np.arange(9) * 365.25 / 2, (1, 0)),
+        (np.arange(13) * 365.25 / 4, (2, 1)),
+        (np.arange(80) * 12.0, (2, 2)),
+    ],
+)
+def test_waves_that_the_dates_do_not_sample_are_left_out(days, forms):
+    """A wave that is the same at all dates moves all of them alike: nothing shows it, and it does not matter."""
+    years = np.append(days / 365.25 + 50.5, np.nan)
+    assert tuple(len(_forms(number, years)) for number in WAVES) == forms
+    for form in (one for number in WAVES for one in _forms(number, years)):
+        assert form[-1] == 0
+        assert abs(form.sum()) < 1e-9
+        assert abs(form[:-1] @ years[:-1]) < 1e-7
+
+
+def test_one_date_a_year_has_the_sigmas_that_loops_show(monkeypatch):
+    made = Truth(seed=5, dates=8, interval=365.25).made()
+    years = 50.5 + np.arange(8.0)
+    found = adjust(made.truth.cells, made.edges, years.tolist())
+    monkeypatch.setattr(adjustment, "yearly_variances", lambda *given: np.zeros((2, 2)))
+    np.testing.assert_array_equal(found.sigma, adjust(made.truth.cells, made.edges, years.tolist()).sigma)
+
+
+def test_a_date_without_a_time_has_a_season_of_its_own():
+    network = Network(np.zeros((3, 3, 2)), np.zeros((2, 9, 9)), np.zeros(3, dtype=int))
+    found = network.with_seasons(np.zeros(2), np.array([[4.0, 1.0], [0.0, 0.0]]), np.array([np.nan, 15.0, 15.5]))
+    np.testing.assert_allclose(found.covariance[0][::3, ::3], [[4, 0, 0], [0, 4, -4], [0, -4, 4]], atol=1e-12)
+    np.testing.assert_allclose(found.covariance[1][::3, ::3], [[1, 0, 0], [0, 1, -1], [0, -1, 1]], atol=1e-12)
 
 
 def _with_stated_error(dates: int, size: float) -> tuple[AdjustedStack, AdjustedStack]:

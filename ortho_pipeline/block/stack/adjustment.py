@@ -156,7 +156,7 @@ def _referred(
     cells: Cells, solved: _Solved, motion: Motion, years: Array, datum: int | None, sloped: NDArray[np.bool_]
 ) -> AdjustedStack:
     """Return a stack with its datum."""
-    yearly = yearly_variances(solved.left(years), solved.trends, solved.components, cells.place, years)
+    yearly = yearly_variances(solved.left(years), solved.edges, solved.trends, solved.components, cells.place, years)
     found = solved.network.with_seasons(solved.components.of_seasons, yearly, years)
     known = np.isfinite(years)
     part = found.part

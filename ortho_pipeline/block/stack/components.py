@@ -35,6 +35,8 @@ _EDGES, _PAIRS = 120, 180
 #: Limits of the scale of an edge, relative to the mean of its dates.
 _SCALES = 0.25, 25.0
 _ROUNDS = 30
+#: Waves in a year, of errors that dates of one season share: with two, each of four seasons can differ.
+WAVES = 1, 2
 #: The errors of dates that are so many years apart, counted within a year, have a correlation of exp(-1).
 _SEASON = 0.25
 

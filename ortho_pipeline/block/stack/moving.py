@@ -88,6 +88,11 @@ class Left:
         """Which places ``(K,)`` enough edges see."""
         return np.asarray((self.weight > 0).sum(axis=0) >= _FEWEST)
 
+    @property
+    def noisier(self) -> Array:
+        """By how much the variance of each place ``(K,)`` is larger than the one of most."""
+        return _noisier(self.value, self.weight)
+
     def change(self, form: Array) -> tuple[Array, Array, Array]:
         """Return how much of a form ``(T,)`` each place has ``(K, 2)``, its variance ``(K,)`` and what is left."""
         apart = (form[self.first] - form[self.second])[:, None]

@@ -26,7 +26,7 @@ from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from scipy.stats import chi2
 
-from ortho_pipeline.block.stack.components import ErrorComponents, season_correlation
+from ortho_pipeline.block.stack.components import WAVES, ErrorComponents, season_correlation
 from ortho_pipeline.block.stack.edges import Edges
 from ortho_pipeline.block.stack.trends import Trends
 from ortho_pipeline.models.base import Array
@@ -97,12 +97,12 @@ class Network:
         variance : (2,)
             px², of an error that falls off from season to season.
         yearly : (h, 2)
-            px², of waves of a year, of half a year and so on.
+            px², of the waves `WAVES`.
         """
         covariance, apart = self.covariance.copy(), years[:, None] - years
         covariance[:, ::3, ::3] += variance[:, None, None] * season_correlation(years)
-        for number, one in enumerate(yearly, 1):
-            wave = np.nan_to_num(np.cos(2 * np.pi * number * apart))
+        for number, one in zip(WAVES, yearly, strict=True):
+            wave = np.where(np.isfinite(apart), np.cos(2 * np.pi * number * apart), np.eye(len(years)))
             covariance[:, ::3, ::3] += one[:, None, None] * wave
         return replace(self, covariance=covariance)
 

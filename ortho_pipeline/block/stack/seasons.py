@@ -15,19 +15,23 @@ from dataclasses import replace
 import numpy as np
 from scipy import optimize
 
-from ortho_pipeline.block.stack.components import ErrorComponents, classes_of, correlations_of
+from ortho_pipeline.block.stack.components import WAVES, ErrorComponents, classes_of, correlations_of
+from ortho_pipeline.block.stack.edges import Edges
 from ortho_pipeline.block.stack.moving import WAVE, Left
 from ortho_pipeline.block.stack.trends import Trends
 from ortho_pipeline.models.base import Array
 
-#: Waves in a year: with two, each of four seasons can differ.
-WAVES = 1, 2
+#: A wave is determined if so much (root mean square; 0.7 of all phases) is left of it without a constant and a rate.
+_LEFT = 0.3
 
 
-def yearly_variances(left: Left, trends: Trends, components: ErrorComponents, place: Array, years: Array) -> Array:
+def yearly_variances(
+    left: Left, edges: Edges, trends: Trends, components: ErrorComponents, place: Array, years: Array
+) -> Array:
     """Return the variances ``(2, 2)`` px² of the mean of all places: waves of a year and of half a year, both axes.
 
-    They are zero if the dates span less than one and a half years: then seasons do not repeat.
+    They are zero if the dates span less than one and a half years, because seasons do not repeat then, and if all dates
+    have the same phase of a wave, because it moves all of them alike.
     """
     found, known = np.zeros((len(WAVES), 2)), np.isfinite(years)
     usual = trends.weights[trends.good, :, 0].mean(axis=0) if trends.good.any() else np.zeros(len(place))
@@ -37,15 +41,15 @@ def yearly_variances(left: Left, trends: Trends, components: ErrorComponents, pl
     weight = usual[seen] / usual[seen].sum()
     centred = np.eye(len(seen)) - weight
     classes = classes_of(place[seen]).ravel()
-    matrices = np.concatenate([np.eye(len(seen))[None], correlations_of(place[seen])])
+    relative = np.diag(edges.relative[trends.good][:, seen].mean(axis=0))
+    matrices = np.concatenate([relative[None], correlations_of(place[seen])])
     expected = np.stack([np.bincount(classes, (centred @ one @ centred.T).ravel()) for one in matrices], axis=1)
     size, of_mean = np.maximum(np.linalg.norm(expected, axis=0), 1e-12), matrices @ weight @ weight
-    time = np.where(known, years, 0.0)
-    without = replace(left, value=left.change(time)[2])
+    without = replace(left, value=left.change(np.where(known, years, 0.0))[2])
+    root = np.sqrt(without.noisier[seen])
     for row, number in enumerate(WAVES):
-        products = np.zeros((2, len(expected)))
-        for wave in (np.cos, np.sin):
-            form = wave(2 * np.pi * number * time)
+        forms, products = _forms(number, years), np.zeros((2, len(expected)))
+        for form in forms:
             apart = centred @ without.change(form)[0][seen]
             shares, of_dates = (one[:, seen] for one in left.shares(form))
             dates = of_dates.T @ (components.scale[:, None] * of_dates)
@@ -53,8 +57,23 @@ def yearly_variances(left: Left, trends: Trends, components: ErrorComponents, pl
             for axis in (0, 1):
                 noise = dates * np.tensordot(components.shared[axis], matrices, 1)
                 noise += own * np.tensordot(components.own[axis], matrices, 1)
-                rest = np.outer(apart[:, axis], apart[:, axis]) - centred @ noise @ centred.T
-                products[axis] += np.bincount(classes, rest.ravel()) / 2
+                rest = np.outer(apart[:, axis], apart[:, axis]) - centred @ (noise * np.outer(root, root)) @ centred.T
+                products[axis] += np.bincount(classes, rest.ravel()) / len(forms)
         for axis in (0, 1):
             found[row, axis] = of_mean @ (optimize.nnls(expected / size, products[axis])[0] / size)
+    return found
+
+
+def _forms(number: int, years: Array) -> list[Array]:
+    """Return cosine and sine ``(T,)`` of a wave without a constant, a rate and each other, if enough is left."""
+    known = np.isfinite(years)
+    time = years[known] - years[known].mean()
+    taken, found = [np.ones(len(time)), time], list[Array]()
+    for wave in (np.cos, np.sin):
+        course = wave(2 * np.pi * number * time)
+        course = course - np.column_stack(taken) @ np.linalg.lstsq(np.column_stack(taken), course, rcond=None)[0]
+        if np.sqrt((course**2).mean()) > _LEFT:
+            taken.append(course)
+            found.append(np.zeros(len(years)))
+            found[-1][known] = course
     return found
