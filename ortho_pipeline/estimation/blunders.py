@@ -305,7 +305,8 @@ def outlying(
 
     A check point is tested with its own uncertainty and that of the model. With five or more check points, their median
     scatter is the scale if it is larger than sigma0: a model that is poor everywhere makes no point an outlier. A
-    control point is tested by its leave-one-out residual, against the sigma0 of the others.
+    control point is tested by its leave-one-out residual, against the sigma0 of the others. In this test, an error that
+    is common to the control points stays as all of them estimate it; `Fit.loo_residuals` estimate it without the point.
 
     `common` ``(P, P)`` is the covariance of the parameters from an error common to the control points; it also counts
     for check points without this error. If all control points were matched and this error is not stated, measured

@@ -60,8 +60,8 @@ def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], 
         degrees = to_degrees(np.column_stack([ring, np.zeros(len(ring))]))[:, :2]
         parts += _polygons(shapely.make_valid(shapely.Polygon(_unwrapped(degrees))))
     # Parts on both sides of the antimeridian are neighbours: count all longitudes from the widest gap between parts.
-    lons = np.array([polygon.centroid.x for polygon in parts])
-    turns = np.floor((lons - _beyond_widest_gap(lons)) / 360)
+    wests, _, easts, _ = np.array([polygon.bounds for polygon in parts]).T
+    turns = np.floor((wests - _beyond_widest_gap(wests, easts)) / 360)
     moved = [shapely.transform(p, lambda xy, t=t: xy - [360 * t, 0]) for p, t in zip(parts, turns, strict=True)]
     area = shapely.union_all(moved)
     west, south, east, north = area.bounds
@@ -70,12 +70,14 @@ def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], 
     return _listed(shapely.geometry.mapping(cut)), [round(float(value), _DECIMALS) for value in box]
 
 
-def _beyond_widest_gap(lons: NDArray[np.float64]) -> float:
-    """Return the first longitude (0 to 360) to the east of the widest gap between longitudes."""
-    around = np.sort(np.mod(lons, 360))
-    gaps = np.diff(around, prepend=around[-1] - 360)
+def _beyond_widest_gap(wests: NDArray[np.float64], easts: NDArray[np.float64]) -> float:
+    """Return the first longitude (0 to 360) to the east of the widest gap between ranges of longitudes."""
+    first = np.mod(wests, 360)
+    order = np.argsort(first)
+    first, reached = first[order], np.maximum.accumulate((first + easts - wests)[order])
+    before = np.maximum(np.append(-np.inf, reached[:-1]), reached[-1] - 360)
     # Less a rounding error.
-    return float(around[np.argmax(gaps)]) - 1e-9
+    return float(first[np.argmax(first - before)]) - 1e-9
 
 
 def _polygons(geometry: BaseGeometry) -> list[Any]:

@@ -44,7 +44,7 @@ def test_half_a_sample_is_found(tmp_path: Path, move: bool) -> None:
     notice = next(one for one in fit.warnings if one.code == "dem-shifted")
     assert ("points.dem_shift" in str(notice)) != move
     size = float(np.hypot(*fit.heights.shift_m))
-    assert f"Estimate: the DEM must move by {size:.1f} m (" in str(notice)
+    assert f"Estimated shift of the DEM: {size:.1f} m (" in str(notice)
 
 
 def test_a_dem_in_its_place_is_not_shifted(tmp_path: Path) -> None:

@@ -65,6 +65,9 @@ def test_a_large_raster_is_looked_at_in_few_pixels(tmp_path: Path) -> None:
         ([(-179, 0, -178, 1), (178, 0, 179, 1), (-150, 0, -149, 1)], (178, 0, -149, 1)),
         ([(-100, 0, -99, 1), (0, 0, 1, 1), (100, 0, 101, 1)], (-100, 0, 101, 1)),
         ([(-180, -90, 180, 90)], (-180, -90, 180, 90)),
+        # Wide parts: the widest gap is not that between their middles.
+        ([(-80, 0, 80, 1), (119, 0, 121, 1), (-131, 0, -129, 1)], (-131, 0, 121, 1)),
+        ([(-60, 0, 80, 1), (100, 0, 102, 1), (-140, 0, -120, 1)], (-140, 0, 102, 1)),
     ],
 )
 def test_the_box_holds_all_parts(boxes: list[tuple[float, ...]], expected: tuple[float, ...]) -> None:

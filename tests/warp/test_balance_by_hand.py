@@ -104,7 +104,8 @@ def test_windows_are_spread_from_edge_to_edge(box):
 @pytest.mark.parametrize(
     ("box", "columns", "rows"),
     [((10, 20, 60, 90), 1, 1), ((0, 0, 384, 385), 1, 2), ((0, 0, 1000, 1000), 3, 3), ((0, 0, 9000, 9000), 3, 3),
-     ((0, 0, 40_000, 100), 9, 1), ((0, 0, 700, 40_000), 1, 9)],
+     ((0, 0, 40_000, 100), 9, 1), ((0, 0, 700, 40_000), 1, 9),
+     ((0, 0, 3840, 1536), 4, 2), ((0, 0, 1920, 768), 4, 2), ((0, 0, 2688, 1920), 3, 3)],
 )  # fmt: skip
 def test_windows_of_seams_are_nine_at_most_of_a_wide_overlap(box, columns, rows):
     found = np.array(list(seam_windows(box)))

@@ -91,7 +91,7 @@ class HeightsRecord(Record):
             apart = "the DEM and the images are displaced from each other"
             chance = "chance alone would do this in less than 1 of 1000 cases"
             doubt = "It is not certain which of both is off, so the adjustment divides the displacement between both"
-            text = Text(f"{apart} ({chance}). {doubt}. Estimate: the DEM must move by {part}. ", *remedy)
+            text = Text(f"{apart} ({chance}). {doubt}. Estimated shift of the DEM: {part}. ", *remedy)
             fields = {"east_m": east, "north_m": north, "chance": self.shift_chance}
             found.append(Notice("dem-shifted", text, applied=self.shift_applied, **fields))
         if self.spots is not None and self.spots.left_out:

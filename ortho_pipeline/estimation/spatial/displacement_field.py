@@ -111,8 +111,10 @@ class DisplacementField:
         TooFewPoints
             If there are fewer than 12, or they are all on one line.
         """
-        if len(place) < FEWEST_POINTS or _on_a_line(place):
+        if len(place) < FEWEST_POINTS:
             raise TooFewPoints(f"{len(place)} displacements do not determine a field", remedy="give more matches")
+        if _on_a_line(place):
+            raise TooFewPoints("displacements on one line do not determine a field", remedy="give matches beside it")
         weight = np.ones(len(place)) if sigma is None else (sigma / np.median(sigma)) ** 2
         weight = np.clip(weight, 0.25, 16.0)
         origin, scale = place.mean(axis=0), float(np.ptp(place, axis=0).max())

@@ -128,8 +128,11 @@ def _windows(box: tuple[int, int, int, int]) -> Iterator[tuple[int, int, int, in
     across, down = (math.ceil((box[k + 2] - box[k]) / _SEAM_WINDOW) for k in (0, 1))
     shrink = max(1.0, math.sqrt(across * down / _SEAM_WINDOWS))
     across, down = max(1, round(across / shrink)), max(1, round(down / shrink))
-    # Of a long and thin box, the short side is not shrunk.
-    across, down = (min(n, max(1, _SEAM_WINDOWS // other)) for n, other in ((across, down), (down, across)))
+    # The short side of a long and thin box cannot be shrunk.
+    if across > down:
+        across = min(across, _SEAM_WINDOWS // down)
+    else:
+        down = min(down, _SEAM_WINDOWS // across)
     for top in np.linspace(box[1], box[3] - height, down).astype(int).tolist():
         for left in np.linspace(box[0], box[2] - width, across).astype(int).tolist():
             yield left, top, width, height
