@@ -38,7 +38,7 @@ from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.models.base import Array
 
 #: Criteria that are larger than the smallest one by this contradict the model.
-CONTRADICTED = 10.0
+_CONTRADICTED = 10.0
 #: The stated noise counts as this many observations: a stated sigma is rarely accurate to better than 50 %.
 _STATED = 8
 #: Grid positions in the scene, in each direction and in height.
@@ -130,7 +130,7 @@ def supported(expected: Mapping[str, Expectation], worth: float) -> tuple[list[s
     names = [
         name
         for name, statistics in expected.items()
-        if statistics.criterion <= lowest + CONTRADICTED or statistics.noise <= worth**2 * expected[best].noise
+        if statistics.criterion <= lowest + _CONTRADICTED or statistics.noise <= worth**2 * expected[best].noise
     ]
     return names, min(1.0, expected[best].noise)
 

@@ -1,10 +1,9 @@
 """Compare corrections of a block: adjust each to the same points, test it at left-out points, and recommend one.
 
-The method is like that of `ortho compare` for one scene (`estimation.choice`): gross errors are left out for all
-corrections, and a correction that Akaike's criterion contradicts is not recommended. If points with known ground test
-the corrections, one within 5 % of the smallest error is recommended, that with the fewest parameters. Ties alone hardly
-show errors of many parameters: a left-out ray is predicted by its neighbours. Then the criterion decides, unless a
-correction with fewer parameters has a sigma0 within 5 %.
+Gross errors are left out for all corrections. Among corrections within 5 % of the smallest error at points with known
+ground, the one with the fewest parameters is recommended. Ties alone hardly show errors of many parameters: a left-out
+ray is predicted by its neighbours. Then Akaike's criterion decides (`estimation.choice.expected_error`), unless a
+correction with fewer parameters has a sigma0 or left-out rays within 5 % of the criterion's choice.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.errors.texts import counted
-from ortho_pipeline.estimation.choice.expected_error import CONTRADICTED, criterion
+from ortho_pipeline.estimation.choice.expected_error import criterion
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.models.base import Array
 
@@ -127,37 +126,28 @@ def compare_corrections(
 def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
     """Return the recommended correction, and the reason."""
     observations = max((one.redundancy for one in tried), default=0)
-    criteria = {one.name: one.criterion(observations) for one in tried}
-    lowest = min(criteria.values(), default=math.inf)
-    # Many points prove differences that do not matter.
-    least_noise = min((one.sigma0 for one in tried if criteria[one.name] == lowest), default=math.inf)
-    as_good = {one.name for one in tried if criteria[one.name] == lowest or one.sigma0 <= _WORTH * least_noise}
-    sound = as_good | {name for name, value in criteria.items() if value <= lowest + CONTRADICTED}
-    of_ground = {one.name: np.concatenate([one.errors("check"), one.errors("control")]) for one in tried}
-    of_rays = {one.name: one.rays for one in tried}
     for errors, what, unit in (
-        (of_ground, "points (their ground coordinates left out)", "m"),
-        (of_rays, "rays (leave-one-out)", "px"),
-    ):
-        tested = {name: values for name, values in errors.items() if name in sound and np.isfinite(values).any()}
-        if not tested:
-            continue
-        common = np.all([np.isfinite(values) for values in tested.values()], axis=0)
+        (lambda one: np.concatenate([one.errors("check"), one.errors("control")]),
+         "points (their ground coordinates left out)", "m"),
+        (lambda one: one.rays, "rays (leave-one-out)", "px"),
+    ):  # fmt: skip
+        tested = {one: errors(one) for one in tried}
+        tested = {one: values for one, values in tested.items() if np.isfinite(values).any()}
+        common = np.all([np.isfinite(values) for values in tested.values()], axis=0) if tested else np.zeros(0)
         if common.sum() < _FEWEST:
             continue
-        sizes = {name: _rms(values[common]) or 0.0 for name, values in tested.items()}
-        able = [one for one in tried if one.name in sizes]
-        close = {name for name, size in sizes.items() if size <= _WORTH * min(sizes.values())}
-        if errors is of_rays:
-            close = as_good & {*sizes} or close
-        chosen = min((one for one in able if one.name in close), key=lambda one: (one.parameters, sizes[one.name]))
-        text = (
-            f"RMSE {sizes[chosen.name]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
-        )
-        least = min(able, key=lambda one: sizes[one.name])
-        if least.parameters > chosen.parameters:
-            more = f"{least.name} has RMSE {sizes[least.name]:.3g} {unit}"
-            text += f". {more}, but these points do not justify its parameters"
+        sizes = {one: _rms(values[common]) or 0.0 for one, values in tested.items()}
+        best = least = min(sizes, key=lambda one: sizes[one])
+        if unit == "px":
+            best = min(sizes, key=lambda one: (one.criterion(observations), one.parameters))
+        close = [one for one in sizes if sizes[one] <= _WORTH * sizes[best]]
+        if unit == "px":
+            close += [one for one in sizes if one.sigma0 <= _WORTH * best.sigma0]
+        chosen = min(close, key=lambda one: (one.parameters, sizes[one]))
+        text = f"RMSE {sizes[chosen]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
+        if least is not chosen:
+            more = f"{least.name} has RMSE {sizes[least]:.3g} {unit}"
+            text += f". {more}, but these points do not justify its {counted(least.parameters, 'parameter')}"
         return chosen.name, text
     return None, "fewer than three points test all corrections, too few for a recommendation"
 
