@@ -119,6 +119,8 @@ def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, m
     monkeypatch.undo()
     write_run_page(page, "june", [scene("one", 0.3, ortho=ortho)], MADE)
     assert page.read_bytes() != first
+    write_run_page(page, "june", [scene("one", 0.2, ortho=ortho)], {**MADE, "software": {"gdal": "3.100"}})
+    assert "3.100" in page.read_text()
 
 
 def test_the_page_names_the_pipeline_file_that_was_planned(tmp_path, ortho):

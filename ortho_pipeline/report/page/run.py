@@ -78,7 +78,7 @@ class SceneRow:
 def write_run_page(
     path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]], provenance: Mapping[str, Any]
 ) -> None:
-    """Write the page of a run, unless it is there and of the same scenes and results.
+    """Write the page of a run, unless it is there and of the same scenes, results and provenance.
 
     Parameters
     ----------
