@@ -179,13 +179,33 @@ def merged(*layers: Settings) -> Settings:
 
 
 @reads("see docs/run.md for the form of the file")
-def read_config(path: str | os.PathLike[str]) -> Config:
+def read_config(path: str | os.PathLike[str], content: bytes | None = None) -> Config:
     """Read a pipeline file.
+
+    Parameters
+    ----------
+    content : bytes, optional
+        Its bytes, if they were read already (`read_content`).
 
     Raises
     ------
     InputError
         For anything that is not as the schema has it: the message names line, field and remedy.
+    """
+    document, lines = _parse(read_content(path) if content is None else content, path)
+    try:
+        return Config.model_validate(document)
+    except pydantic.ValidationError as error:
+        raise _explained(error, lines, path) from error
+
+
+def read_content(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a pipeline file.
+
+    Raises
+    ------
+    InputError
+        If it is a folder, cannot be read, or is too large.
     """
     if os.path.isdir(path):
         raise InputError(
@@ -196,11 +216,7 @@ def read_config(path: str | os.PathLike[str]) -> Config:
     content = read_bounded(path, _MAX_BYTES, remedy="check the path")
     if len(content) > _MAX_BYTES:
         raise InputError("the pipeline file is larger than 5 MB", file=path, remedy="name images by patterns")
-    document, lines = _parse(content, path)
-    try:
-        return Config.model_validate(document)
-    except pydantic.ValidationError as error:
-        raise _explained(error, lines, path) from error
+    return content
 
 
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config
+from ortho_pipeline.batch.config import Config, Entry, Settings, merged, read_config, read_content
 from ortho_pipeline.batch.paths import PipelinePaths, Place, key_of_name
 from ortho_pipeline.commands.heights.automatic import AUTO
 from ortho_pipeline.commands.resolved.ledger import versions
@@ -104,11 +105,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """A pipeline file, worked out."""
+    """A pipeline file, worked out.
+
+    Parameters
+    ----------
+    source : mapping
+        The pipeline file in a provenance: role, name, size and SHA-256 of the bytes that were parsed.
+    """
 
     path: Place
     output: Path
     jobs: tuple[Job, ...]
+    source: Mapping[str, Any]
     mosaic: MosaicOptions | None = None
 
     def chosen(self, only: Sequence[str] = (), shard: tuple[int, int] | None = None) -> tuple[Job, ...]:
@@ -158,7 +166,14 @@ def plan(
         For a wrong file, a path outside of the root, a pattern without a match, or two scenes of one name.
     """
     file = place(located(path, allow_network=allow_network))
-    return _Planner(file, read_config(file), PipelinePaths(path, root, allow_network)).plan()
+    content = read_content(file)
+    source = {
+        "role": "pipeline file",
+        "path": file.name,
+        "bytes": len(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+    return _Planner(file, read_config(file, content), PipelinePaths(path, root, allow_network)).plan(source)
 
 
 class _Planner:
@@ -170,7 +185,7 @@ class _Planner:
         # What another machine asks for is not written here: its outputs go to a store.
         self.output = Path("nowhere") if places.far else places.inside(config.output, "output")
 
-    def plan(self) -> Plan:
+    def plan(self, source: Mapping[str, Any]) -> Plan:
         if self.output == self.places.base:
             raise InputError(
                 "the output folder cannot be the folder of the pipeline file",
@@ -186,7 +201,7 @@ class _Planner:
         self._check_names(jobs)
         self._check_mosaic(jobs)
         settings = None if self.config.mosaic is None else MosaicOptions(**dict(self.config.mosaic))
-        return Plan(self.path, self.output, tuple(jobs), settings)
+        return Plan(self.path, self.output, tuple(jobs), source, settings)
 
     # -- images ------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import socket
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -217,22 +216,12 @@ def siblings(paths: Sequence[str | os.PathLike[str]], cache: dict[Path, Sequence
     return digest.hexdigest()
 
 
-class Digests:
-    """SHA-256 of files, taken once for each state (size, time of change) of a file."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[str, int, int], str] = {}
+class Digests(files.Checksums):
+    """Checksums that records know are not taken again."""
 
     def learn(self, states: Sequence[FileState]) -> None:
         """Take over what a record knows."""
-        self._known.update({(state.path, state.bytes, state.mtime_ns): state.sha256 for state in states})
-
-    def __call__(self, path: str | os.PathLike[str], stop: threading.Event | None = None) -> str:
-        stat = os.stat(path)
-        state = os.fspath(path), stat.st_size, stat.st_mtime_ns
-        if state not in self._known:
-            self._known[state] = files.sha256(path, stop)
-        return self._known[state]
+        self.known.update({(state.path, state.bytes, state.mtime_ns): state.sha256 for state in states})
 
 
 # -- locks -----------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Sequence
@@ -17,7 +16,6 @@ from ortho_pipeline.batch.shared.run import SharedFolder, summary_of
 from ortho_pipeline.commands.resolved.ledger import software
 from ortho_pipeline.errors import InputError, error_document
 from ortho_pipeline.files import write_json
-from ortho_pipeline.files.shell import typed
 from ortho_pipeline.report.page.run import write_run_page
 
 
@@ -50,10 +48,11 @@ def summarise(config: str | os.PathLike[str] | Plan, store: SharedFolder | None 
 
 
 def provenance_of(planned: Plan) -> dict[str, Any]:
-    """Return the command, the pipeline file and the versions that a run was made with; scenes have their own."""
-    name, content = planned.path.name, planned.path.read_bytes()
-    file = {"role": "pipeline file", "path": name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-    return {"command": f"ortho run {typed(name)}", "software": software(), "inputs": [file]}
+    """Return the pipeline file that was planned, with its SHA-256, and the versions; scenes have their own.
+
+    The command is no part of it: runs with other executors or workers write the same page.
+    """
+    return {"software": software(), "inputs": [dict(planned.source)]}
 
 
 def paths_of(record: RunRecord, job: Job) -> dict[str, str]:

@@ -42,6 +42,8 @@ def with_flags(text: str, flags: Mapping[str, str]) -> str:
 
 def as_typed(text: str) -> str:
     """Return a text with the options that it names as they are typed in the command that runs."""
+    if not isinstance(text, Text):
+        return text
     ctx = click.get_current_context(silent=True)
     return text if ctx is None else with_flags(text, flags_of(ctx.command, _words(ctx)))
 
@@ -57,9 +59,10 @@ def name_as_typed(error: OrthoError, command: click.Command) -> None:
         error.field = ", ".join(flags.get(part, part) for part in error.field.split(", "))
 
 
-def _words(ctx: click.Context) -> list[str]:
+def _words(ctx: click.Context) -> frozenset[str]:
     """Return the words that were typed: whoever wrote -tr looks for -tr in a message, not for --resolution."""
-    return shlex.split(ctx.meta.get("command", ""))
+    words: frozenset[str] = ctx.meta.get("words", frozenset())
+    return words
 
 
 def _offer(error: OrthoError, command: click.Command, flags: Mapping[str, str]) -> None:

@@ -11,6 +11,7 @@ import importlib
 import logging
 import shlex
 import sys
+from collections.abc import Container
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -124,12 +125,14 @@ class _Commands(click.Group):
 
     def make_context(self, info_name: str | None, args: list[str], *more: Any, **extra: Any) -> click.Context:
         command = shlex.join([info_name or "ortho", *args])
+        # Without the values of options, as in --search=50; a set, because messages look up every option in it.
+        words = frozenset(word.partition("=")[0] for word in args)
         try:
             ctx = super().make_context(info_name, args, *more, **extra)
         except click.UsageError as error:
-            _print_usage_error(command, error)
+            _print_usage_error(words, error)
             raise
-        ctx.meta["command"] = command
+        ctx.meta.update(command=command, words=words)
         return ctx
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -151,7 +154,7 @@ class _Commands(click.Group):
             short.__cause__ = error
             return self._fail(ctx, short, FAILED)
         except click.UsageError as error:
-            _print_usage_error(ctx.meta["command"], error)
+            _print_usage_error(ctx.meta["words"], error)
             raise
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
@@ -173,9 +176,9 @@ class _Commands(click.Group):
         ctx.exit(code)
 
 
-def _print_usage_error(command: str, error: click.UsageError) -> None:
+def _print_usage_error(words: Container[str], error: click.UsageError) -> None:
     """Print the document of an error in the command line itself."""
-    if "--json" in shlex.split(command):
+    if "--json" in words:
         from ortho_pipeline.cli.printing import print_json
 
         parameter = getattr(error, "param", None)

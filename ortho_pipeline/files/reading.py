@@ -160,6 +160,28 @@ def sha256(path: str | os.PathLike[str], stop: threading.Event | None = None) ->
     return digest.hexdigest()
 
 
+class Checksums:
+    """SHA-256 of files, taken once for each state (path, size, time of change) of a file.
+
+    Examples
+    --------
+    >>> checksums = Checksums()
+    >>> checksums("sample_data/gcps.csv") == checksums("sample_data/gcps.csv") == sha256("sample_data/gcps.csv")
+    True
+    """
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[str, int, int], str] = {}
+
+    def __call__(self, path: str | os.PathLike[str], stop: threading.Event | None = None) -> str:
+        """Return the SHA-256 of a file; as `sha256`."""
+        status = os.stat(path)
+        state = os.fspath(path), status.st_size, status.st_mtime_ns
+        if state not in self.known:
+            self.known[state] = sha256(path, stop)
+        return self.known[state]
+
+
 def states(paths: Iterable[str | os.PathLike[str]]) -> dict[str, tuple[int, int, int]]:
     """Return size, time of change and inode of the files among `paths`, by which a change is noticed."""
     found = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline.batch.plan import plan
+from ortho_pipeline.batch.runner import run
+from ortho_pipeline.batch.summary import summarise
 from ortho_pipeline.report.page.run import write_run_page
 
 HOSTILE = '<script>alert("x")</script>'
 MADE = {
-    "command": "ortho run june.yaml",
     "software": {"gdal": "3.99"},
     "inputs": [{"role": "pipeline file", "path": "june.yaml", "bytes": 10, "sha256": "c0ffee"}],
 }
@@ -61,7 +64,7 @@ def test_what_failed_stands_first_and_then_the_least_accurate(tmp_path, ortho):
     assert "this scene is not made yet" in (tmp_path / "part.html").read_text(encoding="utf-8")
     assert "Give a DEM." in rows[0]
     assert page.count("<script") == 1
-    assert [text in page for text in ("<code>ortho run june.yaml</code>", "3.99", "c0ffee")] == [True] * 3
+    assert [text in page for text in ("<th>pipeline file</th>", "3.99", "c0ffee")] == [True] * 3
     assert 'href="scenes/a%20b_report.html"' in rows[3]
     assert rows[3].count("data:image/png;base64,") == 1
 
@@ -116,3 +119,23 @@ def test_the_same_results_are_the_same_page_and_cost_no_pixel(tmp_path, ortho, m
     monkeypatch.undo()
     write_run_page(page, "june", [scene("one", 0.3, ortho=ortho)], MADE)
     assert page.read_bytes() != first
+    write_run_page(page, "june", [scene("one", 0.2, ortho=ortho)], {**MADE, "software": {"gdal": "3.100"}})
+    assert "3.100" in page.read_text()
+
+
+def test_the_page_names_the_pipeline_file_that_was_planned(tmp_path, ortho):
+    file = tmp_path / "june.yaml"
+    file.write_text(f"scenes: [{{image: {ortho.relative_to(tmp_path)}}}]\noutput: out\n")
+    parsed = hashlib.sha256(file.read_bytes()).hexdigest()
+    planned = plan(file)
+    file.write_text("scenes: []\n")
+    run(planned, executor="sequential")
+    page = (tmp_path / "out" / "index.html").read_bytes()
+    assert parsed.encode() in page
+    # No command: with other executors the page is the same.
+    assert b"ortho run" not in page
+    file.unlink()
+    run(planned, executor="processes", workers=1)
+    assert (tmp_path / "out" / "index.html").read_bytes() == page
+    summarise(planned)
+    assert (tmp_path / "out" / "index.html").read_bytes() == page

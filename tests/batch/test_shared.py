@@ -100,7 +100,7 @@ def test_an_environment_that_does_not_say_it_is_refused(environment: dict[str, s
 
 def test_parts_of_all_workers_are_all_scenes_once() -> None:
     jobs = tuple(Job(f"s{k}", Request(Path(f"s{k}.tif")), Path("out"), {}) for k in range(23))
-    planned = Plan(Path("p.yaml"), Path("out"), jobs)
+    planned = Plan(Path("p.yaml"), Path("out"), jobs, {})
     parts = (part_of_array({"JOB_COMPLETION_INDEX": str(k), "ORTHO_SHARDS": "5"}) for k in range(5))
     made = [job.name for part in parts for job in planned.chosen(shard=part)]
     assert sorted(made) == sorted(job.name for job in jobs)
@@ -148,7 +148,7 @@ def done_record(job: Job) -> RunRecord:
 def work_together(address: str, count: int, scenes: int, patience: float, dying: int | None = None) -> Counter[str]:
     """Let some workers make the scenes of one plan at once, each beginning with its own; return how often each was."""
     jobs = tuple(Job(f"s{k:03}", Request(Path(f"s{k}.tif")), Path("out"), {}) for k in range(scenes))
-    planned = Plan(Path("p.yaml"), Path("out"), jobs)
+    planned = Plan(Path("p.yaml"), Path("out"), jobs, {})
     made: list[str] = []
     where = SharedFolder(address, allow_network=True, patience=patience)
 

@@ -13,8 +13,11 @@ import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
 
+from ortho_pipeline.cli import flags
+from ortho_pipeline.cli.flags import as_typed
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands import rectify
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options import SurfaceOptions
 from ortho_pipeline.raster.source import Grid
 
@@ -401,3 +404,19 @@ def test_each_stage_of_a_job_has_its_own_progress(tiny, tmp_path):
 def test_the_help_has_no_stray_blanks(command):
     text = run(command, "--help").stdout.split("Options:")[0]
     assert not [line for line in text.splitlines() if "  " in line.strip()]
+
+
+def test_messages_name_options_as_typed_and_split_no_command_line(monkeypatch):
+    def named(*words: str) -> str:
+        with cli.make_context("ortho", ["rectify", *words]) as ctx:
+            command = cli.get_command(ctx, "rectify")
+            with click.Context(command, parent=ctx):
+                return as_typed(Text("give ", Setting("output.bands", "1")))
+
+    assert named("a.tif") == "give --band 1"
+    assert named("a.tif", "-b", "2") == "give -b 1"
+    # The form with = counts too.
+    assert named("a.tif", "-b", "2", "--band=3") == "give --band 1"
+    monkeypatch.setattr(flags, "flags_of", pytest.fail)
+    with cli.make_context("ortho", ["rectify", "a.tif"]):
+        assert as_typed("3 points") == "3 points"

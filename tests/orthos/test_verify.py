@@ -22,6 +22,7 @@ from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import Accuracy
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import reading, sha256
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
 
@@ -198,8 +199,30 @@ def test_a_folder_gives_one_table(shifted, tmp_path):
     assert [Path(row["ortho"]).name for row in table["orthos"]] == ["a.tif", "b.tif"]
     assert table["failed"] == 1
     assert "error" in table["orthos"][1]
-    assert "a.tif" in (tmp_path / "out" / "verify.html").read_text()
+    page = (tmp_path / "out" / "verify.html").read_text()
+    assert "a.tif" in page
     assert (tmp_path / "out" / "a_verify.html").exists()
+    made, own = table["provenance"], json.loads((tmp_path / "out" / "a_verify.json").read_text())["provenance"]
+    assert (made["command"], made["software"]) == (own["command"], own["software"])
+    assert made["inputs"] == own["inputs"][1:]
+    assert [one["path"] for one in made["inputs"]] == [str(shifted[1])]
+    assert [" verify " in page, made["inputs"][0]["sha256"] in page] == [True, True]
+
+
+def test_a_folder_reads_what_its_orthos_have_in_common_once_for_checksums(shifted, tmp_path, monkeypatch):
+    folder, read = tmp_path / "orthos", []
+    folder.mkdir()
+    for name in ("a.tif", "b.tif"):
+        shutil.copy(shifted[0], folder / name)
+
+    def counted(path, stop=None):
+        read.append(Path(path))
+        return sha256(path, stop)
+
+    monkeypatch.setattr(reading, "sha256", counted)
+    table = verify(folder, match=MatchOptions(reference=[str(shifted[1])])).document
+    assert table["failed"] == 0
+    assert sorted(read) == sorted([folder / "a.tif", folder / "b.tif", shifted[1]])
 
 
 def test_points_alone_say_how_accurate_an_ortho_is(shifted, tmp_path):

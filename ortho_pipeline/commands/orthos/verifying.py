@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from ortho_pipeline.commands.orthos.measuring import CELLS, MeasuredOrtho, measu
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import FEWEST_POINTS, Accuracy, Verified, profile
-from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
+from ortho_pipeline.commands.resolved.ledger import Ledger, provenance, software
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import SCHEMA_VERSION, Result, to_store
 from ortho_pipeline.display.notices import Notice, to_document
@@ -32,7 +32,7 @@ from ortho_pipeline.display.numbers import class_size, size_m
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.ground_residuals import metre_partials, with_reference_height
-from ortho_pipeline.files import together, write_json
+from ortho_pipeline.files import Checksums, sha256, together, write_json
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
@@ -132,6 +132,8 @@ class _Job:
     ) -> None:
         self.match, self.points, self.surface, self.scene, self.output = match, points, surface, scene, output
         self.masks, self.band, self.required, self.command = masks, band, required, command
+        # The orthos of a folder have a DEM and references in common.
+        self.digest = Checksums()
 
     def document(self, ortho: str | os.PathLike[str]) -> tuple[dict[str, Any], MeasuredOrtho | None]:
         """Return the document of one ortho, and its matches."""
@@ -147,7 +149,7 @@ class _Job:
         document = document_of(measured or opened, self.match, heights, errors, filled=filled)
         document["requirements"] = [one.judged(document) for one in self.required]
         request = Request(ortho, self.scene, self.points, self.surface, self.match)
-        document["provenance"] = provenance_of(request, opened, heights, self.masks, self.command)
+        document["provenance"] = provenance_of(request, opened, heights, self.masks, self.command, self.digest)
         return document, measured
 
     def _heights(self, opened: Scene) -> Surface | None:
@@ -177,11 +179,16 @@ class PointErrors(NamedTuple):
 
 
 def provenance_of(
-    request: Request, scene: Scene, surface: Surface | None, masks: Sequence[ClassMask], command: str | None
+    request: Request,
+    scene: Scene,
+    surface: Surface | None,
+    masks: Sequence[ClassMask],
+    command: str | None,
+    digest: Callable[..., str] = sha256,
 ) -> dict[str, Any]:
     """Return the record of the files, options and versions that the document of an ortho was made with."""
     hiding = Ledger({Path(mask.path): "mask" for mask in masks if Path(mask.path).is_file()})
-    inputs = Ledger.of(request, scene, surface).joined(hiding).hashed()
+    inputs = Ledger.of(request, scene, surface).joined(hiding).hashed(digest)
     settings = request.asked("scene", "surface", "match", "output")
     return dict(json_value(provenance(request, scene, surface, inputs, command, settings)))
 
@@ -427,6 +434,7 @@ def _verify_folder(folder: Path, out: str | os.PathLike[str] | None, job: _Job) 
         rows.append({name: document[name] for name in kept})
     table = {"schema_version": SCHEMA_VERSION, "folder": str(folder), "orthos": rows, "failed": len(images) - len(done)}
     table["requirements"] = [one for row in rows for one in row.get("requirements") or ()]
+    table["provenance"] = _in_common([one.document["provenance"] for one in done], job.command)
     table |= to_document([])
     files: dict[str, Path] = {}
     if out is not None:
@@ -434,3 +442,13 @@ def _verify_folder(folder: Path, out: str | os.PathLike[str] | None, job: _Job) 
         write_json(files["json"], table)
         write_table(table, files["html"])
     return Result(files, table, table_text(table))
+
+
+def _in_common(records: Sequence[Mapping[str, Any]], command: str | None) -> dict[str, Any]:
+    """Return command, versions and the inputs that the orthos of a folder have in common; each has its own record."""
+    shared = [
+        entry
+        for entry in (records[0]["inputs"] if records else ())
+        if entry["role"] not in ("image", "metadata") and all(entry in record["inputs"] for record in records)
+    ]
+    return {"command": command, "software": software(), "inputs": shared}

@@ -65,10 +65,10 @@ def write_page(
 
 def write_table(table: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     """Write the page of a folder: one row for each ortho."""
-    known = {"Processed": processed()}
+    known, made = {"Processed": processed()}, table["provenance"]
     page = render(
         "report/ortho_table.html.j2", table=table, name=os.path.basename, interval=interval_text, about=known,
-        best_part=best_part,
+        best_part=best_part, provenance=list(flat({key: value for key, value in made.items() if key != "inputs"})),
     )  # fmt: skip
     write_text(path, page)
 

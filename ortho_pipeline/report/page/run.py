@@ -78,7 +78,7 @@ class SceneRow:
 def write_run_page(
     path: str | os.PathLike[str], title: str, scenes: Sequence[Mapping[str, Any]], provenance: Mapping[str, Any]
 ) -> None:
-    """Write the page of a run, unless it is there and of the same scenes and results.
+    """Write the page of a run, unless it is there and of the same scenes, results and provenance.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def write_run_page(
         As in ``run.json``: name, files (paths), facts, error. What differs between runs of one result (seconds, and
         whether a scene was made or found) is no part of the page.
     provenance : mapping
-        The command, versions, and the pipeline file among the inputs.
+        Versions, and the pipeline file among the inputs.
     """
     folder = Path(path).parent
     rows = sorted((_row(one, folder) for one in scenes), key=_order)
