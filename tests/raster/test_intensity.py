@@ -17,11 +17,12 @@ def raster(path: Path, bands: np.ndarray, nodata: float | None = None, alpha: bo
     count, height, width = bands.shape
     kind = gdal.GDT_UInt16 if bands.dtype == np.uint16 else gdal.GDT_Float32
     dataset = gdal.GetDriverByName("GTiff").Create(str(path), width, height, count, kind, options=["ALPHA=NO"])
-    dataset.WriteArray(bands)
-    if nodata is not None:
-        dataset.GetRasterBand(1).SetNoDataValue(nodata)
+    # GDAL 3.13 changes no tag after pixels were written.
     if alpha:
         dataset.GetRasterBand(count).SetColorInterpretation(gdal.GCI_AlphaBand)
+    if nodata is not None:
+        dataset.GetRasterBand(1).SetNoDataValue(nodata)
+    dataset.WriteArray(bands)
     del dataset
     return RasterSource(path)
 
