@@ -12,7 +12,7 @@ from scipy.stats import ttest_rel
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.choice.comparison import choose_models, compare
-from ortho_pipeline.estimation.choice.expected_error import Expectation, expectation, supported
+from ortho_pipeline.estimation.choice.expected_error import Expectation, criterion, expectation, supported
 from ortho_pipeline.estimation.choice.recommendation import expected_errors, recommend
 from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.fit import Fit
@@ -162,3 +162,13 @@ def test_counts_are_those_of_the_points_that_were_used() -> None:
     assert done.best.model == done.recommended == "affine3d", "heights displace by 300 px"
     assert (done.points.control, done.points.check) == (11, 5)
     assert (done.rows[0].parameters, done.rows[0].redundancy) == (8, 2 * 11 - 8)
+
+
+def test_the_criterion_is_that_of_hurvich_and_tsai_with_eight_further_observations_and_the_noise() -> None:
+    """With S + 8 squares, 20 + 8 observations and 3 + 1 parameters."""
+    expected = 28 * math.log(12 / 28) + 2 * 4 + 2 * 4 * 5 / (28 - 4 - 1)
+    assert criterion(4.0, 20, 3) == pytest.approx(expected, rel=1e-12)
+    # 10 + 8 observations, 15 + 1 parameters: one is left; with another parameter none.
+    assert criterion(4.0, 10, 15) == pytest.approx(18 * math.log(12 / 18) + 32 + 2 * 16 * 17 / 1, rel=1e-12)
+    assert criterion(4.0, 10, 16) == math.inf
+    assert criterion(4.0, 10, 17) == math.inf

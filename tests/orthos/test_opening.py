@@ -77,6 +77,14 @@ def test_a_geotransform_that_cannot_be_inverted_is_refused(transform):
         MapGrid("EPSG:32636", transform, (60, 40))
 
 
+@pytest.mark.parametrize(
+    "transform", [(5e5, 1.0, 0.0, 4e6, 0.0), (5e5, 1.0, 0.0, 4e6, 0.0, -1.0, 0.0), (5e5, 1.0, 0.0, np.nan, 0.0, -1.0)]
+)
+def test_a_geotransform_has_six_finite_numbers(transform):
+    with pytest.raises(InputError, match="six finite numbers"):
+        MapGrid("EPSG:32636", transform, (60, 40))
+
+
 @pytest.mark.parametrize("name", GRIDS)
 def test_an_ortho_of_any_grid_opens(tmp_path, name):
     path = raster(tmp_path / "a.tif", *GRIDS[name])
