@@ -45,7 +45,7 @@ class Server:
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the server; the user's own is beside it."""
+    """The folder of the server; its neighbour is the user's own."""
     for name in ("server", "mine"):
         (tmp_path / name).mkdir()
     monkeypatch.setattr(Server, "folder", tmp_path / "server")

@@ -22,7 +22,7 @@ def middles(grid: Grid) -> np.ndarray:
 
 
 GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 10.0, 20.0, 60, 40)
-#: A place within it in the zone beside it.
+#: A place within it, in coordinates of zone 32.
 AT = np.round(pyproj.Transformer.from_crs("EPSG:32633", "EPSG:32632").transform(500_150, 3_999_800)).tolist()
 
 

@@ -29,7 +29,7 @@ from ortho_pipeline.models.base import Array
 #: the classes of distances.
 _RANGES = 0.2, 0.5, 1.25
 _TERMS = 1 + 2 * len(_RANGES)
-CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
+_CLASSES = np.array([1e-6, 0.18, 0.3, 0.45, 0.65, 0.9, 1.2, 1.6, 3.0])
 #: Edges and pairs of edges whose products are taken, at most.
 _EDGES, _PAIRS = 120, 180
 #: Limits of the scale of an edge, relative to the mean of its dates.
@@ -120,7 +120,7 @@ def correlations_of(place: Array) -> Array:
 
 def classes_of(place: Array) -> NDArray[np.int_]:
     """Return the class ``(K, K)`` of the distance of two places."""
-    return np.searchsorted(CLASSES, spatial.distance.cdist(place, place))
+    return np.searchsorted(_CLASSES, spatial.distance.cdist(place, place))
 
 
 def season_correlation(years: Array) -> Array:
@@ -206,7 +206,7 @@ class _Shapes:
 
     def _sums(self, pairs: list[tuple[int, int, float]]) -> tuple[Array, Array, Array]:
         """Return expected sums ``(classes, 7)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
-        classes, terms = len(CLASSES) + 1, _TERMS
+        classes, terms = len(_CLASSES) + 1, _TERMS
         expected, seen, number = np.zeros((classes, terms)), np.zeros((classes, 2)), np.zeros(classes)
         design, relative = self.trends.design, np.sqrt(self.edges.relative)
         for one, other, sign in pairs:

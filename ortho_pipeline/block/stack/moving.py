@@ -28,6 +28,7 @@ LEAST = 0.1
 _FEWEST, _STEPS = 4, 10
 #: Squared sigmas within which places share a rate.
 _ALIKE = 9.2
+#: Seasons repeat if the dates span so many years.
 WAVE = 1.5
 #: A step has so many dates on each side. What is left is clipped at so many sigmas, so many times.
 _BESIDE, _CLIP, _CLIPPED = 4, 2.5, 4
@@ -136,7 +137,8 @@ def motion_of(
     time, tested = np.where(np.isfinite(years), years, 0.0), left.tested
     span = float(np.ptp(years[np.isfinite(years)]))
     rate, variance, rest = left.change(time)
-    noisier = _noisier(rest, left.weight)
+    without = replace(left, value=rest)
+    noisier = without.noisier
     sigma2 = variance * noisier
     rate = rate - _majority(rate[tested], sigma2[tested]) if tested.any() else rate
     ratio = (rate**2).sum(axis=1) / np.maximum(sigma2, 1e-300)
@@ -144,7 +146,6 @@ def motion_of(
     forms = [] if steady else _forms(time, np.isfinite(years), span)
     crit = chi2.isf(_CHANCE / (1 + len(forms)), 2)
     moving = tested & (ratio > crit) & (size > LEAST)
-    without = replace(left, value=rest)
     for name, course in forms:
         change, variance, _ = without.change(course)
         seen = tested & (variance < 1e6)

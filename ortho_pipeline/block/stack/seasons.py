@@ -47,6 +47,7 @@ def yearly_variances(
     size, of_mean = np.maximum(np.linalg.norm(expected, axis=0), 1e-12), matrices @ weight @ weight
     without = replace(left, value=left.change(np.where(known, years, 0.0))[2])
     root = np.sqrt(without.noisier[seen])
+    shared, single = (np.tensordot(of, matrices, 1) for of in (components.shared, components.own))
     for row, number in enumerate(WAVES):
         forms, products = _forms(number, years), np.zeros((2, len(expected)))
         for form in forms:
@@ -55,8 +56,7 @@ def yearly_variances(
             dates = of_dates.T @ (components.scale[:, None] * of_dates)
             own = shares.T @ (components.factor[:, None] * shares)
             for axis in (0, 1):
-                noise = dates * np.tensordot(components.shared[axis], matrices, 1)
-                noise += own * np.tensordot(components.own[axis], matrices, 1)
+                noise = dates * shared[axis] + own * single[axis]
                 rest = np.outer(apart[:, axis], apart[:, axis]) - centred @ (noise * np.outer(root, root)) @ centred.T
                 products[axis] += np.bincount(classes, rest.ravel()) / len(forms)
         for axis in (0, 1):

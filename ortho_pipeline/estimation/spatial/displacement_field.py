@@ -114,7 +114,9 @@ class DisplacementField:
         if len(place) < FEWEST_POINTS:
             raise TooFewPoints(f"{len(place)} displacements do not determine a field", remedy="give more matches")
         if _on_a_line(place):
-            raise TooFewPoints("displacements on one line do not determine a field", remedy="give matches beside it")
+            raise TooFewPoints(
+                "displacements on one line do not determine a field", remedy="give matches away from this line"
+            )
         weight = np.ones(len(place)) if sigma is None else (sigma / np.median(sigma)) ** 2
         weight = np.clip(weight, 0.25, 16.0)
         origin, scale = place.mean(axis=0), float(np.ptp(place, axis=0).max())

@@ -137,12 +137,12 @@ def _recommended(tried: Sequence[_Tried]) -> tuple[str | None, str]:
         if common.sum() < _FEWEST:
             continue
         sizes = {one: _rms(values[common]) or 0.0 for one, values in tested.items()}
-        best = least = min(sizes, key=lambda one: sizes[one])
+        least = min(sizes, key=lambda one: sizes[one])
+        close = [one for one in sizes if sizes[one] <= _WORTH * sizes[least]]
         if unit == "px":
             best = min(sizes, key=lambda one: (one.criterion(observations), one.parameters))
-        close = [one for one in sizes if sizes[one] <= _WORTH * sizes[best]]
-        if unit == "px":
-            close += [one for one in sizes if one.sigma0 <= _WORTH * best.sigma0]
+            near = _WORTH * sizes[best], _WORTH * best.sigma0
+            close = [one for one in sizes if sizes[one] <= near[0] or one.sigma0 <= near[1]]
         chosen = min(close, key=lambda one: (one.parameters, sizes[one]))
         text = f"RMSE {sizes[chosen]:.3g} {unit} at {common.sum()} {what}; {counted(chosen.parameters, 'parameter')}"
         if least is not chosen:
