@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.display.numbers import fixed, metres, plain_size, px, share, short, signed
+from ortho_pipeline.display.numbers import fixed, flat, metres, plain_size, px, share, short, signed
 from ortho_pipeline.errors.texts import Setting, counted
 from ortho_pipeline.options.flags import flag_of
 
@@ -100,6 +100,7 @@ def _environment(package: str) -> Any:
         "share": share,
         "fixed": fixed,
         "number": short,
+        "flat": flat,
         "plain": plain_size,
         "counted": counted,
     }

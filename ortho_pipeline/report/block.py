@@ -15,7 +15,7 @@ from ortho_pipeline.block.shared.priors import SharedParameterRecord
 from ortho_pipeline.block.variances.components import VariancesRecord
 from ortho_pipeline.display.drawing import Drawing, round_down, style_sheet
 from ortho_pipeline.display.notices import Notice, doubted, to_document
-from ortho_pipeline.display.numbers import flat, metres, px, significant, size_m
+from ortho_pipeline.display.numbers import metres, px, significant, size_m
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.blunders import contradicting
@@ -372,7 +372,6 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
     plan, network = plot_ground(report), plot_network(report)
     places = [place for image in report.images.values() for place in image.outline or ()]
     where = plot_locator((places[0][0], places[0][1])) if places else None
-    provenance = {key: value for key, value in report.provenance.to_json().items() if key != "inputs"}
     said, errors = _signals_of(report), errors_of_block(report)
     return render(
         "report/block.html.j2",
@@ -399,7 +398,7 @@ def page(report: BlockReport, pictures: Mapping[str, bytes] | None = None) -> st
         locator=None if where is None else where.svg(),
         plan=None if plan is None else plan.svg(),
         plot_style=style_sheet(),
-        provenance=list(flat(provenance)),
+        provenance=report.provenance.to_json(),
         signals=said,
         levels=WORDS,
         script=script(),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.display.drawing import Axes, Drawing, style_sheet
-from ortho_pipeline.display.numbers import flat, size_m
+from ortho_pipeline.display.numbers import size_m
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.files import write_text
@@ -54,7 +54,6 @@ def write_page(
         profiles=profiles,
         picture=picture,
         before=document.get("before"),
-        provenance=list(flat({key: value for key, value in document["provenance"].items() if key != "inputs"})),
         signals=signals(document["warnings"], document["notices"]),
         levels=WORDS,
         interval=interval_text,
@@ -65,10 +64,10 @@ def write_page(
 
 def write_table(table: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     """Write the page of a folder: one row for each ortho."""
-    known, made = {"Processed": processed()}, table["provenance"]
+    known = {"Processed": processed()}
     page = render(
         "report/ortho_table.html.j2", table=table, name=os.path.basename, interval=interval_text, about=known,
-        best_part=best_part, provenance=list(flat({key: value for key, value in made.items() if key != "inputs"})),
+        best_part=best_part,
     )  # fmt: skip
     write_text(path, page)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ortho_pipeline.display.numbers import flat, metres
+from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.display.pages import render
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.errors.texts import counted
@@ -111,8 +111,7 @@ def write_run_page(
         levels=WORDS,
         said=_summary(rows),
         about=_about(rows),
-        provenance=list(flat({key: value for key, value in provenance.items() if key != "inputs"})),
-        inputs=provenance["inputs"],
+        provenance=provenance,
     )
     write_text(path, page)
 
