@@ -188,12 +188,15 @@ class Heights:
             solved, heights = again, judged
         return solved, heights
 
-    def _with_shared_errors(self, solved: Solved, number: int) -> Heights:
-        """Return them with the errors that they share by a solution."""
+    def seen(self, solved: Solved) -> tuple[CommonHeights, Array]:
+        """Return the errors that they share, with what a solution tells of them, and the slope ``(k,)``."""
         slopes = np.nan_to_num(self.terrain.slopes)
         common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
-        if self.spots is not None:
-            common, slope = self.spots.told(common, self.sigma, slope)
+        return (common, slope) if self.spots is None else self.spots.told(common, self.sigma, slope)
+
+    def _with_shared_errors(self, solved: Solved, number: int) -> Heights:
+        """Return them with the errors that they share by a solution."""
+        common, slope = self.seen(solved)
         step = common.step(slope)
         if np.abs(step).max() > _SHARED_STABLE:
             # The DEM is rougher than its planes, so whole steps of its shift would swing about the best without end.

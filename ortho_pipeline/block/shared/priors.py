@@ -6,7 +6,10 @@ one standard deviation adds to them, :math:`V = (I - H) U` what is left of that 
 :math:`h` the errors that heights of a DEM share (information :math:`T_{hh}`, cross :math:`T_{hc}`):
 
 .. math::
-    T = V^T V - T_{hc}^T (I + T_{hh})^{-1} T_{hc}, \quad (I + T)\, dc = -V^T r - c
+    T &= V^T V - T_{hc}^T (I + T_{hh})^{-1} T_{hc} \\
+    (I + T)\, dc &= -V^T r - c - T_{hc}^T (I + T_{hh})^{-1} b_h
+
+The last term, with the slope :math:`b_h` of the heights' errors, is not zero while these are not settled yet.
 
 A wrong focal length over flat ground looks like a wrong height. So the heights' errors are unknowns here, too.
 
@@ -23,7 +26,6 @@ import numpy as np
 from ortho_pipeline.block.equations.elimination import Elimination
 from ortho_pipeline.block.equations.problem import BlockProblem, Misfits, Selection
 from ortho_pipeline.block.equations.solver import EXACT, Solved, attempt
-from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.errors import NotConverged
 from ortho_pipeline.estimation.observations.common_unknown import CommonUnknown
@@ -161,7 +163,7 @@ class SharedPriors(CommonUnknown):
         """Return the solution with the parameters as unknowns, from one with their present values, and the heights."""
         found = self
         for _ in range(_ROUNDS):
-            found, slope = found._seen(solved, None if heights is None else heights.common)
+            found, slope = found._seen(solved, heights)
             step = found.step(slope)
             if np.abs(step).max() < _STABLE:
                 break
@@ -178,7 +180,7 @@ class SharedPriors(CommonUnknown):
                 solved, heights = heights.settled(solved, selection)
         return solved, found, heights
 
-    def _seen(self, solved: Solved, heights: CommonHeights | None) -> tuple[SharedPriors, Array]:
+    def _seen(self, solved: Solved, heights: Heights | None) -> tuple[SharedPriors, Array]:
         """Return them with what a solution tells of them, and the slope ``(k,)``."""
         linear, problem, ordering = solved.linear, solved.problem, solved.linear.ordering
         units, right = self._units(problem), np.zeros((problem.size, len(self.value)))
@@ -197,16 +199,18 @@ class SharedPriors(CommonUnknown):
             pseudo[: len(units)] += units[:, k]
             left.append(Misfits(-change.rays, -change.ground, pseudo))
         whole = np.stack([one.vector for one in left], axis=1)
-        told, by_params = whole.T @ whole, step
+        told, by_params, slope = whole.T @ whole, step, -whole.T @ linear.misfits.vector
         if heights is not None:
-            rows, loads = heights.units(linear)
+            common, of_heights = heights.seen(solved)
+            rows, loads = common.units(linear)
             cross = -loads.T @ np.stack([one.ground[rows, 2] for one in left], axis=1)
-            follow = -heights.left @ cross
+            follow = -common.left @ cross
             told = told + cross.T @ follow
-            by_params = by_params + heights.by_params @ follow
-            by_points += heights.by_points @ follow
+            slope = slope + follow.T @ (of_heights - common.value)
+            by_params = by_params + common.by_params @ follow
+            by_points += common.by_points @ follow
         found = replace(self, told=(told + told.T) / 2, by_params=by_params, by_points=by_points)
-        return found, -whole.T @ linear.misfits.vector
+        return found, slope
 
     def _units(self, problem: BlockProblem) -> Array:
         """Return what one standard deviation adds to the misfits of the priors ``(n, k)`` of images."""

@@ -156,9 +156,13 @@ def refuse_contradictions(
         for name in ("gcps", "check", "ground_sigma"):
             if getattr(options, name) is not None:
                 raise InputError(
-                    Text(Setting(f"points.{name}"), " needs a file of points, and none is given"),
+                    "this option is for points that were measured in the images, and none are given",
                     field=f"points.{name}",
-                    remedy=Text("leave it out, or give ", Setting("points.points")),
+                    remedy=Text(
+                        "give them with ",
+                        Setting("points.points", "FILE"),
+                        " (id,image,col,row; a file that also has x,y,h needs no second one), or leave it out",
+                    ),
                 )
     if options.ties is None and not match.reference:
         for name in ("search", "points"):

@@ -67,7 +67,12 @@ _LOOK: dict[str, str] = {
     "few-check-points": "Use at least 30 check points before you claim an accuracy class.",
     "no-redundancy": "Add points. Until then the residuals prove nothing.",
     "control-covers-part": "Add control points in the empty part, or do not use the ortho there.",
-    "dem-shifted": "Add control points: they show whether the DEM or the images are displaced.",
+    "dem-shifted": Text(
+        "Add control points: they show whether the DEM or the images are displaced. If neighbouring heights of the DEM "
+        "have similar errors, state ",
+        Setting("points.dem_correlation"),
+        ".",
+    ),
     "weak-join": Text(
         "Give a DEM (",
         Setting("surface.dem"),
