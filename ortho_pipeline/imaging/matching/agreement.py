@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import bdtrc
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
@@ -129,7 +129,7 @@ def refuse_accident(
         If the probability is more than one in a million.
     """
     share = min(1.0, math.pi * tolerance**2 / (2 * NEXT + 1) ** 2)
-    if float(stats.binom.sf(agreeing - 1, chips, share)) * places > _ACCIDENT:
+    if float(bdtrc(agreeing - 1, chips, share)) * places > _ACCIDENT:
         raise InputError(
             f"cannot match the scene with {targets[0].called}: only {agreeing} of {counted(chips, 'chip')} agree "
             f"within {reach:.0f} px, which can be chance",

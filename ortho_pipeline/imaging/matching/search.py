@@ -24,7 +24,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, stats
+from scipy import ndimage
+from scipy.special import stdtr
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
@@ -444,7 +445,9 @@ def _standing_out(
         difference = np.array([values[best][place] - values[other][place] for place in common])
         chance = 1.0
         if len(difference) >= _FEWEST:
-            chance = float(stats.ttest_1samp(difference, 0.0, alternative="greater").pvalue)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = difference.mean() / (difference.std(ddof=1) / math.sqrt(len(difference)))
+            chance = float(stdtr(len(difference) - 1, -ratio))
         if chance < _UNIQUE and means[other] < _CLEARLY * means[best]:
             continue
         far = float(np.hypot(*(corrections[best].coefficients - corrections[other].coefficients)[[0, 3]])) * pixel

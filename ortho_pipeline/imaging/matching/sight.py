@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import bdtrc
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Text
@@ -234,7 +234,7 @@ def _agreeing(offset: Array, along: Array, displaced: float, chips: Chips) -> ND
     most = near[int(near.sum(axis=1).argmax())]
     chance = min(1.0, float(np.prod([half / chips.reach for half in np.minimum(wide, chips.reach)])))
     count = len(offset)
-    accident = stats.binom.sf(int(most.sum()) - 2, count - 1, chance) * count > _ACCIDENT
+    accident = bdtrc(int(most.sum()) - 2, count - 1, chance) * count > _ACCIDENT
     return np.zeros(count, dtype=bool) if accident else most
 
 
