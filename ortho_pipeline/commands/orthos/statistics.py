@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import spatial, stats
+from scipy import spatial
 
 from ortho_pipeline.commands.orthos.measuring import CELLS, MeasuredOrtho
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
@@ -87,11 +87,13 @@ class Accuracy:
     @classmethod
     def of_points(cls, errors: Array, seed: int = 0) -> Accuracy:
         """Return the accuracy from the errors ``(n, 2)`` of independent points."""
+        from scipy.stats import invwishart  # importing it would take most of the start-up of what uses no points
+
         count = len(errors)
         random = np.random.default_rng(seed)
         mean, about = errors.mean(axis=0), errors - errors.mean(axis=0)
         scatter = about.T @ about + 1e-12 * np.eye(2)
-        covariances = stats.invwishart.rvs(count - 1, scatter, size=_DRAWS, random_state=random)
+        covariances = invwishart.rvs(count - 1, scatter, size=_DRAWS, random_state=random)
         roots = np.linalg.cholesky(covariances)
         means = mean + np.einsum("kij,kj->ki", roots, random.standard_normal((_DRAWS, 2))) / np.sqrt(count)
         drawn = means[:, None] + np.einsum("kij,knj->kni", roots, random.standard_normal((_DRAWS, _ERRORS, 2)))
