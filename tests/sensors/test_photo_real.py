@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +13,14 @@ from ortho_windows import tapered, windows
 from scipy.spatial.transform import Rotation
 from skimage.registration import phase_cross_correlation
 
-from ortho_pipeline import load_model
+from ortho_pipeline import load_model, rectify
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.options import BlockOptions, MatchOptions, OutputOptions, SceneOptions, SurfaceOptions
 
 pytestmark = [pytest.mark.realdata, pytest.mark.slow]
 MAP = "EPSG:32651"
+OUTPUT = OutputOptions(crs=MAP, resolution=0.15)
 
 
 def shift(first: Path, second: Path) -> tuple[float, int]:
@@ -42,30 +44,66 @@ def of_odm(project: Path) -> dict[str, np.ndarray]:
     }
 
 
-def test_photos_by_their_tags_alone_fit_and_are_where_opendronemap_has_them(real, tmp_path):
-    project = real / "orthority" / "odm"
+def adjusted(project: Path, folder: Path, **block: Any) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Adjust the photos by their tags alone; return the report and the orthos by image."""
     images = sorted((project / "images").glob("*.tif"))
-    surface = SurfaceOptions(dem=project / "odm_dem" / "dsm.tif", vertical="ellipsoid", fill="mask")
-    output = OutputOptions(crs=MAP, resolution=0.15)
     adjust(
         images,
-        tmp_path / "tags",
-        BlockOptions(ties="auto"),
+        folder,
+        BlockOptions(ties="auto", **block),
         SceneOptions(sensor="photo", sensor_options={"vertical": "ellipsoid"}),
         match=MatchOptions(search=10.0, points=150),
-        surface=surface,
-        orthos=output,
+        surface=surface_of(project),
+        orthos=OUTPUT,
     )
-    report = json.loads((tmp_path / "tags" / "block_report.json").read_text())
+    report = json.loads((folder / "block_report.json").read_text())
+    return report, {image.stem: folder / f"{image.stem}_ortho.tif" for image in images}
+
+
+def surface_of(project: Path) -> SurfaceOptions:
+    """Return OpenDroneMap's DSM."""
+    return SurfaceOptions(dem=project / "odm_dem" / "dsm.tif", vertical="ellipsoid", fill="mask")
+
+
+def check_places(project: Path, folder: Path, report: dict[str, Any]) -> None:
+    """Compare the positions of the photos with those of OpenDroneMap."""
     to_map = ground_transform("EPSG:4979", MAP)
     sigma_odm = 0.045  # the accuracy of GPS in the reconstruction, gps_dop
     for name, wanted in of_odm(project).items():
-        found = to_map([load_model(tmp_path / "tags" / f"{name}_model.json").perspective_centre])[0]
+        found = to_map([load_model(folder / f"{name}_model.json").perspective_centre])[0]
         parameters = report["adjustment"]["images"][name]["parameters"]
         sigmas = np.array([parameters[key]["sigma"] for key in ("X_L", "Y_L", "Z_L")])
         assert (np.abs(found - wanted) < 3 * np.hypot(sigmas, sigma_odm)).all(), name
-    orthos = {name: tmp_path / "tags" / f"{name}_ortho.tif" for name in of_odm(project)}
-    pairs = [shift(orthos[one], orthos[other])[0] for one, other in itertools.combinations(orthos, 2)]
+
+
+def check_neighbours(orthos: dict[str, Path]) -> None:
+    """Compare the orthos with each other."""
+    pairs = [shift(one, other)[0] for one, other in itertools.combinations(orthos.values(), 2)]
     known = [value for value in pairs if np.isfinite(value)]
     assert len(known) >= 4
     assert max(known) < 1.0
+
+
+def test_photos_by_their_tags_alone_fit_and_are_where_opendronemap_has_them(real, tmp_path):
+    project = real / "orthority" / "odm"
+    report, orthos = adjusted(project, tmp_path)
+    check_places(project, tmp_path, report)
+    check_neighbours(orthos)
+
+
+def test_orthos_are_those_of_opendronemap_if_its_dsm_is_the_datum(real, tmp_path):
+    """The DSM is from the reconstruction. By default its bias is estimated, and orthos are up to 2.7 px apart."""
+    project = real / "orthority" / "odm"
+    report, orthos = adjusted(project, tmp_path / "tags", dem_bias=0.0, dem_shift_sigma=0.0)
+    check_places(project, tmp_path / "tags", report)
+    check_neighbours(orthos)
+    for image in sorted((project / "images").glob("*.tif")):
+        theirs = rectify(
+            image,
+            tmp_path / "odm",
+            scene=SceneOptions(sensor_options={"vertical": "ellipsoid"}),
+            surface=surface_of(project),
+            output=OUTPUT,
+        )
+        assert theirs.document["report"]["scene"]["sensor"] == "odm"
+        assert shift(orthos[image.stem], theirs.files["ortho"])[0] < 2.0
