@@ -214,8 +214,8 @@ def _of_image(
             f"no point was measured in {image_name!r}, only in {some}",
             file=path,
             field="image",
-            remedy="measure points in this image with 'ortho measure' (in a finished ortho: --ortho --height 0). If "
-            "only the image was renamed, correct its name in this file",
+            remedy="measure points in this image: `ortho measure IMAGE -o points.geojson`, for a finished ortho with "
+            "--ortho --height 0. If only the image was renamed, correct its name in this file",
         )
     table.rows = kept
     return table

@@ -477,8 +477,8 @@ def _sentences(analysis: Covariance) -> list[str]:
             if function is not None and p < SIGNIFICANCE
         ]
         if sizes:
-            sentences.append(f"Their standard deviation is about {' and '.join(sizes)}.")
-        sentences.append("A better DEM, or a model with more parameters ('ortho compare'), can reduce them.")
+            sentences.append(f"The systematic errors have a standard deviation of about {' and '.join(sizes)}.")
+        sentences.append("A better DEM, or a model with more parameters, can reduce these errors.")
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")
     if analysis.relative is not None:
