@@ -60,7 +60,7 @@ NEEDS: Mapping[str, Mapping[str, str]] = {
         "prune": "You want to keep only the parameters that the points justify.",
         "significance": "You want another threshold than 5 %.",
         "shift-only": "A finished ortho must only be shifted.",
-        "max-bending": "The displacement of a finished ortho changes within shorter distances.",
+        "max-bending": "The displacement of a finished ortho changes faster than 0.02 px per pixel.",
         "params": "You want to adjust some parameters of a camera and keep the others.",
         "ridge": "A rational model has too many parameters, and the automatic weight does not suit you.",
         "models": "An earlier run saved the models of the images as `_model.json`.",
@@ -195,7 +195,7 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
     "measure": {
         "output": _NAMED,
         "gcps": "You have points already, and add more.",
-        "dem": "Reference and image must match in hilly ground, and points need heights.",
+        "dem": "The ground is hilly, or the points have no heights.",
         "reference": "You read the ground coordinates from an orthoimage that is shown next to the image.",
     },
     "rectify": {
@@ -207,6 +207,8 @@ OTHERWISE: Mapping[str, Mapping[str, str]] = {
         "search": _FAR,
         "reference": "All dates must agree with an orthoimage that you trust.",
         "dem": "Some dates are raw scenes.",
+        "executor": "You want several processes, or the workers of dask.",
+        "workers": "You want several processes.",
         "height": "Some dates are raw scenes of flat ground.",
     },
     "verify": {

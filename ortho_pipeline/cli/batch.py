@@ -41,7 +41,7 @@ _SHOWN = 60
 @click.command(cls=Command)
 @click.argument("pipeline_file", metavar="PIPELINE.yaml", type=click.Path(), required=False)
 @executor_option("How scenes are distributed.  [default: processes; dask with --scheduler]")
-@workers_option
+@workers_option("all processors")
 @click.option(
     "--threads",
     type=click.IntRange(min=1),
@@ -67,7 +67,8 @@ _SHOWN = 60
     "--root",
     type=click.Path(file_okay=False),
     metavar="DIR",
-    help="Allow only paths inside this folder.  [default: folder of the file]",
+    help="All paths of the file must be inside this folder; a parent folder allows more.  "
+    "[default: folder of the file]",
 )
 @click.option("--checksums", is_flag=True, help="Compare files by checksum, ignoring timestamps.")
 @click.option("--list", "as_list", is_flag=True, help="List the scenes and their state; make nothing.")

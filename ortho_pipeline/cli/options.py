@@ -368,9 +368,12 @@ def executor_option(text: str) -> Decorator:
     return click.option("--executor", type=click.Choice(EXECUTORS), help=text)
 
 
-workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: all processors]"
-)
+def workers_option(unset: str) -> Decorator:
+    """Return the option of how many processes work."""
+    text = f"Number of processes.  [default: {unset}]"
+    return click.option("--workers", type=click.IntRange(min=1), metavar="N", help=text)
+
+
 scheduler_option = click.option(
     "--scheduler", metavar="URL", help="Address of the dask scheduler, such as tcp://host:8786."
 )

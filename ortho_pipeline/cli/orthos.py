@@ -117,7 +117,7 @@ def verify(
     default=0.02,
     show_default=True,
     metavar="PX",
-    help="Largest change of a smooth field's displacement per pixel.",
+    help="Most that the displacement of a smooth field may change from one pixel to the next.",
 )
 @click.option("--resampling", "-r", type=click.Choice(RESAMPLING), default="cubic", show_default=True)
 @folder_option

@@ -81,7 +81,7 @@ class BlockOptions:
             "PX",
             kind="number",
             above=0,
-            unset="without control, the accuracy in the metadata, else 10",
+            unset="with control, not held; without, the accuracy in the metadata, or 10 if they state none",
         ),
     ] = None
     dem_heights: Annotated[

@@ -237,7 +237,7 @@ class SurfaceOptions:
             "Accuracy of the heights (standard deviation): a number, or a raster such as Copernicus' HEM.",
             "M|FILE",
             kind="number or word",
-            unset="unknown",
+            unset="not stated: matching and adjust estimate it, ties assumes 10",
         ),
     ] = None
     source: Annotated[
@@ -294,8 +294,8 @@ class MatchOptions:
             "M",
             kind="number",
             above=0,
-            unset="three times the stated accuracy; if none is stated, 100 m (of an ortho, at least 30 pixels), but at "
-            "most a quarter of the image",
+            unset="three times the stated accuracy; if none is stated, 100 m (for a finished ortho 100 m or 30 pixels, "
+            "whichever is larger), but at most a quarter of the image",
         ),
     ] = None
     search_rotation: Annotated[

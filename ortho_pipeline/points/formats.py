@@ -214,7 +214,8 @@ def _of_image(
             f"no point was measured in {image_name!r}, only in {some}",
             file=path,
             field="image",
-            remedy="use the name of the image in which the points were measured",
+            remedy="measure points in this image: `ortho measure IMAGE -o points.geojson`, for a finished ortho with "
+            "--ortho --height 0. If only the image was renamed, correct its name in this file",
         )
     table.rows = kept
     return table

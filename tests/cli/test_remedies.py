@@ -50,6 +50,7 @@ WITHOUT = {
     ("exchange", "pip install"): "needs the network",
     ("ortho_measure", "pip install"): "needs the network",
     ("points", "pip install"): "needs the network",
+    ("points", "ortho measure"): "serves a page until somebody stops it",
     ("report", "pip install"): "needs the network",
     ("commands", "ortho doctor --fetch-grids"): "needs the network",
     ("geodesy", "pyproj sync"): "needs the network",

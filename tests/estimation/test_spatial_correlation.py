@@ -65,6 +65,11 @@ def test_a_random_field_is_called_systematic_and_neighbours_are_more_accurate():
     assert found.verdict == "systematic"
     assert found.p_joint == pytest.approx(0.001)
     assert "Systematic errors remain" in found.statement
+    x, y = (function.systematic for function in found.functions if function is not None)
+    assert (
+        f"The systematic errors have a standard deviation of about {x:.2f} m in x and {y:.2f} m in y."
+        in found.statement
+    )
     assert found.relative is not None
     assert max(found.relative) < 0.8 * min(found.absolute)
     first, last = found.classes[0], found.classes[-1]

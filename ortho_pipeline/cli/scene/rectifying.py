@@ -37,8 +37,8 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, Sc
     "--overwrite",
     "-overwrite",
     is_flag=True,
-    help="Also delete leftovers of earlier runs and sidecar files that GIS software would pick up. (Existing outputs "
-    "are always replaced.)",
+    help="Also delete outputs of an earlier run whose report is missing, and sidecar files that GIS software would "
+    "pick up. (Existing outputs are always replaced.)",
 )
 @click.option(
     "--sharpen",
@@ -137,7 +137,8 @@ def export(
     """Write the model of IMAGE for other programs.
 
     With --gcps or --reference the command adjusts the model first. It writes an RPC (text, RPB, XML, VRT, or tag in a
-    copy of the image), GCPs (VRT, or tags in a copy; measured points, otherwise a grid), or geolocation arrays.
+    copy of the image), GCPs (the measured points, or a grid if there are none; as VRT, or as tags in a copy of the
+    image), or geolocation arrays.
     """
     from ortho_pipeline import commands
 

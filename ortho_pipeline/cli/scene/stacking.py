@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 @executor_option(
     "How the work is distributed.  [default: this process; processes with --workers; dask with --scheduler]"
 )
-@workers_option
+@workers_option("no further process")
 @scheduler_option
 @shard_option("Match only the K-th of N parts of the pairs.")
 @json_option

@@ -232,7 +232,8 @@ def require_several(bands: Sequence[int], colours: str | os.PathLike[str]) -> No
         raise InputError(
             f"this image has {counted(len(bands), 'band')}; a multispectral image has at least two",
             file=colours,
-            remedy="combine single bands first: `gdalbuildvrt -separate ms.vrt BLUE GREEN RED NIR`",
+            remedy="combine single bands of the same acquisition first: `gdalbuildvrt -separate ms.vrt BLUE GREEN RED "
+            "NIR`. If they have RPC files, copy one to ms_rpc.txt",
         )
 
 

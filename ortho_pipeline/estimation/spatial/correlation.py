@@ -470,6 +470,15 @@ def _sentences(analysis: Covariance) -> list[str]:
         f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}. "
         f"{chance}. {here}."
     ]
+    if analysis.verdict == "systematic":
+        sizes = [
+            f"{function.systematic:.2f} {analysis.unit} in {axis}"
+            for axis, function, p in zip("xy", analysis.functions, analysis.p or (1.0, 1.0), strict=True)
+            if function is not None and p < SIGNIFICANCE
+        ]
+        if sizes:
+            sentences.append(f"The systematic errors have a standard deviation of about {' and '.join(sizes)}.")
+        sentences.append("A better DEM, or a model with more parameters, can reduce these errors.")
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")
     if analysis.relative is not None:

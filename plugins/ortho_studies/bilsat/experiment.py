@@ -102,7 +102,7 @@ KNOBS = (
         PLACES,
         "places in a cell",
         "chosen",
-        "In each cell so many places are drawn, and the lowest is measured, because road crossings are in plains and "
+        f"In each cell {PLACES} places are drawn, and the lowest is measured, because road crossings are in plains and "
         "valleys. With one place, 3 % fewer predictions are within 1.5; with six, the same number.",
     ),
     Knob(
@@ -122,8 +122,8 @@ KNOBS = (
     ),
 )
 NAIVE = (
-    "the paper’s own value with 44 points, times the root of 1 − p/2k for the control and of 1 + p/2k for "
-    "the check points, for p unknowns and k points. It uses no geometry. It takes the noise of each model from "
+    "the paper’s own value with 44 points. With p unknowns and k points it is multiplied by √(1 − p/(2k)) for the "
+    "control and by √(1 + p/(2k)) for the check points. It uses no geometry. It takes the noise of each model from "
     "the paper; the simulation must predict this noise."
 )
 

@@ -47,8 +47,8 @@ REASONS = (
     Reason("poly2 even:7", "Six unknowns per axis from seven points: one degree of freedom per axis."),
     Reason(
         "rfm1 even:8",
-        "Fourteen unknowns from sixteen measurements, and those of height from eight heights. A single draw has "
-        "little meaning, and the check points depend on the eight heights.",
+        "Fourteen unknowns from sixteen measurements; the unknowns of height depend on eight heights only. A "
+        "single draw has little meaning, and the check points depend on the eight heights.",
     ),
     Reason(
         "rfm",

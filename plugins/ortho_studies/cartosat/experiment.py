@@ -231,9 +231,9 @@ KNOBS = (
         simulated.CELLS,
         "places for each point",
         "fitted",
-        "So many places are drawn for each point on average, and the lowest ones are measured, because roundabouts "
-        "are in settlements. It affects the columns of the 3D affine model, whose parallel rays ignore the effect of "
-        "height towards the sides.",
+        f"On average {simulated.CELLS:g} places are drawn for each point, and the lowest ones are measured, because "
+        "roundabouts are in settlements. It affects the columns of the 3D affine model, whose parallel rays ignore the "
+        "effect of height towards the sides.",
         ("2|affine3d UTM|fore x", "2|affine3d UTM|aft x"),
     ),
     Knob(
@@ -482,7 +482,7 @@ def _numbers(rows: tuple[PaperColumn, ...]) -> list[Number]:
 
 def _curves(found: Array, counts: tuple[int, ...]) -> list[Curve]:
     medians = [[_median(found[:, k, n]) for n in range(len(counts))] for k in range(len(CURVES))]
-    title = "RMS of the check points in object space (all three axes together), over the number of control points"
+    title = "RMS of the check points in object space (all three axes together), against the number of control points"
     series = {name: (counts, values) for name, values in zip(CURVES, medians, strict=True)}
     return [Curve(title, "control points", "metres", series)]
 

@@ -83,8 +83,8 @@ _RANKINGS: tuple[tuple[str, tuple[str, ...], Callable[..., tuple[bool, str]], st
         "",
     ),
     (
-        "Its errors are distributed otherwise than those of the RPCs, since the coordinates are others: more in X, "
-        "less in Z …",
+        "Its errors are distributed differently from those of the RPCs, since its coordinates are geocentric and those "
+        "of the RPCs east, north, height: more in X, less in Z …",
         (_NINE, _AFFINE),
         lambda push, rpc: (push[4] > 1.3 * rpc[4] and push[6] < rpc[6], f"{_axes(push)} and {_axes(rpc)}"),
         "",

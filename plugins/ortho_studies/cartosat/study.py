@@ -22,7 +22,7 @@ def simulate(folder: str | PathLike[str], *, seed: int = 0, size: int = 1200, ji
 
 
 def reproduce(realisations: int, *, progress: Callable[[float], None] | None = None) -> Reproduced:
-    """Tables 2 to 6 of Willneff et al., on simulated CARTOSAT-1 stereo pairs, and errors by control point number."""
+    """Tables 2 to 6 of Willneff et al., on simulated CARTOSAT-1 stereo pairs, and errors against the number of GCPs."""
     document = experiment.reproduce(realisations, progress=progress)
     return Reproduced(
         document, text(document), lambda: page.page(document, {m: experiment.error_vectors(m) for m in page.DRAWN})

@@ -102,8 +102,8 @@ KNOBS = (
         REVERSED,
         "of the realisations",
         "published",
-        "A scan against the flight, with lines of sight that are not parallel along it. Two of three real "
-        "products have it, so it is drawn at random.",
+        "A scan against the flight, with lines of sight that are not parallel in the direction of flight. Two of three "
+        "real products have it, so it is drawn at random.",
     ),
     Knob(
         "OFF_NADIR_DEG",
@@ -425,7 +425,7 @@ def _curve(values: Array) -> Curve:
         medians = [float(np.nanmedian(values[:, k, n])) if known[n] else np.nan for n in range(POINTS)]
         series[name] = (counts, [value if value <= DRAWN else None for value in medians])
     return Curve(
-        f"Error of the 20 check points over the number of control points (medians of {len(values)} realisations; "
+        f"Error of the 20 check points against the number of control points (medians of {len(values)} realisations; "
         f"beyond {DRAWN:g} m not drawn)",
         "control points",
         "RMS error, m",

@@ -112,7 +112,8 @@ def reproduce(realisations: int = 100, *, progress: Callable[[float], None] | No
         settings_text=(
             f"{realisations} realisations, noise {simulated.SIGMA_IMAGE:g} px in the image and "
             f"{simulated.SIGMA_GROUND:g} m on the ground, attitude error {simulated.SIGMA_BIAS:g} m, drift "
-            f"{simulated.SIGMA_DRIFT:g} m, wobble {simulated.SIGMA_WOBBLE:g} m per degree"
+            f"{simulated.SIGMA_DRIFT:g} m, wobble {simulated.SIGMA_WOBBLE:g} m for each "
+            "polynomial degree above the first"
         ),
         knobs=KNOBS,
         naive_text=NAIVE,

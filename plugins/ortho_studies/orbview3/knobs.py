@@ -12,8 +12,8 @@ KNOBS = (
         {name: seconds for name, (seconds, _) in simulated.SCENES.items()},
         "s from abeam",
         "fitted",
-        "Time of each scene. The difference gives the paper's height-to-base ratio of 1.4; the ratio is that of "
-        "the errors of 3D affine in Y, which are proportional to the distance along the track.",
+        "Time of each scene. The difference of the times gives the paper's height-to-base ratio of 1.4. The ratio of "
+        "the times is that of the errors of 3D affine in Y, which are proportional to the distance along the track.",
         ("1|affine3d|* Y",),
     ),
     Knob(
@@ -75,8 +75,8 @@ KNOBS = (
         [simulated.SIGMA_DRIFT, simulated.SIGMA_WOBBLE, simulated.SIGMA_YAW],
         "m",
         "fitted",
-        "Attitude: drift towards an end of the scene, each higher degree, and yaw at the ends of the line; from "
-        "the residuals (root mean square) of shift and affine correction.",
+        "Attitude: drift towards an end of the scene, each higher polynomial degree, and yaw at the ends of the line; "
+        "from the residuals (root mean square) of shift and affine correction.",
         ("1|RPC shift|*", "1|RPC affine|*"),
     ),
     Knob(
@@ -84,7 +84,7 @@ KNOBS = (
         simulated.DEGREES,
         "",
         "chosen",
-        "Highest degree of the attitude error over a scene: periods down to some kilometres.",
+        "Highest polynomial degree of the attitude error over a scene: periods down to some kilometres.",
     ),
     Knob(
         "ENHANCEMENT",
