@@ -123,17 +123,14 @@ class Heights:
             more = np.zeros((count, shared.shape[1]))
             more[rows], own[rows] = shared[: len(rows)] * np.nan_to_num(each)[:, None], left[: len(rows)]
             loads = np.hstack([loads, more])
-        none = np.zeros(count, dtype=bool)
-        common = CommonHeights.of(loads, bias, len(rows), problem.size)
+        none, common = np.zeros(count, dtype=bool), CommonHeights.of(loads, bias, len(rows), problem.size)
         images = np.full(count, len(problem.models))
         np.minimum.at(images, problem.points.point, problem.points.image)
         each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
         terrain = LocalTerrain.under(source, _places(problem, local), of, each, images)
         heights = cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
-        if spots is None:
-            return heights
-        left_there = None if left is None else left[len(rows) :]
-        return replace(heights, spots=spots.with_loads(bias, heights.shift, shared[len(rows) :], left_there))
+        at_spots = shared[len(rows) :], None if left is None else left[len(rows) :]
+        return heights if spots is None else replace(heights, spots=spots.with_loads(bias, heights.shift, *at_spots))
 
     @property
     def shift(self) -> float:
@@ -190,8 +187,8 @@ class Heights:
 
     def seen(self, solved: Solved) -> tuple[CommonHeights, Array]:
         """Return the errors that they share, with what a solution tells of them, and the slope ``(k,)``."""
-        slopes = np.nan_to_num(self.terrain.slopes)
-        common, slope = self.common.with_slopes(slopes, self.shift).moved_by(solved)
+        common = self.common.with_slopes(np.nan_to_num(self.terrain.slopes), self.shift)
+        common, slope = common.moved_by(solved)
         return (common, slope) if self.spots is None else self.spots.told(common, self.sigma, slope)
 
     def _with_shared_errors(self, solved: Solved, number: int) -> Heights:
