@@ -209,6 +209,11 @@ KERNELS = {"bilinear": (None, 1), "nearest": (0, 0), "cubic": (1, 2), "lanczos":
 WIDTH, HEIGHT = 16, 12
 
 
+def plan(row, column):
+    """Image columns and rows of output pixels."""
+    return 0.813 + 1.0537 * column + 0.0211 * row, 0.719 + 0.0303 * column + 0.9517 * row
+
+
 def warped(name: str, masked: bool, window: tuple[int, int, int, int]):
     """Warp 14 x 11 pixels out of a window of a source of two bands, a plane each, by a lattice that is a plane too."""
     kernel, reach = KERNELS[name]
@@ -230,13 +235,12 @@ def warped(name: str, masked: bool, window: tuple[int, int, int, int]):
     target = OutputWindow(2, 13, 1, 15, 4, 3, out, good)
     short = tile_kernel.warp_block(source, flat, DemWindow(np.zeros((2, 2)), 0, 0, False), resampling, target)
     row, column = np.meshgrid(np.arange(2, 13), np.arange(1, 15), indexing="ij")
-    places = 0.813 + 1.0537 * column + 0.0211 * row, 0.719 + 0.0303 * column + 0.9517 * row
     here = (slice(None), slice(4, 15), slice(3, 17))
     outside = np.ones(out.shape, dtype=bool)
     outside[here] = False
     assert (out[outside] == 99.0).all()
     assert not good[outside].any()
-    return short, out[here], good[here], places
+    return short, out[here], good[here], plan(row, column)
 
 
 @pytest.mark.parametrize("masked", [False, True])
