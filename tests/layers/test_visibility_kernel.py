@@ -120,6 +120,25 @@ def test_bounds_of_one_top_by_hand(forward, aside):
     np.testing.assert_allclose(above, expected)
 
 
+def test_neighbours_are_taken_in_each_time_directions_have_come_to_be_a_column_apart():
+    tops = np.full((12, 23), -INF)
+    tops[6, 11] = 50.0
+    above, below = np.empty(tops.shape), np.empty(tops.shape)
+    kernel.find_bounds(Course(1, 2.0, 3.0, 0.0, 0.5, 0.5, 20.0), np.zeros((13, 24)), tops, above, below)
+    # Half a column per row: 1 for rounding, 1 and twice 0.5 for the spread, and one more after every second row.
+    for row, pad in ((6, 3), (5, 4), (4, 4), (3, 5), (2, 5), (1, 6), (0, 6)):
+        np.testing.assert_array_equal(np.flatnonzero(above[row] > -INF), np.arange(11 - pad, 12 + pad))
+    kernel.find_bounds(Course(1, 2.0, 3.0, 0.0, 0.04, 0.5, 20.0), np.zeros((13, 24)), tops, above, below)
+    assert [int((row > -INF).sum()) for row in above[:7]] == [5] * 7
+
+
+def test_neighbours_are_the_next_on_both_sides():
+    high, low = np.array([5.0, 1.0, 2.0, 3.0, 9.0, 0.0]), np.array([5.0, 7.0, 8.0, 6.0, 9.0, 9.0])
+    kernel._take_in_neighbours(high, low, np.empty(6))
+    np.testing.assert_array_equal(high, [5, 5, 3, 9, 9, 9])
+    np.testing.assert_array_equal(low, [5, 5, 6, 6, 6, 9])
+
+
 @pytest.mark.parametrize("forward", [1, -1])
 def test_lines_meet_a_ridge_that_they_cross_below(forward):
     """A line leaves the ridge's row, d rows on, after d + 1 rows at most; a void is no ridge."""
@@ -213,6 +232,10 @@ def test_terrain_between_the_ends_of_a_cell_may_rise_above_a_line():
     # From the middle on it falls; what counts is where the part begins.
     assert kernel._rises_above(heights, 0, 0, 0.0, 0.0, 8.99, 0.5, 0.5, 0.0, 1.0, 2.0)
     assert not kernel._rises_above(heights, 0, 0, 0.0, 0.0, 9.01, 0.5, 0.5, 0.0, 1.0, 2.0)
+    # 6 m per sample against a line that bends upwards: 2 s - s^2 is at most 1 m.
+    ramp = np.array([[0.0, 6.0], [0.0, 6.0]])
+    assert kernel._rises_above(ramp, 0, 0, 0.0, 0.0, 0.99, 0.5, 0.0, 1.0, 0.0, 2.0)
+    assert not kernel._rises_above(ramp, 0, 0, 0.0, 0.0, 1.01, 0.5, 0.0, 1.0, 0.0, 2.0)
     # The Earth falls away below: by 0.1 s^2 metres.
     assert not kernel._rises_above(heights, 0, 0, 0.0, 0.0, 8.91, 0.5, 0.5, 0.1, 1.0, 2.0)
     assert kernel._rises_above(heights, 0, 0, 0.0, 0.0, 8.89, 0.5, 0.5, 0.1, 1.0, 2.0)
@@ -226,7 +249,14 @@ def test_heights_in_the_window():
     for x, y in ((-1e-9, 1), (1, -1e-9), (5 + 1e-9, 1), (1, 4 + 1e-9)):
         assert np.isnan(kernel._height(heights, x, y))
     heights[2, 3] = NAN
-    for x, y, void in ((2.0, 2.5, False), (2.5, 1.0, False), (2.5, 2.0, True), (3.0, 1.5, True), (2.5, 1.5, True)):
+    for x, y, void in (
+        (2.0, 2.5, False),
+        (2.0, 1.5, False),
+        (2.5, 1.0, False),
+        (2.5, 2.0, True),
+        (3.0, 1.5, True),
+        (2.5, 1.5, True),
+    ):
         assert np.isnan(kernel._height(heights, x, y)) == void
 
 
@@ -242,17 +272,24 @@ def test_pixels_of_a_row_within_a_cell(du, dv, pixels):
 # -- tiles -----------------------------------------------------------------------------------------------------------
 
 
+def between(nodes, row, column, spacing):
+    at = [[row / spacing], [column / spacing]]
+    return [map_coordinates(nodes[..., axis], at, order=1)[0] for axis in range(2)]
+
+
 @pytest.mark.parametrize("scale", [0.6, 0.09], ids=["narrow", "wide"])
 def test_classes_of_a_tile(scale):
     """Nodes every 4 and 8 pixels, a window that begins between them, and directions that change with the height."""
     heights = spikes(2, void=True)
     west, north, near, far, middle, half, bend = 7, -2, 4, 8, 20.0, 25.0, 0.001
+    random = np.random.default_rng(3)
     j, i = np.mgrid[0:25:near, 0:33:near]
-    origin = (-0.83 + west, 2.13 + north) if scale > 0.5 else (3.1 + west, 3.4 + north)
+    origin = (-0.83, 2.13) if scale > 0.5 else (3.1, 3.4)
     places = np.stack([origin[0] + scale * i + 0.05 * j, origin[1] + scale * j + 0.02 * i], axis=2)
+    places += random.uniform(0, 0.1, places.shape)
     j, i = np.mgrid[0:25:far, 0:33:far]
     first = np.stack([0.2 + 0.002 * i + 0.001 * j, 0.15 - 0.001 * i + 0.003 * j], axis=2)
-    slopes = np.stack([first, np.full_like(first, 0.02)], axis=2)
+    slopes = np.stack([first + random.uniform(-0.03, 0.03, first.shape), np.full_like(first, 0.02)], axis=2)
     ends = np.array([0.1, 0.05]), np.array([0.4, 0.35])
     tops, squares, highest = steep_of(heights, *ends, True)
     above, below = np.full(tops.shape, highest), np.full(tops.shape, -INF)
@@ -260,16 +297,14 @@ def test_classes_of_a_tile(scale):
     kernel.find_known(heights, above, below, known)
     relief = Relief(heights, west, north, tops, squares, above, below, known, highest)
     found = np.full((15, 21), 9, dtype=np.uint8)
-    kernel.look(Rays(places, near, slopes, far, middle, half, bend), relief, 3, 5, found)
+    kernel.look(Rays(places + (west, north), near, slopes, far, middle, half, bend), relief, 3, 5, found)
     counts = np.zeros(3, dtype=int)
     for line, column in np.ndindex(found.shape):
-        j, i = line + 3, column + 5
-        x, y = origin[0] + scale * i + 0.05 * j - west, origin[1] + scale * j + 0.02 * i - north
+        x, y = between(places, line + 3, column + 5, near)
         h = kernel._height(heights, x, y)
         expected = VOID
         if np.isfinite(h):
-            t = (h - middle) / half
-            across, down = 0.2 + 0.002 * i + 0.001 * j + 0.02 * t, 0.15 - 0.001 * i + 0.003 * j + 0.02 * t
+            across, down = between(slopes[:, :, 0] + 0.02 * (h - middle) / half, line + 3, column + 5, far)
             over = excess(heights, x, y, h, across, down, bend, 1201)[1:].max()
             if -1e-2 < over < 1e-2:
                 continue
@@ -286,7 +321,7 @@ def test_classes_that_the_bounds_tell_at_once():
     rays = Rays(places, 8, np.full((2, 2, 1, 2), 0.1), 8, 0.0, 10.0, 0.0)
     for above, below, expected in ((INF, 5.0, HIDDEN), (5.0, -INF, CLEAR)):
         bounds = np.full((3, 3), above), np.full((3, 3), below)
-        known = np.full((3, 3), VOID, dtype=np.uint8)
-        found = np.full((2, 8), 9, dtype=np.uint8)
-        kernel.look(rays, Relief(heights, 0, 0, flat, np.full((1, 1), 99.0), *bounds, known, 99.0), 0, 0, found)
-        assert (found == expected).all()
+        for known in (VOID, expected):
+            known, found = np.full((3, 3), known, dtype=np.uint8), np.full((2, 8), 9, dtype=np.uint8)
+            kernel.look(rays, Relief(heights, 0, 0, flat, np.full((1, 1), 99.0), *bounds, known, 99.0), 0, 0, found)
+            assert (found == expected).all()
