@@ -130,6 +130,9 @@ def test_neighbours_are_taken_in_each_time_directions_have_come_to_be_a_column_a
         np.testing.assert_array_equal(np.flatnonzero(above[row] > -INF), np.arange(11 - pad, 12 + pad))
     kernel.find_bounds(Course(1, 2.0, 3.0, 0.0, 0.04, 0.5, 20.0), np.zeros((13, 24)), tops, above, below)
     assert [int((row > -INF).sum()) for row in above[:7]] == [5] * 7
+    # A tenth per row comes to a column after ten rows from the last one.
+    kernel.find_bounds(Course(1, 2.0, 3.0, 0.0, 0.1, 0.5, 20.0), np.zeros((13, 24)), tops, above, below)
+    assert [int((row > -INF).sum()) for row in above[:7]] == [9, 9, 7, 7, 7, 7, 7]
 
 
 def test_neighbours_are_the_next_on_both_sides():
@@ -297,7 +300,7 @@ def test_classes_of_a_tile(scale):
     kernel.find_known(heights, above, below, known)
     relief = Relief(heights, west, north, tops, squares, above, below, known, highest)
     found = np.full((15, 21), 9, dtype=np.uint8)
-    kernel.look(Rays(places + (west, north), near, slopes, far, middle, half, bend), relief, 3, 5, found)
+    kernel.look(Rays(np.add(places, (west, north)), near, slopes, far, middle, half, bend), relief, 3, 5, found)
     counts = np.zeros(3, dtype=int)
     for line, column in np.ndindex(found.shape):
         x, y = between(places, line + 3, column + 5, near)
@@ -321,7 +324,7 @@ def test_classes_that_the_bounds_tell_at_once():
     rays = Rays(places, 8, np.full((2, 2, 1, 2), 0.1), 8, 0.0, 10.0, 0.0)
     for above, below, expected in ((INF, 5.0, HIDDEN), (5.0, -INF, CLEAR)):
         bounds = np.full((3, 3), above), np.full((3, 3), below)
-        for known in (VOID, expected):
-            known, found = np.full((3, 3), known, dtype=np.uint8), np.full((2, 8), 9, dtype=np.uint8)
+        for before in (VOID, expected):
+            known, found = np.full((3, 3), before, dtype=np.uint8), np.full((2, 8), 9, dtype=np.uint8)
             kernel.look(rays, Relief(heights, 0, 0, flat, np.full((1, 1), 99.0), *bounds, known, 99.0), 0, 0, found)
             assert (found == expected).all()

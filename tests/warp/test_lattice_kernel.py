@@ -13,6 +13,8 @@ NAN, INF = np.nan, np.inf
 @pytest.fixture(autouse=True)
 def plain(interpreted):
     interpreted(lattice_kernel)
+    with np.errstate(invalid="ignore"):
+        yield
 
 
 # -- ranges ----------------------------------------------------------------------------------------------------------
@@ -180,6 +182,17 @@ def test_second_differences_foretell_parabolas_exactly():
             assert found == pytest.approx(parabola(y + fy, x + fx))
 
 
+def test_nodes_at_the_rim_have_the_bow_of_the_next_ones():
+    nodes = np.random.default_rng(1).normal(size=(5, 5))
+    across = np.pad(np.diff(nodes, 2, axis=1), ((0, 0), (1, 1)), mode="edge")
+    down = np.pad(np.diff(nodes, 2, axis=0), ((1, 1), (0, 0)), mode="edge")
+    fx, fy = 0.3, 0.6
+    bowed = nodes - (fx * (1 - fx) * across + fy * (1 - fy) * down) / 2
+    for j, i in np.ndindex(4, 4):
+        expected = [1 - fy, fy] @ bowed[j : j + 2, i : i + 2] @ [1 - fx, fx]
+        assert lattice_kernel._bowed(nodes, j, i, fx, fy) == pytest.approx(expected)
+
+
 # -- the whole bound -------------------------------------------------------------------------------------------------
 
 SPACING = 4
@@ -187,7 +200,7 @@ SPACING = 4
 
 def scene(rows, columns, t):
     """Image and DEM coordinates of offsets in nodes and normalised heights, parabolas all."""
-    column = 5 + 3 * columns + 0.2 * columns**2 + 2 * t + 0.5 * t**2
+    column = 5 + 3 * columns + (0.2 + 0.1 * t) * columns**2 - 2 * t + 0.5 * t**2
     row = 7 - 4 * rows + 0.1 * rows**2 + 0.1 * rows * columns - t
     image = np.stack(np.broadcast_arrays(column, row), axis=-1)
     return image, np.stack([2 * columns + 0.05 * rows**2, 3 * rows + 0 * columns], axis=-1)
@@ -214,18 +227,18 @@ def bounded(points, off=0.0, off_dem=0.0, hidden=()):
 
 
 POINTS = [(1.0, 2.0, 0.3), (13.0, 6.5, -0.8), (15.0, 15.0, 1.0)]
-#: Parallax of a node over the heights, at most: (1.5, 1) px below the middle, (2.5, 1) above it.
+#: Parallax of a node over the heights, at most, in the first column: (2.5, 1) px below the middle, (1.5, 1) above it.
 PARALLAX = np.hypot(1.5, 1) + np.hypot(2.5, 1)
-#: An eighth of the second differences: 0.4 px along, 0.2 down; 0.1 samples down in the DEM.
-BENT = (0.4 + 0.2) / 8 + PARALLAX * 0.1 / 8
+#: An eighth of the second differences: 0.6 px along at the top, 0.2 down; 0.1 samples down in the DEM.
+BENT = (0.6 + 0.2) / 8 + PARALLAX * 0.1 / 8
 
 
 def test_a_parabola_is_off_by_an_eighth_of_its_second_differences():
     error, apart, step = bounded(POINTS)
     assert error == pytest.approx(BENT)
     assert apart == pytest.approx(BENT)
-    # From (3, 0) to (4, 0): 3.9 rows; from (3, 3) to (3, 4): 4.4 columns and 0.3 rows.
-    assert step == pytest.approx(np.hypot(3 + 0.2 * 7, 0.3))
+    # From node (3, 3) to (3, 4) at the top: 5.1 columns and 0.3 rows.
+    assert step == pytest.approx(np.hypot(3 + 0.3 * 7, 0.3))
 
 
 def test_what_check_points_find_counts_three_times():
@@ -245,6 +258,15 @@ def test_check_points_in_cells_that_are_not_visible_do_not_count():
     off[1] = 3.0, -4.0
     assert bounded(POINTS, off, hidden=[(1, 3)])[0] == pytest.approx(BENT)
     assert bounded(POINTS, off, hidden=[(3, 1)])[0] == pytest.approx(BENT + 3 * 5.0)
+
+
+def test_a_node_that_the_model_does_not_project_makes_the_bound_infinite():
+    image, dem = np.zeros((1, 3, 3, 2, 2)), np.zeros((1, 3, 3, 2))
+    image[0, 1, 1, 1] = NAN
+    points, exact = np.zeros((1, 1, 3)), np.zeros((1, 1, 2))
+    out = np.zeros((3, 1))
+    lattice_kernel.bounds(image, image, dem, np.ones((1, 2, 2), dtype=bool), 4, points, exact, exact, *out)
+    assert out[0, 0] == INF
 
 
 def test_nothing_is_visible_in_a_block():
