@@ -182,6 +182,7 @@ def test_squares_of_cells_are_numbered_row_by_row_from_the_smallest():
         assert ray_kernel._square(tops, rows, columns, i, j, 4) == 35 + j // 16 * 4 + i // 16
         assert ray_kernel._square(tops, rows, columns, i, j, 5) == 47 + j // 32 * 2 + i // 32
         assert ray_kernel._square(tops, rows, columns, i, j, 6) == 51
+    assert ray_kernel._square(np.arange(24), 32, 48, 31, 47, 3) == 23
     assert [ray_kernel._coarsest(length) for length in (1, 8, 8.1, 16, 17, 64, 65)] == [3, 3, 4, 4, 5, 6, 7]
 
 
@@ -208,7 +209,7 @@ def test_squares_of_few_samples(interpreted, lean):
     """Steep cells, voids and differences of samples, to the last row and column."""
     interpreted(ray_kernel)
     heights = np.random.default_rng(4).normal(0, 2, (11, 20))
-    heights[10, 19], heights[3, 12] = 30.0, np.nan
+    heights[10, 19], heights[5, 8], heights[3, 12] = 30.0, 40.0, np.nan
     tops, steep, voids = (np.empty((2, 3)) for _ in range(3))
     way = np.array(lean)
     steepest = ray_kernel.find_squares(heights, way - 0.01, way + 0.01, tops, steep, voids)

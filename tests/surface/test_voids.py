@@ -46,7 +46,16 @@ def test_windows_hold_the_nearest_height_within_the_reach(reach):
     """Each is at the distance of the nearest one from the place in the raster, and the edge goes on from there."""
     heights = np.full((4, 5), np.nan)
     heights[1, 3], heights[3, 0] = 7.0, 9.0
-    for u0, v0, nu, nv in ((0, 0, 5, 4), (1, 1, 1, 1), (-2, -3, 4, 5), (4, 3, 3, 2), (-6, 1, 13, 1)):
+    for u0, v0, nu, nv in (
+        (0, 0, 5, 4),
+        (1, 1, 1, 1),
+        (3, 3, 1, 1),
+        (0, 1, 1, 1),
+        (2, 3, 1, 1),
+        (-2, -3, 4, 5),
+        (4, 3, 3, 2),
+        (-6, 1, 13, 1),
+    ):
         found = nearest_heights(source(heights), heights.shape, (u0, v0, nu, nv), reach)
         assert found.shape == (nv, nu)
         for j, i in np.ndindex(nv, nu):
