@@ -48,6 +48,12 @@ def test_hidden_pixels_have_no_value_without_a_mask():
     assert work.hidden_share == pytest.approx(1 / 5)
 
 
+def test_all_that_is_shown_is_hidden():
+    work = looked(np.array([[HIDDEN]], dtype=np.uint8))
+    work.look(0, 0, np.ones((1, 1, 1)), np.ones((1, 1, 1), dtype=bool), 0)
+    assert work.hidden_share == 1.0
+
+
 def test_nothing_is_hidden():
     classes, hidden = looked(SEEN & 0, mask="m").look(0, 0, np.ones((1, 2, 3)), SHOWN[None].copy(), -1.0)
     assert hidden is None
@@ -68,12 +74,12 @@ def test_hidden_pixels_are_filled_from_the_other_ortho_where_it_has_values():
     hidden = np.zeros((5, 6), dtype=bool)
     hidden[1, 2] = hidden[3, 4] = hidden[2, 2] = True
     pixels, valid = np.zeros((2, 5, 6)), np.zeros((2, 5, 6), dtype=bool)
-    valid[:, 0, 0] = True
+    valid[:, 0, 0] = valid[:, 2, 3] = True
     work.fill(40, 70, hidden, pixels, valid)
     assert asked == [(42, 71, 3, 3)]
     expected, known = np.zeros((2, 5, 6)), np.zeros((2, 5, 6), dtype=bool)
     expected[:, 1, 2], expected[:, 2, 2], expected[0, 3, 4] = [100, 109], [103, 112], 108
-    known[:, 0, 0] = known[:, 1, 2] = known[:, 2, 2] = known[0, 3, 4] = True
+    known[:, 0, 0] = known[:, 2, 3] = known[:, 1, 2] = known[:, 2, 2] = known[0, 3, 4] = True
     np.testing.assert_array_equal(pixels, expected)
     np.testing.assert_array_equal(valid, known)
     work.look(0, 0, np.ones((1, 2, 3)), SHOWN[None].copy(), -1.0)
@@ -129,8 +135,8 @@ def test_angles_go_up_to_the_edge_of_the_image(column, row, inside, monkeypatch)
 
 
 def test_the_grid_of_a_layer_holds_the_whole_ortho():
-    grid = Grid(None, 5.0, 9.0, 0.5, 0.25, 16, 17)
-    assert dataclasses.astuple(accuracy.layer_grid(grid, 8)) == (None, 5.0, 9.0, 4.0, 2.0, 2, 3)
+    grid = Grid(None, 5.0, 9.0, 0.5, 0.25, 17, 24)
+    assert dataclasses.astuple(accuracy.layer_grid(grid, 8)) == (None, 5.0, 9.0, 4.0, 2.0, 3, 3)
     assert dataclasses.astuple(accuracy.layer_grid(grid, 1)) == dataclasses.astuple(grid)
 
 

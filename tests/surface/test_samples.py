@@ -13,7 +13,7 @@ from ortho_pipeline.errors import CrsError
 from ortho_pipeline.surface import dem
 from ortho_pipeline.surface.dem import TILE, DemSurface
 from ortho_pipeline.surface.dem_file import SampleGrid
-from ortho_pipeline.surface.dem_mosaic import _between_columns
+from ortho_pipeline.surface.dem_mosaic import _between_columns, _west
 
 HEIGHTS = np.random.default_rng(1).normal(size=(6, 7))
 
@@ -52,7 +52,17 @@ def test_positions_by_tile():
 
 
 @pytest.mark.parametrize(
-    "window", [(0, 0, 7, 6), (-2, -1, 4, 3), (5, 4, 4, 4), (2, 1, 3, 2), (-9, 0, 5, 5), (7, 0, 2, 2)]
+    "window",
+    [
+        (0, 0, 7, 6),
+        (-2, -1, 4, 3),
+        (5, 4, 4, 4),
+        (2, 1, 3, 2),
+        (-9, 0, 5, 5),
+        (7, 0, 2, 2),
+        (0, -9, 5, 5),
+        (1, 6, 2, 2),
+    ],
 )
 def test_windows_are_void_beyond_the_samples(window):
     u0, v0, nu, nv = window
@@ -98,6 +108,8 @@ def test_the_window_around_a_box_has_room_for_cubics():
     assert wide.window_around(5.0, 93.0, 9.0, 95.0) is None
     assert wide.window_around(-9.0, 5.0, -5.0, 9.0) == (-2, 3, 0, 14)
     assert wide.window_around(-9.0, 5.0, -6.0, 9.0) is None
+    assert wide.window_around(5.0, -9.0, 9.0, -5.0) == (3, -2, 14, 0)
+    assert wide.window_around(5.0, -9.0, 9.0, -6.0) is None
 
 
 @pytest.mark.parametrize("window", [(0, 0, 30, 20), (7, 11, 1, 1), (9, 9, 2, 2), (-13, 4, 25, 9)])
@@ -152,6 +164,8 @@ def test_columns_of_all_spacings_are_among_the_divided_ones(coarse, west, fine, 
 
 
 def test_the_first_column_is_that_of_the_file_farthest_west():
+    assert _west(members(1.0, 3.0, 9.0)) == 3.0
+    assert _west(members(-1.0, 3.0, 9.0)) == 9.0
     assert _between_columns([members(2.0, 14.5, 10.5), members(1.0, 12.0, 10.0)]) == 2
     assert _between_columns([members(2.0, 12.5), members(1.0, 13.0, 12.5)]) == 1
 
