@@ -31,7 +31,7 @@ def raster(path, count=2, nodata=None, alpha=False, masked=False) -> str:
     dataset.WriteArray(values)
     if masked:
         dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
-        dataset.GetRasterBand(1).GetMaskBand().WriteArray(np.array([[0, 255, 255], [255] * 3], dtype=np.uint8))
+        dataset.GetRasterBand(1).GetMaskBand().WriteArray(np.array([[255] * 3, [255, 255, 0]], dtype=np.uint8))
     return str(path)
 
 
@@ -42,7 +42,8 @@ def raster(path, count=2, nodata=None, alpha=False, masked=False) -> str:
         ({"nodata": 7}, None, "nodata", [(0, 0, 0), (1, 0, 0), (1, 0, 1)]),
         ({"alpha": True}, None, "alpha", [(0, 0, 0)]),
         ({"alpha": True}, [1], "mask", [(0, 0, 0)]),
-        ({"masked": True}, None, "mask", [(0, 0, 0), (1, 0, 0)]),
+        ({"masked": True}, None, "mask", [(0, 1, 2), (1, 1, 2)]),
+        ({"masked": True, "nodata": 7}, None, "nodata", [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 1, 2), (1, 1, 2)]),
     ],
 )
 def test_which_pixels_are_valid(tmp_path, written, bands, validity, invalid):
@@ -62,11 +63,12 @@ def test_which_pixels_are_valid(tmp_path, written, bands, validity, invalid):
 
 def test_bands_of_several_files_are_valid_each_as_in_its_own(tmp_path):
     plain, holes = raster(tmp_path / "a.tif"), raster(tmp_path / "b.tif", nodata=7)
-    source = RasterSource(plain, holes, bands=[4, 1, 2])
+    source = RasterSource(plain, holes, bands=[1, 2, 4, 3])
     pixels = source.read(1, 0, 2, 2)
-    np.testing.assert_array_equal(pixels, [[[7, 18], [20, 21]], [[11, 12], [14, 15]], [[17, 18], [20, 21]]])
-    expected = np.ones((3, 2, 2), dtype=bool)
-    expected[0, 0, 0] = False
+    own = [[[11, 12], [14, 15]], [[17, 18], [20, 21]]]
+    np.testing.assert_array_equal(pixels, [*own, [[7, 18], [20, 21]], own[0]])
+    expected = np.ones((4, 2, 2), dtype=bool)
+    expected[2, 0, 0] = False
     np.testing.assert_array_equal(source.read_valid(1, 0, pixels), expected)
     for band in (0, 5):
         with pytest.raises(InputError, match=f"no band {band}: the image has 4"):

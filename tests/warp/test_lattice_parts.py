@@ -57,6 +57,8 @@ def test_check_points_spread_over_the_visible_part():
     points = lattice._scatter([OutputBlock(0, 0), OutputBlock(0, 1)], area)
     assert points.shape == (2, VERIFIED, 3)
     np.testing.assert_array_equal(points[0, 0], [100 + 0.5 * 40, 10 + 0.25 * 50, -1.0])
+    # The last pixel of a block is the 255th after the first.
+    np.testing.assert_allclose(points[1, 0], [0.5 * 255, 192 + (0.25 + 0.5698402910) * 63, -1 + 0.3 * 2])
     for found, (top, bottom, left, right) in zip(points, np.minimum(area, 255), strict=True):
         for values, low, high in zip(found.T, (left, top, -1.0), (right, bottom, 1.0), strict=True):
             assert low <= values.min() < low + 0.2 * (high - low)
@@ -70,7 +72,7 @@ def test_check_points_spread_over_the_visible_part():
 @pytest.mark.parametrize(
     ("box", "window"),
     [
-        ((10.2, 20.9, 30.1, 40.0), (4, 14, 37, 46)),
+        ((10.2, 20.9, 30.1, 39.2), (4, 14, 37, 46)),
         ((3.0, 5.0, 399.0, 299.0), (0, 0, 400, 300)),
         ((-20.0, -30.0, -5.5, 9.0), (0, 0, 1, 15)),
         ((-20.0, -30.0, -6.0, 9.0), None),
