@@ -133,6 +133,14 @@ def test_every_pixel_may_be_a_node():
         np.testing.assert_allclose(found, coordinates(made, False, row, [column]), atol=1e-9)
 
 
+def test_every_second_pixel_may_be_a_node():
+    made = lattice(3, (0.2, 5.5), (0.3, 4.4), spacing=2)
+    for row in range(4):
+        np.testing.assert_allclose(
+            block_coordinates(made, False, row, 0, 4), coordinates(made, False, row, range(4)), atol=1e-9
+        )
+
+
 def test_rows_of_nodes_do_not_need_the_next_ones():
     made = lattice(3, (0.2, 5.5), (0.3, 4.4))
     expected = coordinates(made, False, 4, range(8))
