@@ -20,6 +20,7 @@ from real_data import data_folder
 
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.models import RPC
+from ortho_pipeline.runtime.compiled import Kernel
 
 # A shell that starts the tests in the background has its children ignore Ctrl-C; what the tests start must not.
 for _number, _action in (
@@ -96,6 +97,19 @@ def benchmark_module() -> Callable[[str], Any]:
 def sample() -> Path:
     """Folder of the simulated sample scene."""
     return SAMPLE
+
+
+@pytest.fixture
+def interpreted(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Have the kernels of modules run as plain Python, where an index outside of an array is an error."""
+
+    def interpret(*modules: Any) -> None:
+        for module in modules:
+            for name, value in list(vars(module).items()):
+                if isinstance(value, Kernel):
+                    monkeypatch.setattr(module, name, value.py_func)
+
+    return interpret
 
 
 class Calls:

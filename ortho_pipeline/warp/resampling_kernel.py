@@ -400,6 +400,8 @@ def _edge_value(kernel, resampling, source, valid, masked, col, row, left, top, 
     As GDAL does: Lanczos takes the valid neighbours alone, with weights that sum to one; cubic falls back to bilinear.
     What is made as within the image is already rounded if the output is an integer.
     """
+    if kernel == AVERAGE:
+        return _average_valid(source, valid, masked, col - left, row - top, resampling.box)
     integer, real = resampling.integer, resampling.real.dtype.type
     x, y = col - 0.5, row - 0.5
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -407,8 +409,6 @@ def _edge_value(kernel, resampling, source, valid, masked, col, row, left, top, 
     inner = i >= span and j >= span and i + span + 1 < full_width and j + span + 1 < full_height
     if inner and masked:
         inner = _all_valid(valid, i - span - left, j - span - top, 2 * span + 2)
-    if kernel == AVERAGE:
-        return _average_valid(source, valid, masked, col - left, row - top, resampling.box)
     if kernel == CUBIC and inner:
         return _cubic(source, x, y, left, top, real, integer)
     if kernel == LANCZOS:

@@ -75,7 +75,7 @@ class OutputWindow(NamedTuple):
 
 
 #: Fewer pixels in a row are not worth being made together.
-_RUN = 8
+_PART = 8
 
 
 @inlined
@@ -332,9 +332,9 @@ def _next_whole(source, columns, rows, low_col, high_col, low_row, high_row, don
         good = low_col <= col < high_col and low_row <= row < high_row
         if good and whole[int(row) - top, int(col) - left]:
             end += 1
-        elif end - begin >= _RUN:
+        elif end - begin >= _PART:
             break
         else:
             end += 1
             begin = end
-    return (begin, end) if end - begin >= _RUN else (count, count)
+    return (begin, end) if end - begin >= _PART else (count, count)

@@ -2,13 +2,74 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.raster.source import open_dataset
+from ortho_pipeline.raster.source import RasterSource, open_dataset
 
 
 def test_a_folder_without_a_product_is_no_image(tmp_path):
     with pytest.raises(InputError, match="this is a folder, not an image") as caught:
         open_dataset(tmp_path)
     assert "by name" in str(caught.value.remedy)
+
+
+def raster(path, count=2, nodata=None, alpha=False, masked=False) -> str:
+    """Write bands of 3 x 2 pixels, the first without a value, and a second one in the last band alone."""
+    options = ["ALPHA=YES"] if alpha else []
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 3, 2, count, gdal.GDT_Byte, options)
+    values = np.arange(10, 10 + 6 * count, dtype=np.uint8).reshape(count, 2, 3)
+    if nodata is not None:
+        values[:, 0, 0] = values[-1, 0, 1] = nodata
+        for band in range(count):
+            dataset.GetRasterBand(band + 1).SetNoDataValue(nodata)
+    elif alpha:
+        values[-1] = 255
+        values[-1, 0, 0] = 0
+    dataset.WriteArray(values)
+    if masked:
+        dataset.CreateMaskBand(gdal.GMF_PER_DATASET)
+        dataset.GetRasterBand(1).GetMaskBand().WriteArray(np.array([[255] * 3, [255, 255, 0]], dtype=np.uint8))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("written", "bands", "validity", "invalid"),
+    [
+        ({}, None, "all", None),
+        ({"nodata": 7}, None, "nodata", [(0, 0, 0), (1, 0, 0), (1, 0, 1)]),
+        ({"alpha": True}, None, "alpha", [(0, 0, 0)]),
+        ({"alpha": True}, [1], "mask", [(0, 0, 0)]),
+        ({"masked": True}, None, "mask", [(0, 1, 2), (1, 1, 2)]),
+        ({"masked": True, "nodata": 7}, None, "nodata", [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 1, 2), (1, 1, 2)]),
+    ],
+)
+def test_which_pixels_are_valid(tmp_path, written, bands, validity, invalid):
+    source = RasterSource(raster(tmp_path / "a.tif", **written), bands=bands)
+    assert source.validity == validity
+    pixels = source.read(0, 0, 3, 2)
+    valid = source.read_valid(0, 0, pixels)
+    if invalid is None:
+        assert valid is None
+        return
+    expected = np.ones(pixels.shape, dtype=bool)
+    expected[tuple(np.transpose(invalid))] = False
+    np.testing.assert_array_equal(np.broadcast_to(valid, pixels.shape)[:1], expected[:1])
+    if validity != "alpha":
+        np.testing.assert_array_equal(valid, expected)
+
+
+def test_bands_of_several_files_are_valid_each_as_in_its_own(tmp_path):
+    plain, holes = raster(tmp_path / "a.tif"), raster(tmp_path / "b.tif", nodata=7)
+    source = RasterSource(plain, holes, bands=[1, 2, 4, 3])
+    pixels = source.read(1, 0, 2, 2)
+    own = [[[11, 12], [14, 15]], [[17, 18], [20, 21]]]
+    np.testing.assert_array_equal(pixels, [*own, [[7, 18], [20, 21]], own[0]])
+    expected = np.ones((4, 2, 2), dtype=bool)
+    expected[2, 0, 0] = False
+    np.testing.assert_array_equal(source.read_valid(1, 0, pixels), expected)
+    for band in (0, 5):
+        with pytest.raises(InputError, match=f"no band {band}: the image has 4"):
+            RasterSource(plain, holes, bands=[band])
