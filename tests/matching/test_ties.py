@@ -20,7 +20,6 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.imaging.matching.agreement import refuse_accident
-from ortho_pipeline.imaging.matching.chip_search import SIDE
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
 from ortho_pipeline.imaging.ties.pairs import PairSummary
@@ -128,14 +127,6 @@ def test_a_track_has_each_scene_once_and_covers_the_overlap(tmp_path):
     values = np.linalg.eigvalsh(ties.covariance)
     assert (values > 0).all()
     assert np.sqrt(values.max()) < 0.6
-
-
-def test_chips_of_ties_do_not_overlap_however_many_are_asked_for(tmp_path):
-    """A block takes ties for independent: 480 x 320 photos with chips every 9 px were 9 m off at a sigma of 3 m."""
-    _, views = looks(tmp_path, [-10.0, 10.0], side=200, dem_sigma=2.0)
-    ties = tie(views, TieSettings(search=25.0, points=5000, dem_sigma=3.0))
-    assert max(pair.tried for pair in ties.pairs) <= (200 / SIDE) ** 2
-    assert len(np.unique(ties.track)) >= 12
 
 
 def test_a_track_goes_on_where_its_home_cannot_be_matched(tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ the scenes that the home did not overlap, so tracks continue through a block.
 from __future__ import annotations
 
 import itertools
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -177,11 +176,7 @@ class _Block:
     ) -> tuple[list[_Track], list[set[int]]]:
         """Return new tracks, one in each cell without a tie to a later scene, and these scenes for each."""
         share = min(len(partners[other]) for other in placed) / SAMPLES**2
-        factor = min(pair.factor for pair in placed.values())
-        # Chips that overlap have the same errors in part, and a block takes each tie for independent.
-        most = max(1, round(math.prod(view.size) / (SIDE * factor) ** 2))
-        count = min(round(self.settings.points / share), _MOST * self.settings.points, most)
-        columns, rows = cells_of(*view.size, count)
+        columns, rows = cells_of(*view.size, min(round(self.settings.points / share), _MOST * self.settings.points))
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
         centres = np.column_stack([x.ravel(), y.ravel()]) * view.size
         lacking = {other: shows(view, self.targets[other], centres) for other in placed}
@@ -192,6 +187,7 @@ class _Block:
                 if other in track.places:
                     lacking[other][cell] = False
         wanted = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
+        factor = min(pair.factor for pair in placed.values())
         origins, numbers = candidates(view, (0, 0, *view.size), (columns, rows), SIDE, factor, wanted)
         nothing = np.full((2, 2), np.nan)
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
