@@ -15,7 +15,7 @@ from scenes import Case, Setting, write_raster
 
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.control.ties import Tied, _points, names_of
+from ortho_pipeline.commands.control.ties import Tied, _crowded, _points, names_of
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
@@ -127,6 +127,19 @@ def test_a_track_has_each_scene_once_and_covers_the_overlap(tmp_path):
     values = np.linalg.eigvalsh(ties.covariance)
     assert (values > 0).all()
     assert np.sqrt(values.max()) < 0.6
+
+
+@pytest.mark.parametrize(("points", "crowded"), [(20, False), (400, True)])
+def test_crowded_ties_are_told_with_the_number_that_would_not_be(tmp_path, points, crowded):
+    """Chips of 40 px are over each other where cells are smaller than 20 px."""
+    _, views = looks(tmp_path, [-10.0, 10.0], side=200, dem_sigma=2.0)
+    ties = tie(views, TieSettings(search=25.0, points=points, dem_sigma=3.0))
+    notices = _crowded(ties, points)
+    assert [one.code for one in notices] == ["crowded-ties"] * crowded
+    if crowded:
+        # A scene shows 70 to 100 % of the other one, and as many cells more are needed.
+        assert 0.7 <= points * 40**2 / 200**2 / notices[0].fields["crowding"] <= 1.0
+        assert 0.7 <= notices[0].fields["points"] / (4 * 200**2 / 40**2) <= 1.0
 
 
 def test_a_track_goes_on_where_its_home_cannot_be_matched(tmp_path, monkeypatch):

@@ -26,7 +26,7 @@ from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.display.numbers import metres, px
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.files.json.values import json_value
 from ortho_pipeline.hookspecs import Scene
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 DEM_SIGMA, FLAT_SIGMA = 10.0, 30.0
 #: Fewer ties than this between two scenes give a notice.
 _FEW = 30
+#: So many ties a pixel are crowded: neighbours are then nearer than half a chip.
+_CROWDED = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +159,7 @@ def tie_scenes(
     stated = typical_sigma(surface)
     sigma = usual if stated is None else stated
     ties = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
-    notices = [*_few(ties, tuple(scenes))]
+    notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.points)]
     if stated is None:
         text = f"accuracy of the heights not given; assuming {metres(sigma)}"
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
@@ -195,6 +197,21 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
         text = f"only {counted(number, 'tie point')} between {label}, which show the same ground{why}"
         notices.append(Notice("few-ties", text, images=[names[image] for image in pair.images], count=number))
     return notices
+
+
+def _crowded(ties: Ties, points: int) -> list[Notice]:
+    """Return the notice that neighbouring ties have the same errors, of the most crowded pair."""
+    crowding = max((pair.crowding for pair in ties.pairs if pair.ties), default=1.0)
+    if crowding < _CROWDED:
+        return []
+    fewer = max(1, round(points * _CROWDED / crowding))
+    text = Text(
+        f"neighbouring ties share most of the pixels that they were matched by ({crowding:.0f} ties a pixel), and so "
+        "their errors. An adjustment takes ties for independent: its sigmas are too small, and its tests of shifts "
+        "and cameras find too much. Ask for fewer: ",
+        Setting("match.points", str(fewer)),
+    )
+    return [Notice("crowded-ties", text, crowding=crowding, points=fewer)]
 
 
 @with_items

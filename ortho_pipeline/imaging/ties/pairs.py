@@ -73,6 +73,8 @@ class PairSummary:
         The parts of the residuals.
     reason : str
         Why there are no tie points; empty if there are.
+    crowding : float
+        Chips over each pixel of the first scene, at least 1. Chips that overlap have the same errors in part.
     """
 
     images: tuple[int, int]
@@ -81,6 +83,7 @@ class PairSummary:
     shift: tuple[float, float] = (math.nan, math.nan)
     components: Components | None = None
     reason: str = ""
+    crowding: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

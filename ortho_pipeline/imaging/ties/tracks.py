@@ -7,6 +7,7 @@ the scenes that the home did not overlap, so tracks continue through a block.
 from __future__ import annotations
 
 import itertools
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -130,6 +131,7 @@ class _Block:
         self.views, self.targets, self.settings = views, targets, settings
         self.tracks: list[_Track] = []
         self.pairs: list[PairSummary] = []
+        self.crowding: dict[int, float] = {}
 
     def tie_home(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> None:
         """Measure chips of a scene in the scenes after it."""
@@ -188,6 +190,7 @@ class _Block:
                     lacking[other][cell] = False
         wanted = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
         factor = min(pair.factor for pair in placed.values())
+        self.crowding[home] = max(1.0, (SIDE * factor) ** 2 * columns * rows / math.prod(view.size))
         origins, numbers = candidates(view, (0, 0, *view.size), (columns, rows), SIDE, factor, wanted)
         nothing = np.full((2, 2), np.nan)
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
@@ -210,8 +213,9 @@ class _Block:
                     own.setdefault(k, []).append(matched.first_covariance[row])
             count = int(matched.good.sum())
             reason = "" if count else f"none of {counted(len(index), 'place')} matched"
+            shift, crowding = placed[other].shift, self.crowding[home]
             self.pairs.append(
-                PairSummary((home, other), count, len(index), placed[other].shift, matched.components, reason)
+                PairSummary((home, other), count, len(index), shift, matched.components, reason, crowding)
             )
         for k, parts in own.items():
             place, covariance = tracks[k].places[home]

@@ -84,6 +84,7 @@ _LOOK: dict[str, str] = {
     "search-by-default": Text("Change the radius with ", Setting("match.search"), "."),
     "points-cover-part": "Add points in the empty parts: control, or ties if images overlap there.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
+    "crowded-ties": "Small images need few ties. More do not make the result more accurate.",
     "few-ties": "Measure some ties between these images.",
     "no-matches": "Give this image control points or a more similar reference.",
     "dem-datum-by-name": Text("State the height datum of the DEM with ", Setting("surface.vertical"), "."),
