@@ -182,7 +182,7 @@ def test_squares_of_cells_are_numbered_row_by_row_from_the_smallest():
         assert ray_kernel._square(tops, rows, columns, i, j, 4) == 35 + j // 16 * 4 + i // 16
         assert ray_kernel._square(tops, rows, columns, i, j, 5) == 47 + j // 32 * 2 + i // 32
         assert ray_kernel._square(tops, rows, columns, i, j, 6) == 51
-    assert ray_kernel._square(np.arange(24), 32, 48, 31, 47, 3) == 23
+    assert ray_kernel._square(np.arange(24), 32, 48, 47, 31, 3) == 23
     assert [ray_kernel._coarsest(length) for length in (1, 8, 8.1, 16, 17, 64, 65)] == [3, 3, 4, 4, 5, 6, 7]
 
 
