@@ -146,3 +146,15 @@ def student_of(values: Array, covariance: Array, degrees_of_freedom: float) -> t
         ratio = values / np.sqrt(np.diag(covariance))
     tail = stdtr(degrees_of_freedom, -np.abs(ratio)) if degrees_of_freedom > 0 else ndtr(-np.abs(ratio))
     return ratio, np.asarray(2 * tail)
+
+
+def chance_of_mean(values: Array) -> float:
+    """Return the probability of a mean as far above zero as that of values ``(n,)`` by chance; NaN if all are zero.
+
+    One-sided t test.
+    """
+    from scipy.special import stdtr  # importing scipy.stats would take most of a command's start-up
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = values.mean() / (values.std(ddof=1) / np.sqrt(len(values)))
+    return float(stdtr(len(values) - 1, -ratio))

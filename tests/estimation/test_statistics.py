@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyproj
 import pytest
-from scipy.stats import f
+from scipy.stats import f, ttest_1samp
 
 from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.estimation.choice.expected_error import expectation
@@ -19,6 +19,7 @@ from ortho_pipeline.estimation.observations.common_unknown import CommonGroundEr
 from ortho_pipeline.estimation.statistics import (
     basis_of,
     chance_of,
+    chance_of_mean,
     correlation_of,
     effective_parameters,
     left_out,
@@ -306,3 +307,11 @@ def test_parameters_that_cannot_be_separated_are_named():
     assert "a and c" in text
     assert said(0.5, condition=9.9e3) == []
     assert said(0.5, condition=1.1e4)[0].startswith("unstable")
+
+
+def test_the_chance_of_a_mean_is_that_of_a_one_sided_t_test():
+    for mean in (-0.5, 0.0, 0.4, 3.0):
+        values = np.random.default_rng(7).normal(mean, 1.0, 9)
+        assert chance_of_mean(values) == pytest.approx(ttest_1samp(values, 0.0, alternative="greater").pvalue, rel=1e-9)
+    assert (chance_of_mean(np.ones(5)), chance_of_mean(-np.ones(5))) == (0.0, 1.0)
+    assert np.isnan(chance_of_mean(np.zeros(5)))

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from ortho_pipeline.commands.inputs import check_paths
 from ortho_pipeline.commands.orthos.masks import ClassMask
@@ -24,6 +23,7 @@ from ortho_pipeline.commands.scene_fit import by_matches
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
+from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
 from ortho_pipeline.files import together, write_json
@@ -217,7 +217,7 @@ def _justified(kept: MeasuredOrtho, field: DisplacementField, cells: Array) -> t
     """Return the correction with the fewest parameters that predicts held-out matches as well as any other."""
     groups, _ = held_out(field.origin + field.place * field.scale)
     with_field, without = field.held_out(groups)
-    chance = float(stats.ttest_rel(with_field, without, alternative="less").pvalue) if len(without) > 2 else 1.0
+    chance = chance_of_mean(without - with_field) if len(without) > 2 else 1.0
     better = 1.0 - float(with_field.sum() / max(without.sum(), 1e-300))
     bends = float(np.sqrt((field.mean(cells) ** 2).sum(axis=1).mean()))
     if chance < _CHANCE and better > _BETTER and bends > _BENDS:

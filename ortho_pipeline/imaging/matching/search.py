@@ -25,10 +25,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.special import stdtr
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.imaging.matching.agreement import (
     NEXT,
     affine_step,
@@ -445,9 +445,7 @@ def _standing_out(
         difference = np.array([values[best][place] - values[other][place] for place in common])
         chance = 1.0
         if len(difference) >= _FEWEST:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = difference.mean() / (difference.std(ddof=1) / math.sqrt(len(difference)))
-            chance = float(stdtr(len(difference) - 1, -ratio))
+            chance = chance_of_mean(difference)
         if chance < _UNIQUE and means[other] < _CLEARLY * means[best]:
             continue
         far = float(np.hypot(*(corrections[best].coefficients - corrections[other].coefficients)[[0, 3]])) * pixel
