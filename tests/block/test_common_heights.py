@@ -36,7 +36,7 @@ def test_they_are_unknowns_of_the_block(settled: tuple[Solved, Selection, Height
     solved, _, heights = settled
     linear, planes = solved.linear, solved.problem.heights
     assert planes is not None
-    common, slope = heights.common.with_slopes(heights.terrain.slopes, heights.shift).moved_by(solved)
+    common, slope = heights.common.with_slopes(heights.terrain.slopes, heights.source.shift_sigma).moved_by(solved)
     np.testing.assert_array_equal(heights.common.loads[:, 0], 4.0)
     design, misfits = dense(linear)
     grounded, rays = linear.ordering.grounded, linear.ordering.rays

@@ -116,7 +116,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
     active[solved.linear.ordering.numbers] = True
     wrong, broken = active & heights.wrong, active & heights.broken & ~heights.wrong
     water = active & heights.terrain.water & ~wrong & ~broken
-    shift, shift_covariance = heights.common.shift(heights.shift)
+    shift, shift_covariance = heights.common.shift(heights.source.shift_sigma)
     return HeightsRecord(
         used=len(used),
         left_out=tuple(solved.problem.points.ids[k] for k in np.flatnonzero(wrong)),
@@ -132,7 +132,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         bias_prior_m=heights.common.sigma,
         shift_m=tuple(shift.tolist()),
         shift_sigma_m=tuple(np.sqrt(np.diag(shift_covariance)).tolist()),
-        shift_prior_m=heights.shift,
+        shift_prior_m=heights.source.shift_sigma,
         shift_chance=heights.common.chance,
         shift_applied=heights.source.correct_shift,
         correlation_m=heights.source.correlation,

@@ -123,20 +123,17 @@ class Heights:
             more = np.zeros((count, shared.shape[1]))
             more[rows], own[rows] = shared[: len(rows)] * np.nan_to_num(each)[:, None], left[: len(rows)]
             loads = np.hstack([loads, more])
-        none, common = np.zeros(count, dtype=bool), CommonHeights.of(loads, bias, len(rows), problem.size)
+        none = np.zeros(count, dtype=bool)
+        common = CommonHeights.of(loads, bias, len(rows), problem.size)
         images = np.full(count, len(problem.models))
         np.minimum.at(images, problem.points.point, problem.points.image)
         each = np.full(count, DEFAULT_SIGMA) if sigmas is None else sigmas
         terrain = LocalTerrain.under(source, _places(problem, local), of, each, images)
         heights = cls(source, of, images, terrain, sigmas, DEFAULT_SIGMA, own, common, none, none)
-        at_spots = shared[len(rows) :], None if left is None else left[len(rows) :]
-        return heights if spots is None else replace(heights, spots=spots.with_loads(bias, heights.shift, *at_spots))
-
-    @property
-    def shift(self) -> float:
-        """Standard deviation (m) of the position of the DEM, east and north."""
-        stated = self.source.shift
-        return self.source.surface.sample_size / 2.0 if stated is None else stated
+        if spots is None:
+            return heights
+        left_there = None if left is None else left[len(rows) :]
+        return replace(heights, spots=spots.with_loads(bias, source.shift_sigma, shared[len(rows) :], left_there))
 
     @property
     def sigmas(self) -> Array:
@@ -187,8 +184,8 @@ class Heights:
 
     def seen(self, solved: Solved) -> tuple[CommonHeights, Array]:
         """Return the errors that they share, with what a solution tells of them, and the slope ``(k,)``."""
-        common = self.common.with_slopes(np.nan_to_num(self.terrain.slopes), self.shift)
-        common, slope = common.moved_by(solved)
+        slopes = np.nan_to_num(self.terrain.slopes)
+        common, slope = self.common.with_slopes(slopes, self.source.shift_sigma).moved_by(solved)
         return (common, slope) if self.spots is None else self.spots.told(common, self.sigma, slope)
 
     def _with_shared_errors(self, solved: Solved, number: int) -> Heights:
@@ -223,9 +220,9 @@ class Heights:
         """Return them with the DEM under points at `local` ``(N, 3)``, read where the estimate of its shift puts it."""
         undone = self.common.undone.copy()
         undone[1:3] = self.common.value[1:3]
-        east, north = (undone[1:3] * self.shift).tolist()
+        east, north = (undone[1:3] * self.source.shift_sigma).tolist()
         source = replace(self.source, read_at=(east, north))
-        spots = None if self.spots is None else self.spots.read_again(source, self.sigma, self.shift)
+        spots = None if self.spots is None else self.spots.read_again(source, self.sigma)
         # Slopes stay that were read at about the same place of the DEM.
         moved = np.subtract(self.source.read_at, source.read_at)
         read = self.terrain.read + moved / metres_per_degree(np.nan_to_num(self.terrain.ground))

@@ -87,6 +87,11 @@ class DemHeights:
         if self.surface.fill != "mask":
             object.__setattr__(self, "surface", self.surface.with_fill("mask"))
 
+    @property
+    def shift_sigma(self) -> float:
+        """Standard deviation (m) of the position of the DEM, east and north."""
+        return self.surface.sample_size / 2.0 if self.shift is None else self.shift
+
     @classmethod
     def of(cls, heights: DemHeights | Surface) -> DemHeights:
         """Return heights of a DEM; the flat ground of one stated height is no observation."""

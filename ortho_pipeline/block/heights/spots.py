@@ -114,12 +114,12 @@ class SpotDifferences:
         loads = np.column_stack([np.full(len(self.apart), bias), -shift * self.slopes, shared * dem[:, None]])
         return replace(self, loads=loads, own=self.own if left is None else left)
 
-    def read_again(self, source: DemHeights, sigma: float, shift: float) -> SpotDifferences:
-        """Return them with a DEM that was moved; `shift` is the standard deviation of its position, m."""
+    def read_again(self, source: DemHeights, sigma: float) -> SpotDifferences:
+        """Return them with a DEM that was moved."""
         found = SpotDifferences.of(source, sigma)
         assert found is not None
         loads = self.loads.copy()
-        loads[:, 1:3] = -shift * found.slopes
+        loads[:, 1:3] = -source.shift_sigma * found.slopes
         return replace(self, apart=found.apart, slopes=found.slopes, loads=loads)
 
     @property
