@@ -131,7 +131,6 @@ class _Block:
         self.views, self.targets, self.settings = views, targets, settings
         self.tracks: list[_Track] = []
         self.pairs: list[PairSummary] = []
-        self.crowding: dict[int, float] = {}
 
     def tie_home(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> None:
         """Measure chips of a scene in the scenes after it."""
@@ -139,7 +138,7 @@ class _Block:
         if not placed:
             return
         grown = [track for track in self.tracks if home in track.places]
-        begun, cells = self._begun(home, view, placed, partners, grown)
+        begun, cells, crowding = self._begun(home, view, placed, partners, grown)
         tracks = [*grown, *begun]
 
         def wanted(k: int, other: int) -> bool:
@@ -154,7 +153,7 @@ class _Block:
             if len(index):
                 matches[other] = index, pair.match(places[seen])
         _drop_contradicting(matches)
-        self._take(home, tracks, matches, placed)
+        self._take(home, tracks, matches, placed, crowding)
         self.tracks += [track for track in begun if len(track.places) > 1]
 
     def _placed(self, home: int, view: SceneView, partners: Mapping[int, Array]) -> dict[int, Pair]:
@@ -175,8 +174,11 @@ class _Block:
         placed: Mapping[int, Pair],
         partners: Mapping[int, Array],
         grown: Sequence[_Track],
-    ) -> tuple[list[_Track], list[set[int]]]:
-        """Return new tracks, one in each cell without a tie to a later scene, and these scenes for each."""
+    ) -> tuple[list[_Track], list[set[int]], float]:
+        """Return new tracks, later scenes for each, and the crowding of their chips.
+
+        A track begins in each cell without a tie to a later scene; these are its scenes.
+        """
         share = min(len(partners[other]) for other in placed) / SAMPLES**2
         columns, rows = cells_of(*view.size, min(round(self.settings.points / share), _MOST * self.settings.points))
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
@@ -190,11 +192,11 @@ class _Block:
                     lacking[other][cell] = False
         wanted = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
         factor = min(pair.factor for pair in placed.values())
-        self.crowding[home] = max(1.0, (SIDE * factor) ** 2 * columns * rows / math.prod(view.size))
         origins, numbers = candidates(view, (0, 0, *view.size), (columns, rows), SIDE, factor, wanted)
         nothing = np.full((2, 2), np.nan)
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
-        return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()]
+        crowding = max(1.0, (SIDE * factor) ** 2 * columns * rows / math.prod(view.size))
+        return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()], crowding
 
     def _take(
         self,
@@ -202,6 +204,7 @@ class _Block:
         tracks: Sequence[_Track],
         matches: Mapping[int, tuple[NDArray[np.int_], PairMatches]],
         placed: Mapping[int, Pair],
+        crowding: float,
     ) -> None:
         """Add matches to the tracks."""
         own: dict[int, list[Array]] = {}
@@ -213,7 +216,7 @@ class _Block:
                     own.setdefault(k, []).append(matched.first_covariance[row])
             count = int(matched.good.sum())
             reason = "" if count else f"none of {counted(len(index), 'place')} matched"
-            shift, crowding = placed[other].shift, self.crowding[home]
+            shift = placed[other].shift
             self.pairs.append(
                 PairSummary((home, other), count, len(index), shift, matched.components, reason, crowding)
             )
