@@ -43,10 +43,9 @@ REASONS = (
 INTRODUCTION = (
     "The paper’s images are not public. Ours are two simulated scenes over the same coast, taken by a camera that "
     "turns all the time so that its line of sight follows a parallel of latitude westwards, then eastwards; each "
-    "realisation "
-    "draws the 34 places, their noise and the attitude errors anew. The paper tells little about how the satellite "
-    "turned and about its attitude errors. We derived both from most rows of its table, so few "
-    "rows are left to predict."
+    "realisation draws the 34 places, their noise and the attitude errors anew. The paper tells little about how the "
+    "satellite turned and about its attitude errors. We derived both from most rows of its table, so few rows are left "
+    "to predict."
 )
 #: Metres beyond the outermost points; width and rim of a figure in CSS pixels.
 _MARGIN, _WIDE, _RIM = 600.0, 484.0, 18.0
