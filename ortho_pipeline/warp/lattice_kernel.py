@@ -162,13 +162,15 @@ def _reach(image, cells):
     for j in range(count):
         for i in range(count):
             if cells[j, i]:
-                path = 0.0
-                for level in range(image.shape[2] - 1):
-                    path += _distance(image[j, i, level + 1], image[j, i, level])
-                parallax = _worse(parallax, path)
+                for corner in range(4):
+                    node, path = image[j + corner // 2, i + corner % 2], 0.0
+                    for level in range(image.shape[2] - 1):
+                        path += _distance(node[level + 1], node[level])
+                    parallax = _worse(parallax, path)
                 for level in range(image.shape[2]):
-                    step = _worse(step, _distance(image[j, i + 1, level], image[j, i, level]))
-                    step = _worse(step, _distance(image[j + 1, i, level], image[j, i, level]))
+                    for side in range(2):
+                        step = _worse(step, _distance(image[j + side, i + 1, level], image[j + side, i, level]))
+                        step = _worse(step, _distance(image[j + 1, i + side, level], image[j, i + side, level]))
     return parallax, step
 
 

@@ -154,19 +154,24 @@ def test_the_worse_of_two():
     assert lattice_kernel._worse(1.0, NAN) == lattice_kernel._worse(1.0, INF) == INF
 
 
-def test_paths_over_the_heights_and_steps_between_nodes():
-    image = np.zeros((4, 4, 3, 2))
-    image[1, 2] = [[0, 0], [3, 4], [0, 8]]  # 5 and 5 px on
-    image[3, 3, 0] = 400.0
+def test_paths_over_the_heights_and_steps_between_nodes_are_those_of_all_corners_of_visible_cells():
+    image = np.random.default_rng(3).normal(size=(4, 4, 3, 2))
+    for cell in np.ndindex(3, 3):
+        cells = np.zeros((3, 3), dtype=bool)
+        cells[cell] = True
+        nodes = image[cell[0] : cell[0] + 2, cell[1] : cell[1] + 2]
+        path = np.linalg.norm(np.diff(nodes, axis=2), axis=-1).sum(axis=-1).max()
+        step = max(np.linalg.norm(np.diff(nodes, axis=axis), axis=-1).max() for axis in (0, 1))
+        assert lattice_kernel._reach(image, cells) == pytest.approx((path, step))
+    assert lattice_kernel._reach(image, np.zeros((3, 3), dtype=bool)) == (0.0, 0.0)
+
+
+def test_a_corner_without_a_projection_has_no_bound():
+    image = np.zeros((4, 4, 2, 2))
+    image[2, 3, 1] = NAN
     cells = np.zeros((3, 3), dtype=bool)
     cells[1, 2] = True
-    assert lattice_kernel._reach(image, cells) == (10.0, 8.0)
-    image[1, 3, 1] = [3, 12]
-    assert lattice_kernel._reach(image, cells) == (10.0, 8.0)
-    image[1, 3, 1], image[2, 2, 1] = [3, 4], [3, 16]
-    assert lattice_kernel._reach(image, cells) == (10.0, 12.0)
-    image[2, 2, 1], image[1, 3, 1] = [3, 4], [18, 4]
-    assert lattice_kernel._reach(image, cells) == (10.0, 15.0)
+    assert lattice_kernel._reach(image, cells) == (INF, INF)
 
 
 def test_second_differences_foretell_parabolas_exactly():
@@ -237,8 +242,8 @@ def test_a_parabola_is_off_by_an_eighth_of_its_second_differences():
     error, apart, step = bounded(POINTS)
     assert error == pytest.approx(BENT)
     assert apart == pytest.approx(BENT)
-    # From node (3, 3) to (3, 4) at the top: 5.1 columns and 0.3 rows.
-    assert step == pytest.approx(np.hypot(3 + 0.3 * 7, 0.3))
+    # From node (4, 3) to (4, 4) at the top: 5.1 columns and 0.4 rows.
+    assert step == pytest.approx(np.hypot(3 + 0.3 * 7, 0.4))
 
 
 def test_what_check_points_find_counts_three_times():
