@@ -311,7 +311,7 @@ class MatchOptions:
         ),
     ] = None
     points: Annotated[
-        int,
+        int | None,
         Option(
             "--match-points",
             "Approximate number of matches.",
@@ -319,8 +319,9 @@ class MatchOptions:
             kind="integer",
             above=0,
             below=_MOST_MATCHES + 1,
+            unset="500; fewer ties in small images, where neighbours would share pixels",
         ),
-    ] = 500
+    ] = None
     reference_sigma: Annotated[
         float | None,
         Option(
@@ -339,6 +340,11 @@ class MatchOptions:
             choices=("check", "control"),
         ),
     ] = "check"
+
+    @property
+    def wanted(self) -> int:
+        """Number of matches to look for."""
+        return 500 if self.points is None else self.points
 
 
 #: The groups, by the name that they have in messages, in the pipeline file and as arguments of the commands.

@@ -15,15 +15,18 @@ from scenes import Case, Setting, write_raster
 
 from ortho_pipeline.block.point_files import read_block_points
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.control.ties import Tied, _crowded, _points, names_of
+from ortho_pipeline.commands.control.ties import Tied, _crowded, _points, names_of, tie_scenes
+from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.model_file import load_model
 from ortho_pipeline.imaging import matching
 from ortho_pipeline.imaging.matching.agreement import refuse_accident
+from ortho_pipeline.imaging.matching.targets import OtherScene
 from ortho_pipeline.imaging.matching.weights import Components, components
 from ortho_pipeline.imaging.ties import Pair, Ties, TieSettings, tie
 from ortho_pipeline.imaging.ties.pairs import PairSummary
 from ortho_pipeline.models import ImageCorrection
+from ortho_pipeline.options import MatchOptions
 from ortho_pipeline.raster.intensity import Intensity
 from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.surface.base import Surface
@@ -131,7 +134,7 @@ def test_a_track_has_each_scene_once_and_covers_the_overlap(tmp_path):
 
 @pytest.mark.parametrize(("points", "crowded"), [(20, False), (400, True)])
 def test_crowded_ties_are_told_with_the_number_that_would_not_be(tmp_path, points, crowded):
-    """Chips of 40 px are over each other where cells are smaller than 20 px."""
+    """Chips of 40 px share pixels where cells are smaller."""
     _, views = looks(tmp_path, [-10.0, 10.0], side=200, dem_sigma=2.0)
     ties = tie(views, TieSettings(search=25.0, points=points, dem_sigma=3.0))
     notices = _crowded(ties, points)
@@ -139,7 +142,30 @@ def test_crowded_ties_are_told_with_the_number_that_would_not_be(tmp_path, point
     if crowded:
         # A scene shows 70 to 100 % of the other one, and as many cells more are needed.
         assert 0.7 <= points * 40**2 / 200**2 / notices[0].fields["crowding"] <= 1.0
-        assert 0.7 <= notices[0].fields["points"] / (4 * 200**2 / 40**2) <= 1.0
+        assert 0.7 <= notices[0].fields["points"] / (200**2 / 40**2) <= 1.0
+
+
+def test_chips_of_a_small_image_share_no_pixels_unless_a_number_is_asked_for(tmp_path):
+    scenes, _ = looks(tmp_path, [-10.0, 10.0], side=200, dem_sigma=2.0)
+    opened = {name: open_scene(scene.scene_file) for name, scene in zip("ab", scenes, strict=True)}
+    surface = open_dem(scenes[0].dem_file, "ellipsoid")
+    found = tie_scenes(opened, MatchOptions(search=25.0), surface)
+    corners = found.points.measured[found.points.image == 0]
+    gaps = np.abs(corners[:, None] - corners).max(axis=2)[~np.eye(len(corners), dtype=bool)]
+    assert 9 <= len(corners) <= (200 / 40) ** 2
+    assert gaps.min() >= 40
+    assert "crowded-ties" not in [one.code for one in found.notices]
+    asked = tie_scenes(opened, MatchOptions(search=25.0, points=300), surface)
+    assert len(asked.points) > 2 * len(found.points)
+    assert "crowded-ties" in [one.code for one in asked.notices]
+
+
+def test_scenes_that_share_a_strip_without_width_are_refused(tmp_path):
+    _, views = looks(tmp_path, [-10.0, 10.0], side=200, dem_sigma=2.0)
+    strip = np.column_stack([np.full(20, 199.0), np.linspace(0, 199, 20)])
+    with pytest.raises(InputError, match="only a strip of less than 1 px") as caught:
+        Pair.place(views[0], OtherScene(views[1].intensity, views[1].model), strip, 25.0, TieSettings(search=25.0))
+    assert "overlap more" in str(caught.value.remedy)
 
 
 def test_a_track_goes_on_where_its_home_cannot_be_matched(tmp_path, monkeypatch):

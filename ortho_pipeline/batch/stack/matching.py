@@ -98,7 +98,7 @@ class Matcher:
     def _configuration(self) -> dict[str, Any]:
         return {
             "search": self.match.search,
-            "points": self.match.points,
+            "points": self.match.wanted,
             "reference_bands": None if self.match.reference_bands is None else list(self.match.reference_bands),
             "search_rotation": self.match.search_rotation,
         }

@@ -244,7 +244,7 @@ def match_scene(
     search = search_of(scene, options, pixel)
     settings = MatchSettings(
         search=search.distance,
-        points=options.points,
+        points=options.wanted,
         dem_sigma=typical_sigma(view.surface) or 0.0,
         reference_sigma=options.reference_sigma or 0.0,
         threads=threads or os.cpu_count() or 1,

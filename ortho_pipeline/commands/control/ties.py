@@ -47,8 +47,9 @@ if TYPE_CHECKING:
 DEM_SIGMA, FLAT_SIGMA = 10.0, 30.0
 #: Fewer ties than this between two scenes give a notice.
 _FEW = 30
-#: So many ties a pixel are crowded: neighbours are then nearer than half a chip.
-_CROWDED = 4.0
+#: So many ties a pixel are crowded: an adjustment, which takes them for independent, then has sigmas 1.2 times too
+#: small or more (docs/engineering/matching.md).
+_CROWDED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +159,9 @@ def tie_scenes(
     usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
     stated = typical_sigma(surface)
     sigma = usual if stated is None else stated
-    ties = tie(views, TieSettings(search, options.points, sigma, threads or os.cpu_count() or 1))
-    notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.points)]
+    settings = TieSettings(search, options.wanted, options.points is None, sigma, threads or os.cpu_count() or 1)
+    ties = tie(views, settings)
+    notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.wanted)]
     if stated is None:
         text = f"accuracy of the heights not given; assuming {metres(sigma)}"
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
@@ -201,12 +203,12 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
 
 def _crowded(ties: Ties, points: int) -> list[Notice]:
     """Return the notice that neighbouring ties have the same errors, of the most crowded pair."""
-    crowding = max((pair.crowding for pair in ties.pairs if pair.ties), default=1.0)
+    crowding = max((pair.crowding for pair in ties.pairs if pair.ties), default=0.0)
     if crowding < _CROWDED:
         return []
-    fewer = max(1, round(points * _CROWDED / crowding))
+    fewer = max(1, round(points / crowding))
     text = Text(
-        f"neighbouring ties share most of the pixels that they were matched by ({crowding:.0f} ties a pixel), and so "
+        f"neighbouring ties share the pixels that they were matched by ({crowding:.1f} ties a pixel), and so "
         "their errors. An adjustment takes ties for independent: its sigmas are too small, and its tests of shifts "
         "and cameras find too much. Ask for fewer: ",
         Setting("match.points", str(fewer)),

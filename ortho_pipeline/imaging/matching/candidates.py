@@ -25,8 +25,8 @@ _SATURATED = 0.2
 #: Of an image on another machine: the part of its blocks to read, the side (chip px) of the window at a spot, which is
 #: what the search for the position reads there, and the chips per side of that window.
 _READ, _SPOT, _AT_SPOT = 0.1, 168, 3
-#: Width of the border to keep free (chip px).
-_RIM = 2
+#: Width of the border of the scene to keep free (chip px).
+RIM = 2
 
 
 def cells_of(width: float, height: float, count: int) -> tuple[int, int]:
@@ -42,6 +42,7 @@ def candidates(
     size: int,
     factor: int,
     inside: NDArray[np.bool_],
+    apart: bool = False,
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     """Return first pixels ``(n, 2)`` of the chip with the most structure in each cell, and the cells ``(n,)``.
 
@@ -55,14 +56,19 @@ def candidates(
         A chip has `size` x `size` means of `factor` x `factor` pixels.
     inside : (rows, columns) of bool
         Cells to search.
+    apart : bool
+        Whether whole chips stay in their cells, if these are large enough, so that neighbours share no pixels.
+        Otherwise only their centres do.
     """
     width, height = region[2] - region[0], region[3] - region[1]
+    fits = min(width / cells[0], height / cells[1]) >= (size + 2 * RIM) * factor
+    within = size / 2 * factor if apart and fits else 0.0
     parts = []
     for number in np.flatnonzero(inside.ravel()).tolist():
         row, column = divmod(number, cells[0])
         left, right = (region[0] + width * place / cells[0] for place in (column, column + 1))
         top, bottom = (region[1] + height * place / cells[1] for place in (row, row + 1))
-        parts.append(((left, top, right, bottom), number))
+        parts.append(((left + within, top + within, right - within, bottom - within), number))
     return _best_of(view, parts, size, factor)
 
 
@@ -122,7 +128,7 @@ def _best(view: SceneView, cell: tuple[float, float, float, float], size: int, f
         min((last - first) / 2, (_WINDOW - size) / 2 * factor)
         for first, last in ((cell[0], cell[2]), (cell[1], cell[3]))
     ]
-    half = (size / 2 + _RIM) * factor
+    half = (size / 2 + RIM) * factor
     low = [max(centre - part, half) for centre, part in zip(middle, reach, strict=True)]
     high = [min(centre + part, extent - half) for centre, part, extent in zip(middle, reach, view.size, strict=True)]
     if low[0] > high[0] + 1 or low[1] > high[1] + 1:

@@ -45,6 +45,9 @@ class TieSettings:
         Largest relative error (m on the ground) of the models.
     points : int
         Approximate number of tie points of a pair.
+    apart : bool
+        Whether there are fewer in small scenes, so that neighbouring chips share no pixels: those err alike, and an
+        adjustment takes ties for independent.
     dem_sigma : float
         Standard deviation (m) of the DEM's heights.
     threads : int
@@ -54,6 +57,7 @@ class TieSettings:
 
     search: float
     points: int = 500
+    apart: bool = False
     dem_sigma: float = 10.0
     threads: int = 1
     memory: int = 512_000_000
@@ -74,7 +78,7 @@ class PairSummary:
     reason : str
         Why there are no tie points; empty if there are.
     crowding : float
-        Chips over each pixel of the first scene, at least 1. Chips that overlap have the same errors in part.
+        Chips over each pixel of the first scene. Above 1, neighbours share pixels and so errors.
     """
 
     images: tuple[int, int]
@@ -83,7 +87,7 @@ class PairSummary:
     shift: tuple[float, float] = (math.nan, math.nan)
     components: Components | None = None
     reason: str = ""
-    crowding: float = 1.0
+    crowding: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +158,7 @@ class Pair:
         Raises
         ------
         InputError
-            If resolutions are too different, or there is no clear best position.
+            If resolutions are too different, the common area is a strip, or there is no clear best position.
         """
         base = chip_factor(view, [target], shown)
         ground = meet_surface(view.model, shown, view.surface)
@@ -163,6 +167,13 @@ class Pair:
         sigma = settings.dem_sigma * float(np.nanmedian(parallax)) if len(ground) else 0.0
         low, high = shown.min(axis=0), shown.max(axis=0)
         window = int(low[0]), int(low[1]), math.ceil(high[0]), math.ceil(high[1])
+        if min(high - low) < base:
+            raise InputError(
+                f"{target.called} shares only a strip of less than {base} px with {view.intensity.source.path}",
+                file=target.path,
+                field="images",
+                remedy="give images that overlap more",
+            )
         finest = base
         while sigma / finest > _BLURRED and min(high - low) / (2 * finest) >= 3 * 24:
             finest *= 2

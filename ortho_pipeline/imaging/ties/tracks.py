@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.imaging.matching.candidates import candidates, cells_of
+from ortho_pipeline.imaging.matching.candidates import RIM, candidates, cells_of
 from ortho_pipeline.imaging.matching.chip_search import FEWEST, SIDE
 from ortho_pipeline.imaging.matching.targets import SAMPLES, OtherScene, SceneView, metres_per_pixel
 from ortho_pipeline.imaging.ties.pairs import Pair, PairMatches, PairSummary, TieSettings, shared, shows
@@ -180,7 +180,11 @@ class _Block:
         A track begins in each cell without a tie to a later scene; these are its scenes.
         """
         share = min(len(partners[other]) for other in placed) / SAMPLES**2
+        factor = min(pair.factor for pair in placed.values())
         columns, rows = cells_of(*view.size, min(round(self.settings.points / share), _MOST * self.settings.points))
+        if self.settings.apart:
+            most = [max(1, extent // ((SIDE + 2 * RIM) * factor)) for extent in view.size]
+            columns, rows = min(columns, most[0]), min(rows, most[1])
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
         centres = np.column_stack([x.ravel(), y.ravel()]) * view.size
         lacking = {other: shows(view, self.targets[other], centres) for other in placed}
@@ -190,12 +194,12 @@ class _Block:
             for other in placed:
                 if other in track.places:
                     lacking[other][cell] = False
-        wanted = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
-        factor = min(pair.factor for pair in placed.values())
-        origins, numbers = candidates(view, (0, 0, *view.size), (columns, rows), SIDE, factor, wanted)
+        cells = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
+        whole = (0, 0, *view.size)
+        origins, numbers = candidates(view, whole, (columns, rows), SIDE, factor, cells, apart=True)
         nothing = np.full((2, 2), np.nan)
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
-        crowding = max(1.0, (SIDE * factor) ** 2 * columns * rows / math.prod(view.size))
+        crowding = (SIDE * factor) ** 2 * columns * rows / math.prod(view.size)
         return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()], crowding
 
     def _take(
