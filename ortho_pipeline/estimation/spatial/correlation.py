@@ -460,12 +460,13 @@ def _sentences(analysis: Covariance) -> list[str]:
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
     many = round(1 / SIGNIFICANCE)
-    chance = f"Without systematic errors, both values are below {analysis.critical:+.2f} in {many - 1} scenes of {many}"
+    limit = f"{analysis.critical:+.2f} in {many - 1} scenes of {many}"
+    chance = f"Without systematic errors, the larger one is below {limit}"
     if analysis.critical < 0:
         chance += " (residuals of a fit to few points are negatively correlated)"
-    result, here = "No systematic error was found", "Here both are below it"
+    result, here = "No systematic error was found", "Here it is below that"
     if analysis.verdict == "systematic":
-        result, here = "Systematic errors remain", "Here the larger one is above it"
+        result, here = "Systematic errors remain", "Here it is above that"
     sentences = [
         f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}. "
         f"{chance}. {here}."
