@@ -293,8 +293,13 @@ def _cells(option: click.Option, context: click.Context) -> tuple[str, str]:
 
 
 def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [heads, tuple("---" for _ in heads), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    lines = [heads, tuple("---" for _ in heads), *(tuple(map(_cell, row)) for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    """Return the text of a cell with a backslash before a bar; in code, where a bar ends no cell, it would be shown."""
+    return re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or "\\|", text)
 
 
 def _code(text: str) -> str:

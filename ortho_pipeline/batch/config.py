@@ -355,29 +355,29 @@ def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path
         line = lines.get(known, lines.get(known[:-1], 1))
         faults.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
     faults = list(dict.fromkeys(faults))
-    field, message, remedy = faults[0]
+    field, message, _ = faults[0]
     rest = [f"{where}: {what}" for where, what, _ in faults[1:_SHOWN]]
+    remedy = "; ".join(dict.fromkeys(remedy for _, _, remedy in faults[:_SHOWN]))
     if len(faults) > _SHOWN:
         rest.append(f"and {len(faults) - _SHOWN} more")
     return InputError("; ".join([message, *rest]), file=path, field=field, remedy=remedy)
 
 
 def _allowed(place: Place) -> str:
-    """Return the allowed keys in place of an unknown one, or the most similar one."""
+    """Return where an unknown key belongs, or the most similar key, or all that are allowed in its place."""
+    groups: dict[str, Any] = {
+        "scene": SceneSettings,
+        "points": PointSettings,
+        "surface": SurfaceSettings,
+        "match": MatchSettings,
+        "output": OutputSettings,
+    }
     model: Any = Config
     for part in place[:-1]:
-        if isinstance(part, int):
-            continue
-        model = {
-            "scenes": Entry,
-            "defaults": Settings,
-            "mosaic": MosaicSettings,
-            "scene": SceneSettings,
-            "points": PointSettings,
-            "surface": SurfaceSettings,
-            "match": MatchSettings,
-            "output": OutputSettings,
-        }.get(str(part), model)
-    names = list(model.model_fields)
-    close = difflib.get_close_matches(str(place[-1]), names, 1)
-    return f"did you mean {close[0]!r}?" if close else f"one of {', '.join(names)}"
+        if isinstance(part, str):
+            model = {"scenes": Entry, "defaults": Settings, "mosaic": MosaicSettings, **groups}.get(part, model)
+    name, names = str(place[-1]), list(model.model_fields)
+    if homes := [repr(group) for group, fields in groups.items() if name in fields.model_fields]:
+        return f"{name!r} belongs in {' or '.join(homes)}"
+    close = difflib.get_close_matches(name, names, 1)
+    return f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(names)}"

@@ -102,6 +102,6 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            text = f"at a corner, the position is {factor:.0f} times less accurate than a measured point"
+            text = f"at a corner, the sigma of a predicted image position is {factor:.0f} times that of a measured one"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

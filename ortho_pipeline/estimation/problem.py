@@ -28,12 +28,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, TooFewPoints
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.estimation.least_squares import condition_of, minimise, solve_linear
 from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.estimation.statistics import effective_parameters, left_out, unit_weight
 from ortho_pipeline.models.base import Array, SensorModel
+from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.points import Points
 
 #: Above this condition number the points do not determine the model.
@@ -189,11 +190,14 @@ class Problem:
         known += len(self.model.constraints()) if known else 0
         least = self.model.minimum_points if not known else math.ceil((count - known) / 2)
         if points < least:
+            simpler: str = "a simpler model"
+            if isinstance(self.model, ImageCorrection) and count > 2:
+                simpler = Text("a simpler correction, such as ", Setting("points.correction", "shift"))
             raise TooFewPoints(
                 f"{counted(points, 'control point is', 'control points are')} not enough for "
                 f"{counted(count, 'parameter')}",
                 file=self.points.source,
-                remedy=f"give at least {counted(least, 'control point')}, or use a simpler model",
+                remedy=Text(f"give at least {counted(least, 'control point')}, or use ", simpler),
             )
 
     def _determined(self, condition: float) -> None:

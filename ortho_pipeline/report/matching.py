@@ -48,11 +48,11 @@ class MatchComponents(Record):
         """Say what there is of each part."""
         said = []
         if self.matching > 0:
-            said.append(f"{significant(self.matching, 3)} times the variance that least-squares matching states")
+            said.append(f"{significant(self.matching, 3)} times the variance that least-squares matching states for it")
         if self.height_m > 0:
             said.append(f"height errors of {metres(self.height_m)}")
         said.append(f"other errors of {px(self.other_px)} per axis")
-        return ", ".join(said)
+        return " + ".join(said)
 
 
 class MatchCoverage(Record):
@@ -114,13 +114,13 @@ class MatchingRecord(Record):
         """Say what the figures of matches leave out."""
         if self.reference_sigma_m is None:
             return Text(
-                "This figure does not include the error of the reference image (state it with ",
+                "The stated accuracy does not include the error of the reference image (state that with ",
                 Setting("match.reference_sigma"),
                 ").",
             )
         return (
-            f"This figure does not include the error of the reference image ({metres(self.reference_sigma_m)} per "
-            "axis). The sigmas of the parameters and the accuracy raster do."
+            "The stated accuracy does not include the error of the reference image "
+            f"({metres(self.reference_sigma_m)} per axis). The sigmas of the parameters and the accuracy raster do."
         )
 
     def absolute_text(self) -> str | None:

@@ -47,12 +47,12 @@ def test_shells_complete(shell, tmp_path):
     if shutil.which(shell) is None:
         pytest.skip(f"no {shell} on this machine")
     page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
-    (line,) = re.findall(rf"^\| {shell} \(.*\) \| `(.*)` \|$", page, re.MULTILINE)
+    (line,) = re.findall(rf"^(.*?) +# {shell}: ", page, re.MULTILINE)
     program = tmp_path / "ortho"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m ortho_pipeline "$@"\n')
     program.chmod(0o755)
     before = "autoload -Uz compinit; compinit -u -D\n" if shell == "zsh" else ""
-    script = [before + line.replace("\\|", "|")]
+    script = [before + line]
     script += [ASK[shell].format(words=words, at=words.count(" ")) for words in ("ortho rect", "ortho fit --sig")]
     environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "HOME": str(tmp_path)}
     done = subprocess.run(

@@ -23,7 +23,7 @@ def test_heights_that_are_off_are_the_remedy_of_a_weak_join():
     (given,) = signals([], [{**weak, "dem_unused": True}])
     assert given.to_do.startswith("Use the heights of the DEM")
     (absent,) = signals([], [{**weak, "dem_unused": False}])
-    assert absent.to_do.startswith("Give a DEM")
+    assert absent.to_do.startswith("Give control points")
 
 
 def test_a_weak_pair_is_drawn_although_its_images_lie_on_each_other():

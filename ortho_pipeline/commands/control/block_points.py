@@ -187,7 +187,7 @@ def refuse_contradictions(
                 remedy=Text("leave it out, or give ", Setting("match.reference")),
             )
     if options.ties is not None or match.reference or orthos:
-        require_heights(surface)
+        require_heights(surface, "orthos need" if orthos else "matching needs")
 
 
 def _refuse_of_heights(options: BlockOptions, surface: SurfaceOptions) -> None:

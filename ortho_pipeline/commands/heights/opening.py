@@ -169,11 +169,11 @@ def dem_files(options: SurfaceOptions) -> list[str]:
     return [dem.document] if dem.is_collection else [*(matching_files(dem) or [dem])]
 
 
-def require_heights(options: SurfaceOptions) -> None:
-    """Raise an `InputError` if there are no heights."""
+def require_heights(options: SurfaceOptions, purpose: str = "") -> None:
+    """Raise an `InputError` if there are no heights, which names what needs them."""
     if not has_surface(options):
         raise InputError(
-            "no heights given",
+            "no heights given" + (f", and {purpose} them" if purpose else ""),
             field="surface.dem",
             remedy=GIVE_HEIGHTS,
         )

@@ -460,12 +460,13 @@ def _sentences(analysis: Covariance) -> list[str]:
         ]
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
     many = round(1 / SIGNIFICANCE)
-    chance = f"Without systematic errors, both values are below {analysis.critical:+.2f} in {many - 1} scenes of {many}"
+    limit = f"{analysis.critical:+.2f} in {many - 1} scenes of {many}"
+    chance = f"Without systematic errors, the larger one is below {limit}"
     if analysis.critical < 0:
         chance += " (residuals of a fit to few points are negatively correlated)"
-    result, here = "No systematic error was found", "Here both are below it"
+    result, here = "No systematic error was found", "Here it is below that"
     if analysis.verdict == "systematic":
-        result, here = "Systematic errors remain", "Here the larger one is above it"
+        result, here = "Systematic errors remain", "Here it is above that"
     sentences = [
         f"{result}. The residuals of neighbours (the {NEIGHBOURS} nearest points) have a correlation of {alike}. "
         f"{chance}. {here}."
@@ -482,13 +483,13 @@ def _sentences(analysis: Covariance) -> list[str]:
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")
     if analysis.relative is not None:
-        numbers = (
-            "{:.2f} in x and {:.2f} in y".format(*analysis.relative),
-            "{:.2f} in x and {:.2f} in y".format(*analysis.absolute),
+        near, single = (
+            f"{x:.2f} {analysis.unit} in x and {y:.2f} {analysis.unit} in y"
+            for x, y in (analysis.relative, analysis.absolute)
         )
         sentences.append(
             f"Between points closer than {analysis.near_m:g} m ({counted(analysis.pairs_near, 'pair')}) the relative "
-            f"error is {numbers[0]} {analysis.unit}. The error of a single point is {numbers[1]} {analysis.unit}."
+            f"error is {near}. The error of a single point is {single}."
         )
     if analysis.mean_p and min(analysis.mean_p) < SIGNIFICANCE / 2:
         off = "{:+.2f} and {:+.2f}".format(*analysis.mean)

@@ -211,7 +211,7 @@ def _shown(view: SceneView, targets: Sequence[Target]) -> Array:
     inside = _inside(view, targets, image)
     if inside.sum() < _SAMPLES_SHOWN:
         what = "does not overlap the image"
-        remedy = "give a reference of the same place, or correct its CRS; `ortho info IMAGE` shows where each image is"
+        remedy = "give an ortho of the same place, or correct its CRS; `ortho info IMAGE` shows where each image is"
         if inside.any():
             what = f"covers {inside.mean():.1%} of the image, which is too little to match"
             remedy = "give references that cover more of it, or measure points by hand"

@@ -171,7 +171,7 @@ _STATEMENTS: Sequence[tuple[str, tuple[tuple[str, str], ...], _Test, dict[str, A
         {},
     ),
     (
-        "With 32 points the rational function of the second order is so, too.",
+        "With 32 points the rational function of the second order is similar to DLT, too.",
         _checks("rfm2 even:32", "dlt even:20"),
         lambda values: (max(_each(values)) / min(_each(values)) < SIMILAR, _listed(values)),
         {"why": "It depends on twelve check points, and on a regularisation that the paper does not state."},

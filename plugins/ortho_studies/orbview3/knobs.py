@@ -10,7 +10,7 @@ KNOBS = (
     Knob(
         "SCENES",
         {name: seconds for name, (seconds, _) in simulated.SCENES.items()},
-        "s from abeam",
+        "s from the closest approach",
         "fitted",
         "Time of each scene. The difference of the times gives the paper's height-to-base ratio of 1.4. The ratio of "
         "the times is that of the errors of 3D affine in Y, which are proportional to the distance along the track.",
@@ -33,7 +33,7 @@ KNOBS = (
     Knob(
         "TURNING, YAW_RATE",
         [simulated.TURNING, simulated.YAW_RATE],
-        "(0 to 1), rad/s",
+        "as a share (0 to 1); rad/s",
         "fitted",
         "How much the scan keeps its angular speed while the range changes, and the turning rate of the line of "
         "pixels. The paper mentions both, but not their size.",

@@ -81,10 +81,9 @@ def verdict(document: Mapping[str, Any]) -> list[str]:
             f"{_share(predicted, 'within', tight)} within {tight}.",
             f"A naive guess without simulation agrees for {_share(predicted, 'naive', wide)} and "
             f"{_share(predicted, 'naive', tight)}. The guess: {document['naive_text']}",
-            f"{_of(predicted['covered'], predicted['rows'])} are between our 5th and 95th percentile. If the "
-            f"paper were "
-            f"one of our realisations, {100 * single['median']:.0f} % ({100 * single['p5']:.0f} to "
-            f"{100 * single['p95']:.0f} %) would be within {wide} of our medians.",
+            f"{_of(predicted['covered'], predicted['rows'])} are between our 5th and 95th percentile. "
+            f"At best, {100 * single['median']:.0f} % ({100 * single['p5']:.0f} to {100 * single['p95']:.0f} %) can be "
+            f"within {wide} of our medians: that is the share of a single realisation of ours.",
         ]
     if fitted["rows"]:
         sentences.append(
