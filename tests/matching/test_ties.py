@@ -145,19 +145,34 @@ def test_crowded_ties_are_told_with_the_number_that_would_not_be(tmp_path, point
         assert 0.7 <= notices[0].fields["points"] / (200**2 / 40**2) <= 1.0
 
 
-def test_chips_of_a_small_image_share_no_pixels_unless_a_number_is_asked_for(tmp_path):
-    scenes, _ = looks(tmp_path, [-10.0, 10.0], side=200, dem_sigma=2.0)
+def tied_by_default(folder: Path, side: int, **match: float) -> tuple[Tied, Array]:
+    """Tie two scenes as the command does; return also how far (px) each pair of ties is apart in the first one."""
+    folder.mkdir()
+    scenes, _ = looks(folder, [-10.0, 10.0], side=side, dem_sigma=2.0)
     opened = {name: open_scene(scene.scene_file) for name, scene in zip("ab", scenes, strict=True)}
-    surface = open_dem(scenes[0].dem_file, "ellipsoid")
-    found = tie_scenes(opened, MatchOptions(search=25.0), surface)
-    corners = found.points.measured[found.points.image == 0]
-    gaps = np.abs(corners[:, None] - corners).max(axis=2)[~np.eye(len(corners), dtype=bool)]
-    assert 9 <= len(corners) <= (200 / 40) ** 2
+    found = tie_scenes(opened, MatchOptions(search=25.0, **match), open_dem(scenes[0].dem_file, "ellipsoid"))
+    place = found.points.measured[found.points.image == 0]
+    return found, np.abs(place[:, None] - place).max(axis=2)[~np.eye(len(place), dtype=bool)]
+
+
+def test_chips_of_a_small_image_share_no_pixels_unless_a_number_is_asked_for(tmp_path):
+    found, gaps = tied_by_default(tmp_path / "default", 300)
+    assert 16 <= len(found.points) <= (300 / 40) ** 2
     assert gaps.min() >= 40
     assert "crowded-ties" not in [one.code for one in found.notices]
-    asked = tie_scenes(opened, MatchOptions(search=25.0, points=300), surface)
+    asked, _ = tied_by_default(tmp_path / "asked", 300, points=400)
     assert len(asked.points) > 2 * len(found.points)
-    assert "crowded-ties" in [one.code for one in asked.notices]
+    (notice,) = (one for one in asked.notices if one.code == "crowded-ties")
+    assert "Ask for fewer: `match.points=" in str(notice)
+
+
+def test_a_very_small_image_has_enough_ties_all_the_same(tmp_path):
+    """Only 16 chips fit side by side, and a pair needs a dozen matches."""
+    found, _ = tied_by_default(tmp_path / "small", 200)
+    assert len(found.points) >= 18
+    smaller, _ = tied_by_default(tmp_path / "smaller", 150)
+    (notice,) = (one for one in smaller.notices if one.code == "crowded-ties")
+    assert "too small for more ties" in str(notice)
 
 
 def test_scenes_that_share_a_strip_without_width_are_refused(tmp_path):

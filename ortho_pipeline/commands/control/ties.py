@@ -161,7 +161,7 @@ def tie_scenes(
     sigma = usual if stated is None else stated
     settings = TieSettings(search, options.wanted, options.points is None, sigma, threads or os.cpu_count() or 1)
     ties = tie(views, settings)
-    notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.wanted)]
+    notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.points)]
     if stated is None:
         text = f"accuracy of the heights not given; assuming {metres(sigma)}"
         notices.append(Notice("dem-sigma-by-default", text, dem_sigma_m=sigma))
@@ -201,17 +201,22 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
     return notices
 
 
-def _crowded(ties: Ties, points: int) -> list[Notice]:
+def _crowded(ties: Ties, points: int | None) -> list[Notice]:
     """Return the notice that neighbouring ties have the same errors, of the most crowded pair."""
     crowding = max((pair.crowding for pair in ties.pairs if pair.ties), default=0.0)
     if crowding < _CROWDED:
         return []
-    fewer = max(1, round(points / crowding))
+    fewer = None if points is None else max(1, round(points / crowding))
+    remedy = (
+        ("The images are too small for more ties",)
+        if fewer is None
+        else ("Ask for fewer: ", Setting("match.points", str(fewer)))
+    )
     text = Text(
         f"neighbouring ties share the pixels that they were matched by ({crowding:.1f} ties a pixel), and so "
         "their errors. An adjustment takes ties for independent: its sigmas are too small, and its tests of shifts "
-        "and cameras find too much. Ask for fewer: ",
-        Setting("match.points", str(fewer)),
+        "and cameras find too much. ",
+        *remedy,
     )
     return [Notice("crowded-ties", text, crowding=crowding, points=fewer)]
 

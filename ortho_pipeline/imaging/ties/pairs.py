@@ -47,7 +47,7 @@ class TieSettings:
         Approximate number of tie points of a pair.
     apart : bool
         Whether there are fewer in small scenes, so that neighbouring chips share no pixels: those err alike, and an
-        adjustment takes ties for independent.
+        adjustment takes ties for independent. In very small scenes some share them all the same.
     dem_sigma : float
         Standard deviation (m) of the DEM's heights.
     threads : int

@@ -26,6 +26,8 @@ from ortho_pipeline.raster.caching.block_cache import limit_cache
 
 #: Largest ratio of the number of cells of a scene to the number of points wanted in its smallest overlap.
 _MOST = 10
+#: If fewer places fit side by side in the largest overlap of a scene, so many share pixels: a pair needs `FEWEST`.
+_FIT, _SHARING = 2 * FEWEST, 3 * FEWEST
 #: Largest difference (in sigmas) between the heights of one point from two pairs.
 _SIGMAS = 3.5
 #: Scenes that a message names.
@@ -179,12 +181,16 @@ class _Block:
 
         A track begins in each cell without a tie to a later scene; these are its scenes.
         """
-        share = min(len(partners[other]) for other in placed) / SAMPLES**2
+        shares = [len(partners[other]) / SAMPLES**2 for other in placed]
         factor = min(pair.factor for pair in placed.values())
-        columns, rows = cells_of(*view.size, min(round(self.settings.points / share), _MOST * self.settings.points))
+        count = min(round(self.settings.points / min(shares)), _MOST * self.settings.points)
+        columns, rows = cells_of(*view.size, count)
         if self.settings.apart:
-            most = [max(1, extent // ((SIDE + 2 * RIM) * factor)) for extent in view.size]
-            columns, rows = min(columns, most[0]), min(rows, most[1])
+            across, down = (extent // ((SIDE + 2 * RIM) * factor) for extent in view.size)
+            if across * down * max(shares) < _FIT:
+                columns, rows = cells_of(*view.size, min(count, round(_SHARING / max(shares))))
+            else:
+                columns, rows = min(columns, across), min(rows, down)
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
         centres = np.column_stack([x.ravel(), y.ravel()]) * view.size
         lacking = {other: shows(view, self.targets[other], centres) for other in placed}
@@ -196,7 +202,7 @@ class _Block:
                     lacking[other][cell] = False
         cells = np.any(list(lacking.values()), axis=0).reshape(rows, columns)
         whole = (0, 0, *view.size)
-        origins, numbers = candidates(view, whole, (columns, rows), SIDE, factor, cells, apart=True)
+        origins, numbers = candidates(view, whole, (columns, rows), SIDE, factor, cells, self.settings.apart)
         nothing = np.full((2, 2), np.nan)
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
         crowding = (SIDE * factor) ** 2 * columns * rows / math.prod(view.size)
