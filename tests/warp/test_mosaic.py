@@ -7,6 +7,7 @@ import inspect
 import json
 import math
 import os
+import weakref
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,9 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
-from ortho_pipeline.raster.source import Grid, open_dataset
+from ortho_pipeline.raster.source import Grid, RasterSource, open_dataset
 from ortho_pipeline.report.mosaic.document import mosaic_document
-from ortho_pipeline.warp.mosaic import Ortho, lay_out, measure_seam, overlaps, write_cog, write_vrt, writing
+from ortho_pipeline.warp.mosaic import Ortho, lay_out, measure_seam, overlaps, reading, write_cog, write_vrt, writing
 from ortho_pipeline.warp.mosaic.layout import intersection
 
 UTM = pyproj.CRS("EPSG:32635")
@@ -104,6 +105,24 @@ def test_a_mosaic_larger_than_its_windows(tmp_path, landscape, monkeypatch):
     write_cog(placed, tmp_path / "many.tif")
     for one, many in zip(read(tmp_path / "one.tif"), read(tmp_path / "many.tif"), strict=True):
         np.testing.assert_array_equal(one, many)
+
+
+def test_few_of_many_orthos_are_open_at_a_time(tmp_path, landscape, monkeypatch):
+    orthos = [cut(tmp_path, f"s{i}", landscape, 50 * i, 30 * i, 200, 180) for i in range(7)]
+    placed, alive = lay_out(orthos, "first-on-top"), weakref.WeakSet()
+    write_cog(placed, tmp_path / "one.tif")
+
+    class Counted(RasterSource):
+        def __init__(self, *words, **more):
+            super().__init__(*words, **more)
+            alive.add(self)
+            assert len(alive) <= 3
+
+    monkeypatch.setattr(reading, "_OPEN", 2)
+    monkeypatch.setattr(reading, "RasterSource", Counted)
+    write_cog(placed, tmp_path / "few.tif")
+    for one, few in zip(read(tmp_path / "one.tif"), read(tmp_path / "few.tif"), strict=True):
+        np.testing.assert_array_equal(one, few)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +14,20 @@ from ortho_pipeline.raster.caching.block_cache import limit_cache
 from ortho_pipeline.raster.source import MEMORY, RasterSource
 from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, PlacedOrtho, box_of, intersection
 
+#: Orthos that are open at a time. A process may have 1024 files open by default, some of them several for an ortho.
+_OPEN = 200
+
 
 class Opened:
-    """An ortho of a mosaic, open for reading."""
+    """An ortho of a mosaic for reading. It is open while it is among those that were read last."""
 
-    def __init__(self, layer: PlacedOrtho, memory: int = MEMORY) -> None:
-        self.layer, self.source = layer, RasterSource(layer.ortho.path, memory=memory)
+    def __init__(self, layer: PlacedOrtho, source_of: Callable[[Path], RasterSource]) -> None:
+        self.layer, self._source_of = layer, source_of
+
+    @property
+    def source(self) -> RasterSource:
+        """Its pixels."""
+        return self._source_of(self.layer.ortho.path)
 
     def read(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return pixels and their validity ``(bands, h, w)`` in a box of the mosaic inside the ortho."""
@@ -39,7 +50,8 @@ class Opened:
 
 
 def open_layers(placed: Mosaic, memory: int = MEMORY) -> list[Opened]:
-    """Open all orthos of a mosaic, with GDAL's cache within the memory (bytes)."""
-    opened = [Opened(layer, memory) for layer in placed.layers]
+    """Return all orthos of a mosaic for reading, with GDAL's cache within the memory (bytes)."""
+    source_of = functools.lru_cache(maxsize=_OPEN)(functools.partial(RasterSource, memory=memory))
+    opened = [Opened(layer, source_of) for layer in placed.layers]
     limit_cache(memory, 1, max(raster.source.block for raster in opened))
     return opened
