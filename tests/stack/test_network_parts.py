@@ -122,7 +122,7 @@ def test_an_edge_in_no_loop_is_not_tested():
 
 
 def test_two_wrong_edges_of_eleven_do_not_move_the_first_solution():
-    edges, trends, _, _ = loops()
+    edges = loops()[0]
     incidence, truth = edges.incidence(6), np.random.default_rng(2).uniform(-4, 4, (6, 2))
     truth -= truth.mean(axis=0)
     value = incidence @ truth
