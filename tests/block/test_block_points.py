@@ -91,7 +91,8 @@ def test_only_ground_without_a_sigma_gets_one() -> None:
         {"images": ("one.tif", "one.tif")}, {"point": [0, 2, 0, 1, 3]}, {"point": [0, 2, 0, 1, -1]},
         {"point": [-1, -1, -1, -1, -1]}, {"image": [0, 0, 1, 1, 2]}, {"ground": [[5e5, 5e6, 10.0], [5e5, math.nan, 1.0],
         [math.nan] * 3]}, {"ground": [[math.nan, 5e6, 10.0], [5e5, 5e6, 1.0], [math.nan] * 3]},
-        {"measured": np.zeros((5, 3))}, {"sigma_image": [0.1] * 4}, {"image": [0, 0, 1, 1, -1]}, {"point": [0, 2, 0, 1, 1]},
+        {"measured": np.zeros((5, 3))}, {"sigma_image": [0.1] * 4},
+        {"image": [0, 0, 1, 1, -1]}, {"point": [0, 2, 0, 1, 1]},
     ],
 )  # fmt: skip
 def test_what_is_no_block_is_refused(changed: dict[str, Any]) -> None:

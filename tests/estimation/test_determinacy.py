@@ -120,5 +120,7 @@ def test_a_model_without_parameters_is_noted_if_it_was_to_be_adjusted() -> None:
 
     (note,) = nothing_adjusted(Fixed(partials(1)), points)  # type: ignore[arg-type]
     assert "'made' has no parameters" in str(note)
+    both = Points.of([[1, 2]] * 2, [[500_000.0, 4.64e6, 10.0]] * 2, pyproj.CRS(32633), roles=["check", "control"])
+    assert len(nothing_adjusted(Fixed(partials(1)), both)) == 1  # type: ignore[arg-type]
     tie = Points.of([[1, 2]], [[500_000.0, 4.64e6, 10.0]], pyproj.CRS("EPSG:32633"), roles=["check"])
     assert nothing_adjusted(Fixed(partials(1)), tie) == []  # type: ignore[arg-type]

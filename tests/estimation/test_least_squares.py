@@ -34,6 +34,7 @@ def test_without_redundancy_there_is_no_sigma_and_without_parameters_nothing_to_
     square = solve_linear(np.eye(3) + 0.1, np.arange(3.0))
     np.testing.assert_allclose((np.eye(3) + 0.1) @ square.values, np.arange(3.0), atol=1e-14)
     assert math.isnan(square.sigma0)
+    assert solve_linear(np.ones((2, 1)), np.array([1.0, 3.0])).sigma0 == pytest.approx(math.sqrt(2.0))
     empty = solve_linear(np.zeros((4, 0)), np.arange(4.0))
     assert (empty.values.shape, empty.cofactors.shape, empty.condition) == ((0,), (0, 0), 1.0)
     np.testing.assert_array_equal(empty.residuals, np.arange(4.0))
@@ -43,7 +44,8 @@ def test_without_redundancy_there_is_no_sigma_and_without_parameters_nothing_to_
 @pytest.mark.parametrize(
     "design",
     [
-        np.ones((2, 3)), np.column_stack([np.arange(5.0), 2 * np.arange(5.0)]), np.column_stack([np.ones(5), np.zeros(5)]),
+        np.ones((2, 3)), np.column_stack([np.arange(5.0), 2 * np.arange(5.0)]),
+        np.column_stack([np.ones(5), np.zeros(5)]),
         np.array([[1.0, 0.0], [1.0, np.nan], [0.0, 1.0]]), np.array([[1.0, 0.0], [np.inf, 0.0], [0.0, 1.0]]),
     ],
     ids=["few rows", "parallel", "a zero column", "nan", "inf"],
