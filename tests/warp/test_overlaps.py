@@ -17,7 +17,7 @@ from ortho_pipeline.warp.mosaic.overlaps import _all_valid, _ties, _windows
         ((0, 0, 384, 384), [0], [0], (384, 384)),
         ((0, 0, 385, 384), [0, 1], [0], (384, 384)),
         ((5, 7, 1157, 1159), [5, 389, 773], [7, 391, 775], (384, 384)),
-        # More than nine windows are thinned alike along both axes: 6 x 6 to 3 x 3, 12 x 3 to 6 x 2, of which 4 x 2 are taken.
+        # More than nine are thinned alike along both axes: 6 x 6 to 3 x 3, 12 x 3 to 6 x 2, and then to 4 x 2.
         ((0, 0, 2304, 2304), [0, 960, 1920], [0, 960, 1920], (384, 384)),
         ((0, 0, 4608, 1152), [0, 1408, 2816, 4224], [0, 768], (384, 384)),
         # One row of twenty: nine.
