@@ -249,3 +249,9 @@ def test_a_model_needs_a_finite_domain_and_some_ground_in_its_image() -> None:
     for model in (Half(np.nan, seen=False), Half(np.inf), Half(0.0, half=np.inf), Half(0.0, half=np.nan)):
         with pytest.raises(InputError):
             require_view(model)
+
+
+def test_a_field_at_a_half_known_place_is_unknown() -> None:
+    made = SmoothField(rpc(), (400, 300), np.full((3, 4, 2), 0.5))
+    found = made.displacement(np.array([[10.0, 20.0], [np.nan, 20.0], [10.0, np.nan]]))
+    np.testing.assert_allclose(found, [[0.5, 0.5], [np.nan] * 2, [np.nan] * 2])
