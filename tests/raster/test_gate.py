@@ -13,7 +13,6 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.opening.drivers import DRIVERS
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
 
-
 #: Blocks larger than those of a VRT.
 LARGE = ("TILED=YES", "BLOCKXSIZE=256", "BLOCKYSIZE=256")
 
@@ -181,7 +180,7 @@ def test_a_folder_without_a_product_is_no_image(tmp_path: Path) -> None:
         opened(tmp_path)
     for name in ("DIM_A.XML", "DIM_B.XML"):
         (tmp_path / name).write_text("<Dimap_Document/>")
-    with pytest.raises(InputError, match="several products: DIM_A.XML, DIM_B.XML"):
+    with pytest.raises(InputError, match=r"several products: DIM_A\.XML, DIM_B\.XML"):
         opened(tmp_path)
     for names, message in ((("a/DIM_A.XML",), "is missing"), (("DIM_A.XML", "DIM_B.XML"), "several products")):
         parts = "".join(

@@ -50,6 +50,7 @@ def test_a_raw_band_of_a_vrt_names_bytes(tmp_path: Path) -> None:
         (VRT.format(kind="", relative="").replace("one.tif", "<a/>"), "no plain file name"),
         (VRT.format(kind="", relative="").replace("one.tif", ""), "no plain file name"),
         ("<VRTDataset", "not well-formed"),
+        (VRT.format(kind="", relative=' relativeToVRT="1" relativeTOVRT="1"'), "no plain file name"),
     ],
 )  # fmt: skip
 def test_any_other_vrt_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -64,14 +65,14 @@ def test_what_a_vrt_holds_as_text_is_not_looked_at(tmp_path: Path) -> None:
 
 def pcidsk(headers: list[bytes], count: int | None = None, block: int = 3) -> bytes:
     """Return the beginning of a PCIDSK file, whose image headers of 1024 bytes begin at a block of 512 bytes."""
-    start = bytearray(b"PCIDSK  ".ljust((block - 1) * 512))
-    start[336:352] = b"%16d" % block
-    start[376:384] = b"%8d" % (len(headers) if count is None else count)
+    start = bytearray(b"PCIDSK  ".ljust((block - 1) * 512, b"7"))
+    start[336:352] = b"%016d" % block
+    start[376:384] = b"%08d" % (len(headers) if count is None else count)
     return bytes(start) + b"".join(headers)
 
 
 def header(name: bytes) -> bytes:
-    return (b"A" * 64 + name.ljust(64)).ljust(1024)
+    return (b"A" * 64 + name.ljust(64)).ljust(1024, b"B")
 
 
 def test_a_pcidsk_file_with_all_its_channels_inside_names_nothing(tmp_path: Path) -> None:
@@ -86,7 +87,7 @@ def test_a_pcidsk_file_with_all_its_channels_inside_names_nothing(tmp_path: Path
     [
         pcidsk([header(b""), header(b"/etc/passwd")]), pcidsk([header(b"other.raw"), header(b"")]),
         pcidsk([header(b"")], count=2), pcidsk([header(b"")])[:-1], pcidsk([header(b"")], count=10_000),
-        pcidsk([header(b"")]).replace(b"%16d" % 3, b"three".rjust(16)), pcidsk([header(b"")], count=-1)[:1024] + b"x",
+        pcidsk([header(b"")]).replace(b"%016d" % 3, b"three".rjust(16)), pcidsk([header(b"")], count=-1)[:1024] + b"x",
     ],
     ids=["second outside", "first outside", "one missing", "cut", "too many", "no number", "negative"],
 )  # fmt: skip
@@ -115,6 +116,10 @@ def test_an_isis_label_names_its_core(tmp_path: Path) -> None:
     assert named(tmp_path / "a.lbl", "ISIS3", "Object = IsisCube\nEnd\n") == []
     with pytest.raises(InputError, match="no plain value"):
         named(tmp_path / "a.lbl", "ISIS3", label.format("('a.cub', 5)", "Tile"))
+    # A label ends with its pixels following, within 5 MB.
+    assert len(named(tmp_path / "a.lbl", "ISIS3", label.format("a.cub", "Tile").encode() + b"\xff" * 5_000_000)) == 1
+    with pytest.raises(InputError, match="larger than 5 MB"):
+        named(tmp_path / "a.lbl", "ISIS3", b" " * 5_000_000 + label.format("a.cub", "Tile").encode())
 
 
 def test_tiles_and_images_of_products_are_named(tmp_path: Path) -> None:
@@ -138,6 +143,9 @@ def test_a_volume_names_its_products_and_an_image_names_none(tmp_path: Path) -> 
     assert products_of_volume(path) == ["p/dim.xml"]
     path.write_text(VOLUME.format(parts, "<Raster_Data/>"))
     assert products_of_volume(path) == []
+    kinds = "<COMPONENT_TYPE>PDF</COMPONENT_TYPE><COMPONENT_TYPE>DIMAP</COMPONENT_TYPE>"
+    path.write_text(VOLUME.format(f'<Component>{kinds}<COMPONENT_PATH href="q.xml"/></Component>', ""))
+    assert products_of_volume(path) == ["q.xml"]
     path.write_text("<Other/>")
     assert products_of_volume(path) == []
 
