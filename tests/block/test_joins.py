@@ -16,7 +16,7 @@ def join(
     """Return a pair with a largest sigma along an azimuth, and one across."""
     angle = math.radians(azimuth_deg)
     axes = np.array([[math.sin(angle), math.cos(angle)], [math.cos(angle), -math.sin(angle)]]).T
-    return Join(*names, axes @ np.diag([sigma**2, across**2]) @ axes.T, pixel)
+    return Join(*names, axes @ np.diag([sigma**2, across**2]) @ axes.T, 2.0)
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 30.0, 89.0, 120.0, 179.0])
