@@ -89,12 +89,25 @@ def test_only_ground_without_a_sigma_gets_one() -> None:
         {"sigma_image": [0.1, 0.2, 0.3, 0.4, 0.0]}, {"sigma_ground": [[0, 0, 0], [0, 0, 0], [0, -1, 0]]},
         {"measured": [[1, 2], [3, 4], [5, math.inf], [7, 8], [9, 10]]}, {"ids": ("a", "b", "a")},
         {"images": ("one.tif", "one.tif")}, {"point": [0, 2, 0, 1, 3]}, {"point": [0, 2, 0, 1, -1]},
-        {"image": [0, 0, 1, 1, 2]}, {"image": [0, 0, 1, 1, -1]}, {"point": [0, 2, 0, 1, 1]},
+        {"point": [-1, -1, -1, -1, -1]}, {"image": [0, 0, 1, 1, 2]}, {"ground": [[5e5, 5e6, 10.0], [5e5, math.nan, 1.0],
+        [math.nan] * 3]}, {"ground": [[math.nan, 5e6, 10.0], [5e5, 5e6, 1.0], [math.nan] * 3]},
+        {"measured": np.zeros((5, 3))}, {"sigma_image": [0.1] * 4},
+        {"image": [0, 0, 1, 1, -1]}, {"point": [0, 2, 0, 1, 1]},
     ],
 )  # fmt: skip
 def test_what_is_no_block_is_refused(changed: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         block(**changed)
+
+
+def test_a_sentence_tells_the_points_of_each_role_and_the_rays() -> None:
+    assert repr(block(source="a.csv")) == "<3 points: 1 control, 1 check, 1 tie; 5 rays in 2 images; a.csv>"
+    assert repr(block(roles=["tie"] * 3)).startswith("<3 points: 3 tie; 5 rays")
+    empty = BlockPoints((), np.zeros((0, 3)), [], np.zeros((0, 3)), pyproj.CRS(32633), ("a",), [], [],  # type: ignore[arg-type]
+                        np.zeros((0, 2)), [])  # type: ignore[arg-type]  # fmt: skip
+    assert repr(empty).startswith("<0 points: none; 0 rays in 1 image;")
+    assert empty.groups is None
+    assert block(groups=[-1] * 5).groups is None
 
 
 def test_joined_tables_are_moved_to_one_crs_and_their_points_stay_apart() -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from products import flight
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.models import Pushbroom, model_from_dict
 from ortho_pipeline.models.base import Array
@@ -115,3 +117,38 @@ def test_files_say_what_the_light_does_and_older_ones_say_nothing() -> None:
     assert again.light == model.light
     assert "light" not in lit(model).to_dict()
     assert model_from_dict(lit(model).to_dict()).light == LightPath()
+
+
+@pytest.mark.parametrize("wrong", [{"aberration": 1}, {"refraction": "true"}, {"aberration": None, "refraction": True}])
+def test_light_is_bent_or_not(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="true or false"):
+        LightPath(**wrong)
+
+
+def test_the_numbers_of_light_are_those_of_its_functions() -> None:
+    """Bend at the ellipsoid is the lift straight down there, and slowness the inverse of the velocity of light."""
+    both = LightPath(aberration=True, refraction=True)
+    bend, slowness = both.numbers
+    assert bend == pytest.approx(float(both.lift(np.zeros(1), np.ones(1))[0]))
+    assert slowness == pytest.approx(1 / 299_792_458.0)
+    assert LightPath().numbers == (0.0, 0.0)
+    height, cosine, step = np.array([0.0, 3000.0]), np.array([0.9, 0.5]), 1e-2
+    slope = (both.lift(height + step, cosine) - both.lift(height - step, cosine)) / (2 * step)
+    np.testing.assert_allclose(both.rise(height, cosine), 1.0 + slope, rtol=1e-9)
+
+
+def test_what_light_turns_is_turned_back() -> None:
+    """Seen along `apparent`, light arrived along the line itself; and `turned` is the slope of `apparent`."""
+    light, random = LightPath(aberration=True), np.random.default_rng(4)
+    line, velocity = random.normal(0.0, 5e5, (5, 3)), random.normal(0.0, 4e6, (5, 3))
+    up, height = np.tile([0.0, 0.0, 1.0], (5, 1)), np.zeros(5)
+    apparent = light.apparent(line, velocity, up, height)
+    unit = apparent / np.linalg.norm(apparent, axis=1)[:, None]
+    np.testing.assert_allclose(light.straight(unit, velocity), line / np.linalg.norm(line, axis=1)[:, None], atol=1e-12)
+    matrix = random.normal(size=(5, 3, 3))
+    for axis in range(3):
+        nudge = 10.0 * np.eye(3)[axis]
+        ends = [light.apparent(line + sign * nudge, velocity, up, height) for sign in (1, -1)]
+        slope = np.einsum("nij,nj->ni", matrix, (ends[0] - ends[1]) / 20.0)
+        np.testing.assert_allclose(light.turned(matrix, line, velocity)[:, :, axis], slope, rtol=1e-6, atol=1e-8)
+    assert LightPath().turned(matrix, line, velocity) is matrix

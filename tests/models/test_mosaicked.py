@@ -75,6 +75,15 @@ def test_a_point_belongs_to_the_piece_that_it_is_in_or_nearest_to() -> None:
         np.testing.assert_allclose(pieces.ground_to_image(ground), np.column_stack([np.full(5, column), expected]))
 
 
+def test_within_a_pixel_of_a_piece_the_point_is_still_of_the_piece_that_it_is_in() -> None:
+    """Row 1000.5 of the upper piece is half a pixel beyond it, and the middle of the first row of the lower one."""
+    upper, lower = piece(0.0), dataclasses.replace(piece(0.0), lat_off=9.99, row_off=503.0)
+    pieces = Pieces((upper, lower), ((0.0, 0.0), (0.0, 1000.0)), ((1000, 1000),) * 2)
+    ground = np.array([[0.0, 10.005 - 1e-5 * 1000.5, 500.0]])
+    np.testing.assert_allclose(upper.ground_to_image(ground), [[500.0, 1000.5]])
+    np.testing.assert_allclose(pieces.ground_to_image(ground), [[500.0, 1003.5]])
+
+
 def test_pieces_are_checked_and_copies_hold_them() -> None:
     first, second = piece(0.0), piece(0.01)
     made = Pieces([first, second], [(0.0, 0.0), (1000.0, 0.0)], [(1000, 1000)] * 2)

@@ -116,3 +116,11 @@ def test_the_hull_counts_inside_the_image_only():
     assert set(beyond.outline) == {(-500.0, 0.0), (500.0, 0.0), (500.0, 800.0), (-500.0, 800.0)}
     triangle = control_hull(np.array([(0.0, 0.0), (1000, 0), (0, 800)]), SIZE)
     assert (triangle.share, triangle.n, len(triangle.outline)) == (pytest.approx(0.5), 3, 3)
+
+
+def test_without_points_everything_is_empty():
+    assert empty_parts(np.zeros((0, 2)), (100, 80)) == (0.0, ("everywhere",))
+    assert control_hull(np.array([[1.0, 2.0], [3.0, 4.0]]), (100, 80)) is None
+    line = control_hull(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), (100, 80))
+    assert (line.share, line.n, line.outline) == (0.0, 3, ())
+    assert not outside_of_hull(np.zeros((0, 2)), np.ones((3, 2))).any()

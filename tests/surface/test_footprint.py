@@ -208,6 +208,20 @@ def test_a_scene_across_the_antimeridian_has_a_narrow_grid(middle):
     assert scene_pixels(model, found, grid) == pytest.approx(1e6, rel=0.02)
 
 
+@pytest.mark.parametrize("middle", [179.98, -179.98])
+def test_an_extent_on_the_other_side_of_the_antimeridian_is_of_the_scene(middle):
+    column, row, one = np.eye(20)[1], -np.eye(20)[2], np.eye(20)[0]
+    model = RPC(500.0, 500.0, middle, 10.0, 500.0, 500.0, 500.0, 0.1, 0.1, 500.0, column, one, row, one)
+    found, crs = lay(model, FlatSurface(500.0), 1000, 1000), parse_crs("EPSG:4326")
+    size, east = (1000, 1000), -179.95
+    for west in (-180.05, 179.95):
+        grid = choose_grid(model, found, size, crs=crs, resolution=0.001, extent=(west, 9.95, west + 0.1, 10.05))
+        assert scene_pixels(model, found, grid) == pytest.approx(1e4, rel=1e-6)
+    away = choose_grid(model, found, size, crs=crs, resolution=0.001, extent=(east + 10, 9.95, east + 10.1, 10.05))
+    with pytest.raises(InputError, match="does not overlap"):
+        scene_pixels(model, found, away)
+
+
 @pytest.mark.parametrize(
     ("height", "said"),
     [(850.0, "500 to 850 m"), (150.0, "150 to 500 m"), (790.0, None), (210.0, None)],

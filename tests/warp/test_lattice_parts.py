@@ -98,6 +98,16 @@ def test_blocks_over_the_domain_of_the_model():
     assert inside == {(2, 1)}
 
 
+def test_the_domain_is_in_pixels_of_either_side():
+    """Pixels of 2 m by 4 m, the first corner 1000 m west and north of the middle: 75 x 25 pixels to either side."""
+    surface = SimpleNamespace(sampler=lambda crs: lambda ground: ground[:, :2] / 10)
+    exact = lattice._Exact(Plane(), surface, Grid(UTM, 499_000.0, 1_001_000.0, 2.0, 4.0, 900, 700))
+    assert exact.domain() == pytest.approx((425, 225, 575, 275))
+    away = Grid(pyproj.CRS.from_epsg(32651), 499_000.0, 1_001_000.0, 2.0, 4.0, 900, 700)
+    nowhere = SimpleNamespace(crs=UTM, domain=(np.full(3, np.nan), np.ones(3)))
+    assert lattice._Exact(nowhere, surface, away).domain() == (-np.inf, -np.inf, np.inf, np.inf)
+
+
 def test_between_projections_of_one_datum_heights_take_no_part():
     assert lattices()._exact._flat
     assert not lattices(crs=pyproj.CRS.from_epsg(4978), left=-3e6, top=5e6)._exact._flat

@@ -162,6 +162,16 @@ def test_a_run_between_the_same_samples_next_to_voids_and_the_edge(du):
         assert np.isfinite(found).any() == (TOP <= v0 <= TOP + 5)
 
 
+def test_a_run_in_a_window_that_begins_west_of_the_dem():
+    """Windows may begin at negative columns and rows, as those of DEMs with heights beyond their edge do."""
+    ticks, found = np.arange(64.0), np.empty(64)
+    for left, top in ((-5, -3), (-2, 4), (3, -4)):
+        window = DemWindow(HEIGHTS, left, top, False)
+        tile_kernel._row_heights(window, left + 0.2, 0.09, top + 1.3, 0.05, 1.0, ticks, found)
+        expected = [height(HEIGHTS, 0.2 + 0.09 * t, 1.3 + 0.05 * t, False) for t in ticks]
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 # -- parts of rows ---------------------------------------------------------------------------------------------------
 
 #: Bounds of columns and rows within which no neighbour is missing.

@@ -155,8 +155,8 @@ def motion_of(
         here = (change**2).sum(axis=1) / np.maximum(variance * noisier, 1e-300)
         found = seen & (here > crit) & (np.hypot(*change.T) > LEAST)
         better = found & (~moving | (here > ratio))
-        form[better & ~moving] = name
-        ratio = np.where(better & ~moving, here, ratio)
+        form[better] = name
+        ratio = np.where(better, here, ratio)
         moving |= found
     sigma = np.sqrt(np.maximum(sigma2, 0.0))[:, None] * np.ones(2)
     return Motion(moving, tested, rate, sigma, ratio, form)

@@ -178,7 +178,7 @@ def _closed(
     accepted: NDArray[np.bool_],
 ) -> tuple[Closures, Array]:
     """Return the closures of edges, and by how much the constant variance ``(2,)`` of edges is to change."""
-    index, part = np.flatnonzero(accepted), _parts(incidence, accepted)
+    index, every, part = np.flatnonzero(accepted), np.arange(len(value)), _parts(incidence, accepted)
     connected = part[edges.first] == part[edges.second]
     member = (part[:, None] == np.arange(part.max() + 1)).astype(float)
     error, ratio, more = np.full(value.shape, np.nan), np.zeros(len(value)), np.zeros(2)
@@ -190,9 +190,10 @@ def _closed(
         level = float(weight.mean()) if len(weight) else 1.0
         gain = (scaled @ np.linalg.inv((some.T @ scaled).toarray() + level * member @ member.T)).T  # (T, n)
         left = value[:, axis] - incidence @ (gain @ value[index, axis])
-        moved = (sigma[index][:, index] @ gain.T).T + constant[axis] * gain
-        variance = total + _between(edges, moved @ gain.T)
-        variance[index] -= 2.0 * _across(edges, moved, index)
+        # An edge that is not accepted shares errors of its dates with the others, too; the constant is its own.
+        moved = (sigma[:, index] @ gain.T).T  # (T, E)
+        moved[:, index] += constant[axis] * gain
+        variance = total + _between(edges, moved[:, index] @ gain.T) - 2.0 * _across(edges, moved, every)
         leverage, squared = _across(edges, gain, index), _between(edges, gain @ gain.T)[index]
         redundancy = np.ones(len(value))
         redundancy[index] = 1.0 - leverage

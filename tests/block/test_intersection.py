@@ -1,0 +1,155 @@
+"""Intersection of rays: of linear models against NumPy's least squares, and its parts by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+
+from ortho_pipeline.block.intersection import _LONGEST, PARALLEL, _solved, frame_of, intersect, models_of
+from ortho_pipeline.block.points import BlockPoints
+from ortho_pipeline.errors import InputError, TooFewPoints
+from ortho_pipeline.models import MapPlane
+
+#: Images of a map, displaced by heights: pixels (m) and displacement per metre of height, x and y.
+VIEWS = {"a": (1.0, (0.3, 0.0)), "b": (2.0, (-0.3, 0.1)), "c": (1.5, (0.0, 0.25))}
+MODELS = {
+    name: MapPlane("EPSG:32633", (500_000.0, 4_640_000.0), (pixel, pixel), (9000, 9000), 100.0, relief, (0.0, 500.0))
+    for name, (pixel, relief) in VIEWS.items()
+}
+TRUTH = np.array([[500_100.0, 4_639_900.0, 120.0], [500_300.0, 4_639_500.0, 300.0], [500_200.0, 4_639_700.0, 50.0]])
+TO_MAP = pyproj.Transformer.from_crs(4979, 32633, always_xy=True)
+
+
+def seen(name: str) -> np.ndarray:
+    ground = pyproj.Transformer.from_crs(32633, pyproj.CRS(MODELS[name].crs), always_xy=True)
+    return MODELS[name].ground_to_image(np.column_stack(ground.transform(*TRUTH.T)))
+
+
+def block(noise: float = 0.0, drop: Any = (), sigma: float = 0.5) -> BlockPoints:
+    """Return three points in three images, in order of the images."""
+    random = np.random.default_rng(5)
+    measured = np.concatenate([seen(name) for name in VIEWS]) + noise * random.normal(size=(9, 2))
+    keep = np.setdiff1d(np.arange(9), drop)
+    return BlockPoints(
+        ids=("p", "q", "r"), ground=np.full((3, 3), np.nan), roles=np.array(["tie"] * 3), sigma_ground=np.zeros((3, 3)),
+        crs=pyproj.CRS(32633), images=tuple(VIEWS), point=np.tile(np.arange(3), 3)[keep],
+        image=np.repeat(np.arange(3), 3)[keep], measured=measured[keep],
+        sigma_image=(sigma * np.array([1.0] * 5 + [2.0] * 4))[keep],
+    )  # fmt: skip
+
+
+def in_map(ground: np.ndarray) -> np.ndarray:
+    return np.column_stack(TO_MAP.transform(*ground.T))
+
+
+def test_points_without_errors_are_where_they_are() -> None:
+    found = intersect(MODELS, block(drop=[2, 8]))
+    np.testing.assert_allclose(in_map(found.ground[:2]), TRUTH[:2], atol=1e-5)
+    assert np.isnan(found.ground[2]).all(), "one ray leaves it open"
+    assert np.isnan(found.covariance[2]).all()
+    assert np.isnan(found.residuals[[-2]]).any() or np.isnan(found.residuals).any()
+    assert found.rays.tolist() == [3, 3, 1]
+    assert found.sigma0 == pytest.approx(0.0, abs=1e-4)
+    assert repr(found).startswith("<2 of 3 points intersected from 7 rays")
+
+
+def design(points: BlockPoints, point: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the equations of a point in the map over sigma: partials, measurements, and which rays."""
+    rows, right, rays = [], [], []
+    for ray in np.flatnonzero(points.point == point):
+        pixel, relief = VIEWS[points.images[points.image[ray]]]
+        for axis, sign in ((0, 1.0), (1, -1.0)):
+            partial = np.zeros(3)
+            partial[axis], partial[2] = sign / pixel, sign * relief[axis] / pixel
+            offset = sign * (-(500_000.0, 4_640_000.0)[axis] - relief[axis] * 100.0) / pixel
+            rows.append(partial / points.sigma_image[ray])
+            right.append((points.measured[ray, axis] - offset) / points.sigma_image[ray])
+        rays.append(ray)
+    return np.array(rows), np.array(right), np.array(rays)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+def test_points_are_those_of_least_squares(scaled: bool) -> None:
+    points = block(noise=0.5)
+    found = intersect(MODELS, points, scaled=scaled)
+    squares, covariances = 0.0, []
+    for point in range(3):
+        rows, right, rays = design(points, point)
+        # About the truth: the coordinates of the map have too many digits for it.
+        step = np.linalg.lstsq(rows, right - rows @ TRUTH[point], rcond=None)[0]
+        np.testing.assert_allclose(in_map(found.ground[point : point + 1])[0], TRUTH[point] + step, atol=1e-4)
+        left = right - rows @ (TRUTH[point] + step)
+        squares += left @ left
+        np.testing.assert_allclose(
+            found.residuals[rays] / points.sigma_image[rays, None], left.reshape(-1, 2), atol=1e-4
+        )
+        covariances.append(np.linalg.inv(rows.T @ rows))
+    # Nine rays are 18 equations for 9 unknowns.
+    assert found.sigma0 == pytest.approx(np.sqrt(squares / 9), rel=1e-4)
+    scale = squares / 9 if scaled else 1.0
+    # On the central meridian, east is x; a metre of the map is 1 / 0.9996 of the ground.
+    np.testing.assert_allclose(found.covariance, scale * np.array(covariances), rtol=2e-3, atol=1e-4)
+    np.testing.assert_allclose(found.sigmas, np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
+
+
+def test_the_angle_between_rays_is_that_of_their_displacements() -> None:
+    """A ray leans by the displacement per metre; the widest pair of the three images counts."""
+    lean = {name: np.array([-relief[0], -relief[1], 1.0]) for name, (_, relief) in VIEWS.items()}
+    pairs = [("a", "b"), ("a", "c"), ("b", "c")]
+    angles = [
+        np.degrees(np.arccos(lean[i] @ lean[j] / np.linalg.norm(lean[i]) / np.linalg.norm(lean[j]))) for i, j in pairs
+    ]
+    found = intersect(MODELS, block())
+    np.testing.assert_allclose(found.angles_deg, max(angles), rtol=1e-3)
+    np.testing.assert_allclose(intersect(MODELS, block(drop=[3, 4, 5])).angles_deg, angles[1], rtol=1e-3)
+
+
+def test_two_rays_have_no_redundancy_left_for_a_sigma() -> None:
+    found = intersect(MODELS, block(drop=[0, 1, 2]))
+    assert found.sigma0 is not None, "four equations for three unknowns"
+    with pytest.raises(TooFewPoints, match="no point was measured in two images"):
+        intersect(MODELS, block(drop=range(3, 9)))
+
+
+def test_each_image_needs_a_model_and_each_model_an_image() -> None:
+    assert models_of(MODELS, block()) == tuple(MODELS.values())
+    with pytest.raises(InputError, match="no model of the image 'b'"):
+        models_of({name: MODELS[name] for name in ("a", "c")}, block())
+    with pytest.raises(InputError, match="no points of the image 'd'"):
+        models_of({**MODELS, "d": MODELS["a"]}, block())
+
+
+def test_the_frame_is_about_control_with_heights_or_about_the_images() -> None:
+    tie = block()
+    without = frame_of(tuple(MODELS.values()), tie).origin
+    centre = in_map(np.array([without]))[0]
+    assert 500_000 < centre[0] < 520_000
+    given = dict(vars(tie))
+    given = {name: value for name, value in given.items() if not name.startswith("_")}
+    ground = np.array([[600_000.0, 4_700_000.0, 10.0], [600_200.0, 4_700_000.0, np.nan], [np.nan] * 3])
+    some = BlockPoints(**{**given, "ground": ground, "roles": np.array(["control", "control", "tie"])})
+    np.testing.assert_allclose(in_map(np.array([frame_of(tuple(MODELS.values()), some).origin]))[0, :2], ground[0, :2])
+    none = BlockPoints(**{**given, "ground": ground[[1, 1, 2]], "roles": np.array(["control", "control", "tie"])})
+    np.testing.assert_allclose(frame_of(tuple(MODELS.values()), none).origin, without)
+
+
+def test_steps_solve_the_normal_equations_are_not_too_long_and_parallel_rays_have_none() -> None:
+    random = np.random.default_rng(1)
+    rows = random.normal(size=(5, 8, 3))
+    normal, right = rows.swapaxes(1, 2) @ rows, random.normal(size=(5, 3))
+    right[1] *= 10 * _LONGEST
+    thin = np.diag([1.0, 1.0, 1.0])
+    normal[2] = np.diag([2.0 / PARALLEL**2, 1.0, 1.0])
+    normal[3] = np.diag([0.5 / PARALLEL**2, 1.0, 1.0])
+    normal[4] = thin
+    normal[4, 0, 1] = np.nan
+    step, open_ = _solved(normal, right)
+    assert open_.tolist() == [False, False, False, True, True]
+    np.testing.assert_allclose(step[0], np.linalg.solve(normal[0], right[0]))
+    long = np.linalg.solve(normal[1], right[1])
+    np.testing.assert_allclose(step[1], long * _LONGEST / np.linalg.norm(long))
+    np.testing.assert_array_equal(step[3:], 0.0)
+    assert _solved(np.zeros((0, 3, 3)), np.zeros((0, 3)))[0].shape == (0, 3)
