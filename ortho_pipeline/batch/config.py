@@ -380,4 +380,4 @@ def _allowed(place: Place) -> str:
     if homes := [repr(group) for group, fields in groups.items() if name in fields.model_fields]:
         return f"{name!r} belongs in {' or '.join(homes)}"
     close = difflib.get_close_matches(name, names, 1)
-    return f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(names)}"
+    return f"did you mean {close[0]!r} instead of {name!r}?" if close else f"use one of {', '.join(names)}"

@@ -143,7 +143,11 @@ def test_the_file_has_the_options_of_rectify(settings, options, not_in_the_file)
     [
         ("scenes:\n  - images: a\n    points: {gcp: x}\n", "line 3, scenes[0].points.gcp", "did you mean 'gcps'"),
         ("scenes:\n  - images: a\n    dem: b\n", "line 3, scenes[0].dem", "'dem' belongs in 'surface'"),
-        ("scenes:\n  - images: a\n    dem: b\n    outptu: {}\n", "line 3, scenes[0].dem", "did you mean 'output'?"),
+        (
+            "scenes:\n  - images: a\n    dem: b\n    outptu: {}\n",
+            "line 3, scenes[0].dem",
+            "did you mean 'output' instead of 'outptu'?",
+        ),
         ("scenes:\n  - images: a\n    crs: b\n", "line 3, scenes[0].crs", "'crs' belongs in 'points' or 'output'"),
         ("scenes:\n  - images: a\n    zzz: b\n", "line 3, scenes[0].zzz", "use one of scene, points, surface"),
         ("scenes:\n  - images: a\nscenes:\n  - images: b\n", "line 3, scenes", "duplicate key, already in line 1"),

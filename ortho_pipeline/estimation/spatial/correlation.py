@@ -461,7 +461,7 @@ def _sentences(analysis: Covariance) -> list[str]:
     alike = "{:+.2f} in x and {:+.2f} in y".format(*analysis.moran)
     many = round(1 / SIGNIFICANCE)
     limit = f"{analysis.critical:+.2f} in {many - 1} scenes of {many}"
-    chance = f"Without systematic errors, the larger one is below {limit}"
+    chance = f"Without systematic errors, the larger one (with its sign) is below {limit}"
     if analysis.critical < 0:
         chance += " (residuals of a fit to few points are negatively correlated)"
     result, here = "No systematic error was found", "Here it is below that"

@@ -76,9 +76,14 @@ _LOOK: dict[str, str] = {
     "weak-join": Text(
         "Give control points, another view of the place, or a DEM (",
         Setting("surface.dem"),
-        "). If you gave a DEM: a more accurate one.",
+        "), or a more accurate one. Orthos over the adjusted DEM fit better than this: errors that the whole DEM has "
+        "in common move them alike. Measure their seams with `ortho mosaic`.",
     ),
-    "uncertain-at-edge": "Add control points near the corners, or use a simpler correction.",
+    "uncertain-at-edge": Text(
+        "Add control points near the corners, or use a simpler correction (for photos: ",
+        Setting("scene.sensor_options", "no", key="calibrate"),
+        ").",
+    ),
     "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
     "search-by-default": Text("Change the radius with ", Setting("match.search"), "."),

@@ -101,13 +101,20 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     columns, rows = (grid.left - first.left) / first.dx, (first.top - grid.top) / first.dy
     same_pixels = math.isclose(grid.dx, first.dx, rel_tol=1e-9) and math.isclose(grid.dy, first.dy, rel_tol=1e-9)
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
-    if grid.crs != first.crs or not same_pixels or off > _SAME:
+    if grid.crs != first.crs or not same_pixels:
         raise InputError(
-            f"{other.name} ({grid.crs.name}, {grid.dx:g} x {grid.dy:g}) is off the grid of {one.name} "
-            f"({first.crs.name}, {first.dx:g} x {first.dy:g}) by {off:.3f} px",
+            f"the ortho {other.name!r} has pixels of {grid.dx:g} x {grid.dy:g} in {grid.crs.name}, "
+            f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
             file=other.path,
-            field="output",
-            remedy="give all scenes the same CRS and resolution, and no extent or one on multiples of the resolution",
+            field="orthos",
+            remedy="make all orthos with the same CRS and pixel size, for example --like the first one",
+        )
+    if off > _SAME:
+        raise InputError(
+            f"the ortho {other.name!r} is off the grid of {one.name!r} by {off:.3f} px",
+            file=other.path,
+            field="orthos",
+            remedy="make it again without an extent, or with one on multiples of the pixel size",
         )
 
 

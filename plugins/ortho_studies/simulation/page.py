@@ -83,7 +83,7 @@ def verdict(document: Mapping[str, Any]) -> list[str]:
             f"{_share(predicted, 'naive', tight)}. The guess: {document['naive_text']}",
             f"{_of(predicted['covered'], predicted['rows'])} are between our 5th and 95th percentile. "
             f"At best, {100 * single['median']:.0f} % ({100 * single['p5']:.0f} to {100 * single['p95']:.0f} %) can be "
-            f"within {wide} of our medians: that is the share of a single realisation of ours.",
+            f"within {wide} of our medians: so many are if one of our own realisations takes the place of the paper.",
         ]
     if fitted["rows"]:
         sentences.append(
