@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 DEM_SIGMA, FLAT_SIGMA = 10.0, 30.0
 #: Fewer ties than this between two scenes give a notice.
 _FEW = 30
-#: So many ties a pixel are crowded: an adjustment, which takes them for independent, then has sigmas 1.2 times too
-#: small or more (docs/engineering/matching.md).
+#: So many ties a pixel are crowded: an adjustment, which takes them for independent, then has sigmas that are too
+#: small (docs/engineering/matching.md).
 _CROWDED = 2.0
 
 
