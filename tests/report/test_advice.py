@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import jinja2
 from click.testing import CliRunner
 
 from ortho_pipeline.cli.program import cli
@@ -16,6 +17,18 @@ def test_the_code_follows_the_text():
     lines = signal_lines(signals([], [{"code": "left-out", "text": "G03 was left out"}], tested=False))
     assert lines[0] == "Warning: No point tests the accuracy of this result [untested]"
     assert lines[2] == "Warning: G03 was left out [left-out]"
+
+
+def test_a_page_says_once_what_to_do_about_notices_of_one_kind():
+    loader = jinja2.PackageLoader("ortho_pipeline", "report/templates")
+    environment = jinja2.Environment(loader=loader, autoescape=True)
+    environment.filters["coded"] = str
+    shown = [{"code": "uncertain-at-edge", "text": f"image {name}"} for name in "ab"]
+    found = signals([], [*shown, {"code": "left-out", "text": "G03 was left out"}])
+    listed = environment.get_template("signals.html.j2").module.listed(found, {"look": "Warning"}, "")
+    rows = [row for row in str(listed).splitlines() if row.startswith("<li")]
+    assert ["to-do" in row for row in rows] == [False, True, True]
+    assert [text in row for text, row in zip(("Image a", "Image b", "G03"), rows, strict=True)] == [True] * 3
 
 
 def test_heights_that_are_off_are_the_remedy_of_a_weak_join():
