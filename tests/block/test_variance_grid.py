@@ -12,6 +12,8 @@ from scipy.special import polygamma
 
 from ortho_pipeline.block.adjustment import _prepared
 from ortho_pipeline.block.equations.solver import Solved, attempt, solve
+from ortho_pipeline.block.reliability import blunders
+from ortho_pipeline.block.reliability.standardised_residuals import standardise
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.control_equations import ControlEquations
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
@@ -94,3 +96,13 @@ def test_measurements_that_change_by_three_per_cent_are_the_same() -> None:
     assert found.problem.assumed[0] == 0.4
     wanted = solve(of_ground.applied(solved.problem), solved.state, selection)
     np.testing.assert_allclose(found.state.params, wanted.state.params, atol=1e-9)
+
+
+def test_sigmas_of_ground_that_are_guessed_too_large_are_scaled_together() -> None:
+    """Plan and height are ten times as good as guessed: the ratio of both stays, and no point is a gross error."""
+    solved = block(0.5, 1.5)
+    again = solved.problem.with_sigmas(solved.problem.points.sigma_image, (5.0, 15.0))
+    solved = attempt(again, solved.state, solved.linear.weights)
+    problem = blunders._robust(solved, solved.linear.weights, standardise(solved), estimate(solved))[0]
+    assert 0.02 < problem.assumed[0] / 5.0 < 0.5
+    assert problem.assumed[1] / problem.assumed[0] == pytest.approx(3.0)
