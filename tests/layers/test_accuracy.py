@@ -222,21 +222,29 @@ def test_what_nobody_states_is_no_error():
 
 
 @pytest.mark.parametrize(
-    ("side", "slope", "spacing"), [(640.0, 0.002, 64), (640.0, 0.01, 16), (640.0, 0.15, 4), (64.0, 2.0, 1)]
+    ("side", "origin", "slope", "spacing"),
+    # In the last case a node that is one pixel off is too far off.
+    [
+        (640.0, 320.0, 0.002, 64),
+        (640.0, 320.0, 0.01, 16),
+        (640.0, 320.0, 0.15, 4),
+        (64.0, 32.0, 2.0, 1),
+        (100.0, 0.0, 0.03, 4),
+    ],
 )
-def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(tmp_path, side, slope, spacing):
-    """At x px from the middle, a shift of 1 px and a slope have a variance of 1 + (slope x)^2: a line between nodes."""
-    x = np.linspace(0, side, 5000, endpoint=False) - side / 2
+def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(tmp_path, side, origin, slope, spacing):
+    """At x px from the origin, a shift of 1 px and a slope have a variance of 1 + (slope x)^2: a line between nodes."""
+    x = np.linspace(0, side, 5000, endpoint=False) - origin
 
     def error(apart):
-        nodes = np.arange(0.5 - apart, side + apart, apart) - side / 2
+        nodes = np.arange(0.5 - apart, side + apart, apart) - origin
         return np.abs(np.sqrt(np.interp(x, nodes, 1 + (slope * nodes) ** 2)) - np.sqrt(1 + (slope * x) ** 2)).max()
 
-    limit = 0.005 * np.hypot(1.0, slope * side / 2)
+    limit = 0.005 * np.hypot(1.0, slope * max(origin, side - origin))
     good = [apart for apart in (64, 16, 4) if error(apart) < limit]
     assert max(good, default=1) == spacing
     assert all(error(apart) > 1.5 * limit for apart in (64, 16, 4) if apart > spacing)
-    model = ImageCorrection.identity(Parallel(0.0, 0.0, 1.0, side), "affine", (side / 2, side / 2))
+    model = ImageCorrection.identity(Parallel(0.0, 0.0, 1.0, side), "affine", (origin, origin))
     covariance = np.diag([1.0, slope**2, 1e-12, 1.0, 1e-12, 1e-12])
     city = City((), side=side)
     layer = accuracy._Layer(
