@@ -93,21 +93,24 @@ def test_a_part_of_a_scene_has_the_pixels_of_the_scene(tmp_path: Path, pan, colo
 
 
 def test_a_window_is_all_valid_if_its_pixels_and_three_colours_about_it_are(tmp_path: Path) -> None:
-    """One empty colour, one empty panchromatic pixel; the orthos begin at different places, and have other nodata."""
+    """Empty colours, two of them at a side, and an empty panchromatic pixel; the orthos begin at different places."""
     sharp, wide = np.full((1, 120, 130), 500, np.uint16), np.full((2, 40, 40), 400, np.uint16)
-    sharp[0, 100, 90], wide[:, 17, 14] = 1, 2
+    sharp[0, 100, 90] = 1
+    holes = [(14, 17), (0, 27), (33, 0)]
+    for column, row in holes:
+        wide[:, row, column] = 2
     pan = write(tmp_path / "p.tif", place(9, 6, 130, 120), sharp, 1)
     image = opened(pan, write(tmp_path / "m.tif", place(2, 3, 40, 40, RATIO), wide, 2))
-    for left in range(0, 120, 3):
-        for top in range(0, 110, 5):
-            width, height = 7, 6
-            column, row = left + 7, top + 3  # from the first colour
-            about = [
-                begin // RATIO - 3 <= hole < -(-end // RATIO) + 3
-                for begin, end, hole in ((column, column + width, 14), (row, row + height, 17))
-            ]
-            hidden = all(about) or (left <= 90 < left + width and top <= 100 < top + height)
-            assert image._all_valid(left, top, width, height) is not hidden
+    width, height = 7, 6
+    for left, top in [*((left, top) for left in range(120) for top in (0, 63, 97)), *((60, top) for top in range(110))]:
+        column, row = left + 7, top + 3  # from the first colour
+        hidden = left <= 90 < left + width and top <= 100 < top + height
+        for hole in holes:
+            hidden |= all(
+                begin // RATIO - 3 <= place < -(-(begin + size) // RATIO) + 3
+                for begin, size, place in zip((column, row), (width, height), hole, strict=True)
+            )
+        assert image._all_valid(left, top, width, height) is not hidden
 
 
 def test_pixels_without_a_value_have_that_of_the_product(tmp_path: Path) -> None:
