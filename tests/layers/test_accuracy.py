@@ -233,7 +233,7 @@ def test_what_nobody_states_is_no_error():
     ],
 )
 def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(tmp_path, side, origin, slope, spacing):
-    """At x px from the origin, a shift of 1 px and a slope have a variance of 1 + (slope x)^2: a line between nodes."""
+    """At x px from the origin in either axis, 1 px and a slope have a variance of 1 + (slope x)^2: a line between nodes."""
     x = np.linspace(0, side, 5000, endpoint=False) - origin
 
     def error(apart):
@@ -245,7 +245,7 @@ def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(t
     assert max(good, default=1) == spacing
     assert all(error(apart) > 1.5 * limit for apart in (64, 16, 4) if apart > spacing)
     model = ImageCorrection.identity(Parallel(0.0, 0.0, 1.0, side), "affine", (origin, origin))
-    covariance = np.diag([1.0, slope**2, 1e-12, 1.0, 1e-12, 1e-12])
+    covariance = np.diag([1.0, slope**2, 1e-12, 1.0, 1e-12, slope**2])
     city = City((), side=side)
     layer = accuracy._Layer(
         Budget(covariance=covariance), Sight(model, city.grid(1.0)), city.surface(tmp_path / "dem.tif"),
