@@ -233,7 +233,7 @@ def test_what_nobody_states_is_no_error():
     ],
 )
 def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(tmp_path, side, origin, slope, spacing):
-    """At x px from the origin, 1 px and a slope have a variance of 1 + (slope x)^2 in each axis: a line between nodes."""
+    """At x px from the origin, 1 px and a slope have a variance of 1 + (slope x)^2 in either axis: lines in between."""
     x = np.linspace(0, side, 5000, endpoint=False) - origin
 
     def error(apart):
