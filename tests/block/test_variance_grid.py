@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chains import Chain, fly, with_control
+from chains import Chain, fly, to_image, with_control
 from scipy.special import polygamma
 
 from ortho_pipeline.block.adjustment import _prepared
 from ortho_pipeline.block.equations.solver import Solved, attempt, solve
+from ortho_pipeline.block.reliability import blunders
+from ortho_pipeline.block.reliability.standardised_residuals import standardise
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.control_equations import ControlEquations
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
@@ -94,3 +96,32 @@ def test_measurements_that_change_by_three_per_cent_are_the_same() -> None:
     assert found.problem.assumed[0] == 0.4
     wanted = solve(of_ground.applied(solved.problem), solved.state, selection)
     np.testing.assert_allclose(found.state.params, wanted.state.params, atol=1e-9)
+
+
+def test_sigmas_of_ground_that_are_guessed_too_large_are_scaled_together() -> None:
+    """Plan and height are ten times as good as guessed: the ratio of both stays, and no point is a gross error."""
+    solved = block(0.5, 1.5)
+    again = solved.problem.with_sigmas(solved.problem.points.sigma_image, (5.0, 15.0))
+    solved = attempt(again, solved.state, solved.linear.weights)
+    problem = blunders._robust(solved, solved.linear.weights, standardise(solved), estimate(solved))[0]
+    assert 0.02 < problem.assumed[0] / 5.0 < 0.5
+    assert problem.assumed[1] / problem.assumed[0] == pytest.approx(3.0)
+
+
+def test_ground_of_one_image_is_perfect_whatever_its_sigmas() -> None:
+    """One image cannot tell an error of the ground from one of the measurement: the factor is that of plain shifts."""
+    flown = fly(Chain(images=2, convergence_deg=25.0, ties=40, errors=2.0, pairwise=False), 5)
+    both = with_control(flown, "i1", 8)
+    rows = np.flatnonzero((both.image == 1) & (both.roles[both.point] == "control"))
+    points = replace(
+        both, images=("i1",), point=both.point[rows], image=np.zeros(8, dtype=int), measured=both.measured[rows],
+        sigma_image=np.full(8, 0.1), sigma_ground=np.zeros_like(both.ground),
+    )  # fmt: skip
+    start = flown.start["i1"]
+    misses = points.measured - to_image(start, points.ground[points.point])
+    wanted = math.sqrt(misses.var(axis=0).sum() * 8 / 14) / 0.1
+    problem, state, selection = _prepared((start,), points, {}, ())
+    for sigma in (1e-5, 0.1, 0.3):
+        found = estimate(attempt(problem.with_sigmas(points.sigma_image, (sigma, sigma)), state, selection))
+        assert not found.separable
+        assert found.image == pytest.approx(wanted, rel=1e-4)

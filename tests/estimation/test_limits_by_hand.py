@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
-from ortho_pipeline.estimation.blunders import _together_apart, are_alike, contradicting, refuse_many
+from ortho_pipeline.estimation.blunders import _together_apart, are_alike, contradicting, outlying, refuse_many
 from ortho_pipeline.estimation.choice.compared_model import ComparedModel
 from ortho_pipeline.estimation.coordinate_swaps import refuse_swapped
 from ortho_pipeline.estimation.fit import fit
@@ -303,3 +303,23 @@ def test_the_points_of_a_cell_are_neighbours() -> None:
     image = np.random.default_rng(2).uniform(0, 1000, (900, 2))
     for row in _cell_means(image):
         assert np.ptp(image[row > 0], axis=0).max() <= 1000 / 12 + 1
+
+
+def test_an_error_that_control_shares_is_expected_in_check_points_without_it(level: RPC) -> None:
+    """A mean of nine and a common error: 10/9 of the scatter, and the shift's common variance as it is, in px."""
+    random = np.random.default_rng(4)
+    ground = np.column_stack([random.uniform([19.992, -30.008], [20.008, -29.992], (12, 2)), np.full(12, 400.0)])
+    image = level.ground_to_image(ground) + random.normal(0.0, 0.6, (12, 2))
+    image[9] += 60.0, 80.0
+    points = Points.of(image, ground, "EPSG:4979", roles=["control"] * 9 + ["check"] * 3, sigma_image=0.2)
+    used = points.control
+    solution = Problem.of(ImageCorrection.identity(level, "shift", (1000.0, 1000.0)), points, used, {}).solve(
+        np.ones(9, dtype=bool)
+    )
+    common = np.array([[1.5, 0.4], [0.4, 0.7]])
+    (found,) = outlying(solution, points, used, common)
+    misses = image - level.ground_to_image(ground)
+    scatter = misses[:9].var(axis=0, ddof=1).sum()
+    assert found.id == "10"
+    assert found.distance == pytest.approx(np.hypot(*(misses[9] - misses[:9].mean(axis=0))))
+    assert found.expected == pytest.approx(math.sqrt(scatter * 10 / 9 + 1.5 + 0.7))

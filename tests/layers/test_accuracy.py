@@ -15,6 +15,7 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
+from ortho_pipeline.warp.quality import accuracy
 from ortho_pipeline.warp.quality.accuracy import Budget, layer_grid, parts_at, predictive, write_accuracy
 from ortho_pipeline.warp.quality.error_ellipse import circular_error
 from ortho_pipeline.warp.quality.sight import Sight
@@ -212,3 +213,42 @@ def test_quantiles_and_cells_are_those_of_the_pixels(tmp_path):
     middles = (made.cell * np.arange(31) + made.cell / 2) / side
     np.testing.assert_allclose(made.cells[:, :31], np.tile(wanted(middles), (32, 1)), rtol=2e-3)
     assert made.sigma[1] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_what_nobody_states_is_no_error():
+    sight = Sight(Parallel(0.3, -0.4, 2.0, 256.0), City(()).grid())
+    parts = parts_at(Budget(heights=4.0), sight, *(np.array([value]) for value in (200.0, 300.0, FLOOR)))
+    np.testing.assert_allclose(parts.total, [np.array([1.44, 2.56, -1.92]) * TRUE**2], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("side", "origin", "slope", "spacing"),
+    # In the last case a node that is one pixel off is too far off.
+    [
+        (640.0, 320.0, 0.002, 64),
+        (640.0, 320.0, 0.01, 16),
+        (640.0, 320.0, 0.15, 4),
+        (64.0, 32.0, 2.0, 1),
+        (100.0, 0.0, 0.03, 4),
+    ],
+)
+def test_nodes_are_as_far_apart_as_half_a_per_cent_of_the_largest_sigma_allows(tmp_path, side, origin, slope, spacing):
+    """At x px from the origin, 1 px and a slope have a variance of 1 + (slope x)^2 in either axis: lines in between."""
+    x = np.linspace(0, side, 5000, endpoint=False) - origin
+
+    def error(apart):
+        nodes = np.arange(0.5 - apart, side + apart, apart) - origin
+        return np.abs(np.sqrt(np.interp(x, nodes, 1 + (slope * nodes) ** 2)) - np.sqrt(1 + (slope * x) ** 2)).max()
+
+    limit = 0.005 * np.hypot(1.0, slope * max(origin, side - origin))
+    good = [apart for apart in (64, 16, 4) if error(apart) < limit]
+    assert max(good, default=1) == spacing
+    assert all(error(apart) > 1.5 * limit for apart in (64, 16, 4) if apart > spacing)
+    model = ImageCorrection.identity(Parallel(0.0, 0.0, 1.0, side), "affine", (origin, origin))
+    covariance = np.diag([1.0, slope**2, 1e-12, 1.0, 1e-12, slope**2])
+    city = City((), side=side)
+    layer = accuracy._Layer(
+        Budget(covariance=covariance), Sight(model, city.grid(1.0)), city.surface(tmp_path / "dem.tif"),
+        (int(side), int(side)), (FLOOR, FLOOR), 1 << 28,
+    )  # fmt: skip
+    assert layer.spacing == spacing

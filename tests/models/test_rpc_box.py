@@ -197,3 +197,15 @@ def test_the_widest_pixel_is_100_km_at_its_latitude():
     assert simple(lat_off=60.5, **wide).lat_off == 60.5
     with pytest.raises(InputError, match="a pixel of this RPC would be"):
         simple(lat_off=59.5, **wide)
+
+
+def test_a_pole_between_the_middle_and_the_top_takes_the_top_away():
+    # (1 - H / 0.53) (1 - H / 0.55) is negative between these heights alone: no level of 1/16 is in between.
+    denominator = np.eye(20)[0] - (1 / 0.53 + 1 / 0.55) * np.eye(20)[3] + 1 / (0.53 * 0.55) * np.eye(20)[9]
+    for side in (1.0, -1.0):
+        turned = denominator * np.where(np.arange(20) == 3, side, 1.0)
+        model = simple(row_num=-np.eye(20)[2], row_den=turned)
+        low, high = sorted(side * (h - 700.0) / 500.0 for h in model.height_range)
+        # The other side of the middle is sound: poles on one side take nothing of the other.
+        assert low == -1.0
+        assert 0.25 <= high < 0.53

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.opening.drivers import DRIVERS
-from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
+from ortho_pipeline.raster.opening.gate import DecodedUnit, VsiPath, _beside, open_seen
 
 #: Blocks larger than those of a VRT.
 LARGE = ("TILED=YES", "BLOCKXSIZE=256", "BLOCKYSIZE=256")
@@ -193,3 +195,14 @@ def test_a_folder_without_a_product_is_no_image(tmp_path: Path) -> None:
         )
         with pytest.raises(InputError, match=message):
             opened(tmp_path)
+
+
+def test_sidecars_of_a_compressed_file_are_asked_for_by_name(tmp_path: Path) -> None:
+    """GDAL cannot list what is in a .gz: its reader of single files has no folders; an archive has them."""
+    for name in ("b.tif.gz", "b.tif.gz.aux.xml"):
+        (tmp_path / name).write_bytes(gzip.compress(b"x"))
+    assert _beside(VsiPath(f"/vsigzip/{tmp_path}/b.tif.gz")) == ["b.tif.gz.aux.xml"]
+    with zipfile.ZipFile(tmp_path / "c.zip", "w") as archive:
+        for name in ("d/b.tif", "d/b.tfw", "d/other.tfw"):
+            archive.writestr(name, "x")
+    assert sorted(_beside(VsiPath(f"/vsizip/{tmp_path}/c.zip/d/b.tif"))) == ["b.tfw", "b.tif"]

@@ -124,3 +124,13 @@ def test_a_part_around_a_pole_reaches_it(code: int, pole: float) -> None:
     assert all(shape.contains(shapely.Point(lon, pole * 0.999)) for lon in (-179, -90, 0, 45, 179))
     assert not any(shape.contains(shapely.Point(lon, pole * 0.96)) for lon in (-179, -90, 0, 45, 179))
     assert not shape.contains(shapely.Point(0, -pole * 0.999))
+
+
+def test_the_faintest_pixels_are_valid(tmp_path: Path) -> None:
+    """An alpha of 1 of 255 shows the image; an alpha of 0 hides it."""
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 3, 2, 2, gdal.GDT_Byte, ["ALPHA=YES"])
+    dataset.SetProjection(pyproj.CRS("EPSG:32635").to_wkt())
+    dataset.SetGeoTransform((500_000, 10, 0, 4_000_000, 0, -20))
+    dataset.WriteArray(np.array([[[9] * 3] * 2, [[1, 1, 0]] * 2], dtype=np.uint8))
+    dataset = None
+    assert valid_outline(tmp_path / "a.tif").bounds == (500_000, 3_999_960, 500_020, 4_000_000)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from networks import Truth
 
-from ortho_pipeline.block.stack import network
+from ortho_pipeline.block.stack import adjustment, network
 from ortho_pipeline.block.stack.adjustment import adjust
 from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Edges
@@ -232,3 +232,15 @@ def test_a_step_is_reported_by_the_number_of_its_date_among_all():
     before, after = np.setdiff1d(np.arange(15), [4]), np.arange(15, 30)
     expected = made.shift[after].mean(axis=0) - made.shift[before].mean(axis=0)
     np.testing.assert_allclose(stack.steps[0].size, expected, atol=0.15)
+
+
+def test_ground_that_does_not_move_needs_one_solution_for_each_question(monkeypatch):
+    """One for steady motion, one for any motion: the second solution of a question would repeat the first."""
+    made = Truth(seed=4, dates=8).made()
+    asked, motion_of = [], adjustment.motion_of
+    monkeypatch.setattr(
+        adjustment, "motion_of", lambda left, times, **how: (asked.append(how), motion_of(left, times, **how))[1]
+    )
+    stack = adjust(made.truth.cells, made.edges, made.years.tolist(), affine=False)
+    assert not stack.motion.moving.any()
+    assert asked == [{"steady": True}, {}]

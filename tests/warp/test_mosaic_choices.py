@@ -434,3 +434,25 @@ def test_what_cannot_be_is_refused(tmp_path):
                 tmp_path / "m.tif",
                 MosaicOptions(format="COG", **{field: True}),
             )
+
+
+def test_the_accuracy_of_a_pixel_is_that_at_its_place_in_its_own_ortho(tmp_path, monkeypatch):
+    """The second ortho begins 30 px right of the first and 10 px below; it is better in its first 20 columns."""
+    placed = []
+    for number, (left, top) in enumerate([(0, 0), (30, 10)]):
+        name = "ab"[number]
+        ortho = write(tmp_path, name, np.full((40, 60), 100.0 * (1 + number)), left, top)
+        path, grid = tmp_path / f"{name}_accuracy.tif", Grid(UTM, 5e5 + 2.0 * left, 4e6 - 2.0 * top, 2.0, 2.0, 60, 40)
+        errors = np.full((40, 60), 2.0, dtype=np.float32)
+        if number:
+            errors[:] = 3.0
+            errors[:25, :20] = 1.0
+        with RasterWriter(path, grid, Profile(1, np.dtype("float32"), "nodata", math.nan), driver="GTiff") as writer:
+            writer.write(0, 0, errors[None], None)
+        placed.append(dataclasses.replace(ortho, accuracy=path))
+    wanted = np.zeros((50, 90))
+    wanted[10:, 30:], wanted[:40, :60], wanted[10:35, 30:50] = 200.0, 100.0, 200.0
+    for window in (2048, 17):
+        monkeypatch.setattr(writing, "_WINDOW", window)
+        write_cog(lay_out(placed, "most-accurate"), tmp_path / "m.tif")
+        np.testing.assert_array_equal(read(tmp_path / "m.tif")[0], wanted)

@@ -1,0 +1,126 @@
+"""Which pixels of two orthos belong together for pan-sharpening, where their grids begin at different places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.raster.ortho import Profile
+from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened
+from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.raster.source import Grid, RasterSource
+
+UTM = pyproj.CRS("EPSG:32636")
+#: Pixels whose multiples are no exact numbers.
+PIXEL, RATIO, WEIGHTS = 0.3, 4, (0.4, 0.6)
+CORNER = (512_000.0, 4_123_000.0)
+
+
+def place(left: int, top: int, width: int, height: int, ratio: int = 1) -> Grid:
+    """Return a grid that begins at panchromatic pixels from the corner, with pixels of so many of these."""
+    side = PIXEL * ratio
+    return Grid(UTM, CORNER[0] + PIXEL * left, CORNER[1] - PIXEL * top, side, side, width, height)
+
+
+def write(path: Path, grid: Grid, pixels: np.ndarray, nodata: float | None = None) -> Path:
+    kind = {"uint16": gdal.GDT_UInt16, "float32": gdal.GDT_Float32}[pixels.dtype.name]
+    made = gdal.GetDriverByName("GTiff").Create(str(path), grid.width, grid.height, len(pixels), kind)
+    made.SetGeoTransform(grid.geotransform)
+    made.SetProjection(grid.crs.to_wkt())
+    made.WriteArray(pixels)
+    for number in range(len(pixels) if nodata is not None else 0):
+        made.GetRasterBand(number + 1).SetNoDataValue(nodata)
+    return path
+
+
+def opened(pan: Path, colours: Path) -> Pansharpened:
+    sources = RasterSource(pan), RasterSource(colours)
+    return Pansharpened(*sources, (grid_of(pan), grid_of(colours)), WEIGHTS, Profile.of(sources[1]))
+
+
+@pytest.mark.parametrize(
+    ("pan", "colours", "common", "whole"),
+    [
+        # (left, top, width, height): colours begin 30 and 22 pixels before, and reach beyond; three of them are added.
+        ((0, 0, 18, 15), (-30, -22, 20, 30), (0, 0, 18, 15), (-14, -14, 44, 44)),
+        # They begin within, and nothing is added where there are none.
+        ((0, 0, 60, 50), (6, 9, 9, 8), (6, 9, 36, 32), (6, 9, 36, 32)),
+        ((0, 0, 40, 40), (-2, 5, 20, 20), (0, 5, 40, 35), (-2, 5, 56, 48)),
+        ((100, 60, 13, 10), (2, 4, 50, 50), (100, 60, 13, 10), (86, 48, 40, 36)),
+    ],
+)  # fmt: skip
+def test_the_common_extent_is_widened_to_whole_colours_and_three_more(pan, colours, common, whole) -> None:
+    found = CommonExtent.of(place(*pan), place(*colours, RATIO))
+    assert found.ratio == RATIO
+    for grid, (left, top, width, height) in ((found.grid, common), (found.whole, whole)):
+        assert (grid.width, grid.height) == (width, height)
+        assert grid.left == pytest.approx(CORNER[0] + PIXEL * left, abs=1e-6)
+        assert grid.top == pytest.approx(CORNER[1] - PIXEL * top, abs=1e-6)
+
+
+@pytest.mark.parametrize(("pan", "colours"), [((57, 29, 71, 83), (1, 2, 48, 47)), ((3, 6, 170, 170), (19, 27, 31, 29))])
+def test_a_part_of_a_scene_has_the_pixels_of_the_scene(tmp_path: Path, pan, colours) -> None:
+    """Cut at any place, for either ortho: more than three colours from a cut, GDAL's kernel has the same pixels."""
+    random = np.random.default_rng(5)
+    sharp = random.integers(300, 900, (1, 192, 192)).astype(np.uint16)
+    wide = random.integers(300, 900, (2, 48, 48)).astype(np.uint16)
+    # Whole colours are cut: the panchromatic grid begins as many pixels from theirs as the cuts say.
+    first = (colours[0] // RATIO, colours[1] // RATIO)
+    colours = (RATIO * first[0], RATIO * first[1], min(colours[2], 48 - first[0]), min(colours[3], 48 - first[1]))
+    part = sharp[:, pan[1] : pan[1] + pan[3], pan[0] : pan[0] + pan[2]]
+    some = wide[:, first[1] : first[1] + colours[3], first[0] : first[0] + colours[2]]
+    whole = opened(
+        write(tmp_path / "p.tif", place(0, 0, 192, 192), sharp),
+        write(tmp_path / "m.tif", place(0, 0, 48, 48, RATIO), wide),
+    )
+    image = opened(
+        write(tmp_path / "q.tif", place(pan[0], pan[1], part.shape[2], part.shape[1]), part),
+        write(tmp_path / "n.tif", place(*colours, RATIO), some),
+    )
+    left, top = max(pan[0], colours[0]), max(pan[1], colours[1])
+    grid = image.overlap.grid
+    assert grid.left == pytest.approx(CORNER[0] + PIXEL * left, abs=1e-6)
+    wanted = whole.read(left, top, grid.width, grid.height)[0]
+    found, valid = image.read(0, 0, grid.width, grid.height)
+    assert valid.all()
+    assert wanted.min() > 0
+    inside = (slice(None), slice(14, -14), slice(14, -14))
+    np.testing.assert_array_equal(found[inside], wanted[inside])
+    np.testing.assert_array_equal(image.read(20, 17, 30, 25)[0], found[:, 17:42, 20:50])
+
+
+def test_a_window_is_all_valid_if_its_pixels_and_three_colours_about_it_are(tmp_path: Path) -> None:
+    """Empty colours, two of them at a side, and an empty panchromatic pixel; the orthos begin at different places."""
+    sharp, wide = np.full((1, 120, 130), 500, np.uint16), np.full((2, 40, 40), 400, np.uint16)
+    sharp[0, 100, 90] = 1
+    holes = [(14, 17), (0, 27), (33, 0)]
+    for column, row in holes:
+        wide[:, row, column] = 2
+    pan = write(tmp_path / "p.tif", place(9, 6, 130, 120), sharp, 1)
+    image = opened(pan, write(tmp_path / "m.tif", place(2, 3, 40, 40, RATIO), wide, 2))
+    width, height = 7, 6
+    for left, top in [*((left, top) for left in range(120) for top in (0, 63, 97)), *((60, top) for top in range(110))]:
+        column, row = left + 7, top + 3  # from the first colour
+        hidden = left <= 90 < left + width and top <= 100 < top + height
+        for hole in holes:
+            hidden |= all(
+                begin // RATIO - 3 <= place < -(-(begin + size) // RATIO) + 3
+                for begin, size, place in zip((column, row), (width, height), hole, strict=True)
+            )
+        assert image._all_valid(left, top, width, height) is not hidden
+
+
+def test_pixels_without_a_value_have_that_of_the_product(tmp_path: Path) -> None:
+    """In floating point, too, where GDAL marks them with a number of its own."""
+    sharp, wide = np.full((1, 64, 64), 500, np.float32), np.full((2, 16, 16), 400, np.float32)
+    sharp[0, 10, 20] = -1
+    pan = write(tmp_path / "p.tif", place(0, 0, 64, 64), sharp, -1)
+    pixels, valid = opened(pan, write(tmp_path / "m.tif", place(0, 0, 16, 16, RATIO), wide, -9)).read(0, 0, 64, 64)
+    assert not valid[10, 20]
+    assert valid.sum() == 64 * 64 - 1
+    np.testing.assert_array_equal(pixels[:, 10, 20], [-9, -9])
+    np.testing.assert_allclose(pixels[:, valid], 500.0)
