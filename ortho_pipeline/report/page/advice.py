@@ -77,7 +77,7 @@ _LOOK: dict[str, str] = {
         "Give control points, another view of the place, or a DEM (",
         Setting("surface.dem"),
         "), or a more accurate one. Orthos over the adjusted DEM fit better than this: errors that the whole DEM has "
-        "in common move them alike. Measure their seams with `ortho mosaic`.",
+        "in common move them alike. The report of a mosaic has the seams.",
     ),
     "uncertain-at-edge": Text(
         "Add control points near the corners, or use a simpler correction (for photos: ",

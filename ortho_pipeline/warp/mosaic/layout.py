@@ -107,7 +107,7 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
             f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
             file=other.path,
             field="orthos",
-            remedy="make all orthos with the same CRS and pixel size, for example --like the first one",
+            remedy=Text("make all orthos with the same CRS and pixel size (", Setting("output.like"), ")"),
         )
     if off > _SAME:
         raise InputError(
