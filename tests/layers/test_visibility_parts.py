@@ -6,41 +6,21 @@ import math
 from typing import Any
 
 import numpy as np
-import pyproj
 import pytest
+from samples import CRS, Memory
 
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import dem_of
-from ortho_pipeline.surface.dem_file import SampleGrid
 from ortho_pipeline.warp.quality import visibility
 from ortho_pipeline.warp.quality.sight import Sight
 from ortho_pipeline.warp.quality.visibility import FAR, NEAR, Visibility, _across, _bounds, _extremes
 
-CRS = pyproj.CRS("EPSG:32735")
 HEIGHTS = np.random.default_rng(3).uniform(100.0, 140.0, (200, 220))
-
-
-class Memory:
-    """Samples in memory, 10 m apart, from x = 500 000 and y = 6 280 000 on."""
-
-    path, block, unit, files = "dem.tif", 64, "", ("dem.tif",)
-
-    def __init__(self, heights: np.ndarray) -> None:
-        self.heights = heights
-
-    def place(self) -> tuple[pyproj.CRS, SampleGrid]:
-        return CRS, SampleGrid(CRS, self.heights.shape, (5e5, 10.0, 0.0, 6.28e6, 0.0, -10.0))
-
-    def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> np.ndarray:
-        return self.heights[top : top + height, left : left + width].copy()
-
-    def close(self) -> None:
-        pass
 
 
 def look(heights: np.ndarray = HEIGHTS, way: tuple[float, float] = (2.0, -3.0)) -> Visibility:
     """Return the look from pixels of 5 m along lines that go so many pixels per metre upwards."""
-    surface = dem_of(Memory(heights), "ellipsoid", False, "error", 10**8)  # type: ignore[arg-type]
+    surface = dem_of(Memory(heights, (5e5, 6.28e6)), "ellipsoid", False, "error", 10**8)  # type: ignore[arg-type]
     sight = Sight.__new__(Sight)
     sight.grid = Grid(CRS, 5e5, 6.28e6, 5.0, 5.0, 300, 260)
     return Visibility(

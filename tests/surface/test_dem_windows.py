@@ -7,42 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 import pytest
+from samples import CRS, Memory
 
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.surface import dem as dem_module
 from ortho_pipeline.surface.dem import DemSurface, dem_of, open_dem
-from ortho_pipeline.surface.dem_file import SampleGrid
 from ortho_pipeline.surface.voids import nearest_heights
 
-CRS = pyproj.CRS("EPSG:32735")
 HEIGHTS = np.random.default_rng(3).uniform(100.0, 900.0, (40, 50))
 
 
-class Memory:
-    """Samples in memory, 10 m apart, from x = 300 000 and y = 6 280 000 on."""
-
-    path, block, unit, files = "dem.tif", 64, "", ("dem.tif",)
-
-    def __init__(self, heights: np.ndarray) -> None:
-        self.heights = heights
-
-    def place(self) -> tuple[pyproj.CRS, SampleGrid]:
-        return CRS, SampleGrid(CRS, self.heights.shape, (3e5, 10.0, 0.0, 6.28e6, 0.0, -10.0))
-
-    def read(self, left: int, top: int, width: int, height: int, metres_per_unit: float) -> np.ndarray:
-        rows, columns = self.heights.shape
-        assert 0 <= left < left + width <= columns
-        assert 0 <= top < top + height <= rows
-        return self.heights[top : top + height, left : left + width] * metres_per_unit
-
-    def close(self) -> None:
-        pass
-
-
 def surface(heights: np.ndarray = HEIGHTS, fill: Any = "error") -> DemSurface:
-    return dem_of(Memory(heights), "ellipsoid", False, fill, 10**8)  # type: ignore[arg-type]
+    return dem_of(Memory(heights, (3e5, 6.28e6)), "ellipsoid", False, fill, 10**8)  # type: ignore[arg-type]
 
 
 def at(*places: tuple[float, float]) -> np.ndarray:

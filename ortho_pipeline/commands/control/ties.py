@@ -159,7 +159,13 @@ def tie_scenes(
     usual = FLAT_SIGMA if surface.provenance.get("constant_height") is not None else DEM_SIGMA
     stated = typical_sigma(surface)
     sigma = usual if stated is None else stated
-    settings = TieSettings(search, options.wanted, options.points is None, sigma, threads or os.cpu_count() or 1)
+    settings = TieSettings(
+        search,
+        points=options.wanted,
+        apart=options.points is None,
+        dem_sigma=sigma,
+        threads=threads or os.cpu_count() or 1,
+    )
     ties = tie(views, settings)
     notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.points)]
     if stated is None:

@@ -183,14 +183,7 @@ class _Block:
         """
         shares = [len(partners[other]) / SAMPLES**2 for other in placed]
         factor = min(pair.factor for pair in placed.values())
-        count = min(round(self.settings.points / min(shares)), _MOST * self.settings.points)
-        columns, rows = cells_of(*view.size, count)
-        if self.settings.apart:
-            across, down = (extent // ((SIDE + 2 * RIM) * factor) for extent in view.size)
-            if across * down * max(shares) < _FIT:
-                columns, rows = cells_of(*view.size, min(count, round(_SHARING / max(shares))))
-            else:
-                columns, rows = min(columns, across), min(rows, down)
+        columns, rows = self._cells(view.size, shares, factor)
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
         centres = np.column_stack([x.ravel(), y.ravel()]) * view.size
         lacking = {other: shows(view, self.targets[other], centres) for other in placed}
@@ -207,6 +200,17 @@ class _Block:
         begun = [_Track({home: (origin + SIDE // 2 * float(factor), nothing)}) for origin in origins]
         crowding = (SIDE * factor) ** 2 * columns * rows / math.prod(view.size)
         return begun, [{other for other in placed if lacking[other][number]} for number in numbers.tolist()], crowding
+
+    def _cells(self, size: tuple[int, int], shares: Sequence[float], factor: int) -> tuple[int, int]:
+        """Return columns and rows of cells of a scene, of which its partners show these shares; chips have a factor."""
+        count = min(round(self.settings.points / min(shares)), _MOST * self.settings.points)
+        columns, rows = cells_of(*size, count)
+        if not self.settings.apart:
+            return columns, rows
+        across, down = (extent // ((SIDE + 2 * RIM) * factor) for extent in size)
+        if across * down * max(shares) < _FIT:
+            return cells_of(*size, min(count, round(_SHARING / max(shares))))
+        return min(columns, across), min(rows, down)
 
     def _take(
         self,
