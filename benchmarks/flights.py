@@ -17,6 +17,7 @@ import argparse
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,9 @@ from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.points import BlockPoints
-from ortho_pipeline.block.relative.joins import joins_of
+from ortho_pipeline.block.relative.joins import Join, joins_of
 from ortho_pipeline.block.shared.priors import SharedPriors
+from ortho_pipeline.commands.block_results.orthos import corrected
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import OrthoError
 from ortho_pipeline.hookspecs import Scene
@@ -54,7 +56,7 @@ APART, WEAK, CHANCE, ELLIPSE, FAR = 1.0, 0.5, 13.8, 5.99, 4.0
 #: Tangent of the largest angle off the axis that a photo shows; its corners are at 0.93.
 WIDEST = 1.5
 #: Pairs are judged with so many common points or more.
-COMMON = 8
+COMMON = 80
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_MAP = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:32636", always_xy=True)
 
@@ -242,19 +244,23 @@ def write_dem(path: Path, waves: Array, random: np.random.Generator) -> DemSurfa
 # -- the result compared with the truth ------------------------------------------------------------------------------
 
 
-def off_by(flight: Flight, models: Any) -> Array:
+def off_by(flight: Flight, models: Any, dem: DemSurface | None = None) -> Array:
     """Return how far (m, east and north) each ortho is from the true ground: ``(photos, n, 2)``; NaN where unseen.
 
-    It is where a model shows a ground point, from where the photo has it, turned into metres by the true photo.
+    It is where a model shows a ground point, from where the photo has it, turned into metres by the true photo. Orthos
+    are over the true ground, or over a DEM.
     """
-    lonlat = np.array(MIDDLE) + np.random.default_rng(0).uniform(-80, 80, (400, 2)) / (86_000.0, 111_000.0)
+    lonlat = np.array(MIDDLE) + np.random.default_rng(0).uniform(-80, 80, (4000, 2)) / (86_000.0, 111_000.0)
     steps = np.array([[0.0, 0.0], [1.0 / 86_000.0, 0.0], [0.0, 1.0 / 111_000.0]])
     places = [np.column_stack([lonlat + step, height(flight.waves, *(lonlat + step).T)]) for step in steps]
+    shown = places[0]
+    if dem is not None:
+        shown = np.column_stack([lonlat, dem.heights(lonlat, "EPSG:4979")])
     found = []
     for name, position, turn in zip(flight.scenes, flight.positions, flight.turns, strict=True):
         at, east, north = (seen(flight.kind, position, turn, to_ecef(place)) for place in places)
         by_metre = np.stack([east - at, north - at], axis=2)
-        away = models[name].ground_to_image(places[0]) - at
+        away = models[name].ground_to_image(shown) - at
         away[~np.isfinite(by_metre).all(axis=(1, 2))] = np.nan
         by_metre[~np.isfinite(by_metre)] = 1.0
         found.append(-np.einsum("nij,nj->ni", np.linalg.pinv(by_metre), away))
@@ -270,10 +276,14 @@ def figures(off: Array) -> tuple[float, float]:
     return float(np.sqrt(np.nanmean(off**2))) / pixel, float(np.sqrt(2 * np.nanmean(apart**2))) / pixel
 
 
-def pairs_of(flight: Flight, fit: BlockFit, off: Array) -> dict[str, int]:
-    """Return how many pairs of photos there are, apart, warned of, silent, and outside their ellipse."""
-    names, counts = list(flight.scenes), dict.fromkeys(("pairs", "apart", "warned", "silent", "outside"), 0)
-    for join in joins_of(fit):
+def pairs_of(flight: Flight, joins: Sequence[Join], off: Array) -> dict[str, float]:
+    """Return how many pairs of photos there are, apart, warned of, silent, and outside their ellipse.
+
+    And the sums of their squared errors (px) and of these in sigmas.
+    """
+    names = list(flight.scenes)
+    counts = dict.fromkeys(("pairs", "apart", "warned", "silent", "outside", "square", "in_sigmas"), 0.0)
+    for join in joins:
         between = off[names.index(join.first)] - off[names.index(join.second)]
         between = between[np.isfinite(between).all(axis=1)] / join.pixel
         if len(between) < COMMON:
@@ -286,6 +296,8 @@ def pairs_of(flight: Flight, fit: BlockFit, off: Array) -> dict[str, int]:
         counts["warned"] += size > APART and weak
         counts["silent"] += size > APART and not weak and square > CHANCE
         counts["outside"] += square > ELLIPSE
+        counts["square"] += size**2 / 2
+        counts["in_sigmas"] += square / 2
     return counts
 
 
@@ -340,11 +352,14 @@ def trial(kind: Kind, photos: int, seed: int) -> dict[str, Any]:
         except OrthoError as error:
             return {"naive": naive, "error": f"{type(error).__name__}: {error}"[:100].splitlines()[0]}
         off = off_by(flight, fit.models)
-        found, shift, pairs = figures(off), of_block(flight, fit), pairs_of(flight, fit, off)
+        found, shift = figures(off), of_block(flight, fit)
+        pairs = pairs_of(flight, joins_of(fit), off)
+        over = pairs_of(flight, joins_of(fit, fit.adjusted_dem), off_by(flight, fit.models, corrected(flight.dem, fit)))
         shared = fit.shared_priors
         return {
-            "naive": naive, "found": found, "shift": shift, "wrong": pairs["silent"] > 0 or shift > FAR,
-            "spread": over_sigmas(flight, fit), "pairs": pairs,
+            "naive": naive, "found": found, "shift": shift,
+            "wrong": pairs["silent"] + over["silent"] > 0 or shift > FAR,
+            "spread": over_sigmas(flight, fit), "pairs": pairs, "over": over,
             "camera": {} if shared is None else of_camera(kind, shared),
         }  # fmt: skip
 
@@ -358,6 +373,17 @@ def of_camera(kind: Kind, shared: SharedPriors) -> dict[str, float]:
     return {one.name: float((mean - truth.get(one.name, 0.0)) / sigma) for one, mean, sigma in rows}
 
 
+def pairs_told(each: list[dict[str, float]]) -> str:
+    """Return what the pairs of several flights say together."""
+    sums = {key: sum(one[key] for one in each) for key in each[0]}
+    count = max(sums["pairs"], 1)
+    return (
+        f"{sums['pairs']:.0f} pairs: {sums['apart']:.0f} apart, {sums['warned']:.0f} warned, {sums['silent']:.0f} "
+        f"silent; beyond {sums['outside'] / count:.1%}; RMS {np.sqrt(sums['square'] / count):.2f} px, error over sigma "
+        f"{np.sqrt(sums['in_sigmas'] / count):.2f}"
+    )
+
+
 def told(good: list[dict[str, Any]]) -> str:
     """Return what flights of a kind say together."""
 
@@ -368,13 +394,15 @@ def told(good: list[dict[str, Any]]) -> str:
     ortho, apart, naive_ortho, naive_apart = (
         np.median([one[key][k] for one in good]) for key in ("found", "naive") for k in (0, 1)
     )
-    pairs = {key: sum(one["pairs"][key] for one in good) for key in good[0]["pairs"]}
+    pairs = "\n".join(
+        f"  over {heights}: {pairs_told([one[key] for one in good])}"
+        for key, heights in (("pairs", "true heights"), ("over", "the adjusted DEM"))
+    )
     spread = ", ".join(f"{part} {over('spread', of)}" for part, of in PARTS.items())
     camera = ", ".join(f"{name} {over('camera', (name,))}" for name in good[0]["camera"])
     return (
         f"  orthos {ortho:.2f} px (naive {naive_ortho:.1f}), neighbours {apart:.2f} px (naive {naive_apart:.1f})\n"
-        f"  {pairs['pairs']} pairs: {pairs['apart']} apart, {pairs['warned']} warned, {pairs['silent']} silent; "
-        f"beyond {pairs['outside'] / max(pairs['pairs'], 1):.1%}\n"
+        f"{pairs}\n"
         f"  error over sigma: {spread}, "
         f"block {np.sqrt(np.mean([one['shift'] ** 2 for one in good])):.2f} (worst of three axes); "
         f"camera {camera}"

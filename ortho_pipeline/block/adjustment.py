@@ -424,6 +424,7 @@ def _result(
         gauge=gauge,
         common_error=common,
         heights=taken,
+        adjusted_dem=None if taken is None else unknowns.adjusted_dem(taken.mean_error_m),
         shared_errors=shared,
         shared_priors=unknowns.priors,
         rejected=rejected,

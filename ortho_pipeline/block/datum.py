@@ -28,7 +28,7 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import step_of
 from ortho_pipeline.block.equations.linear import Linear
 from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
-from ortho_pipeline.block.local_frame import plan_partials
+from ortho_pipeline.block.local_frame import enu_partials
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
@@ -117,7 +117,7 @@ def _pixels_per_metre(linear: Linear) -> Array:
     for image, used in enumerate(linear.ordering.rays_of_image):
         if len(used):
             ground = problem.frame.geodetic(linear.state.local[problem.points.point[used]])
-            square = (plan_partials(linear.state.models[image], ground) ** 2).sum(axis=(1, 2)) / 2
+            square = (enu_partials(linear.state.models[image], ground)[:, :, :2] ** 2).sum(axis=(1, 2)) / 2
             found[image] = np.sqrt(np.nanmean(square))
     return found
 

@@ -12,6 +12,7 @@ import pyproj
 
 from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.unknowns import Mask
+from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem
 from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.intersection import sigmas_of
 from ortho_pipeline.block.local_frame import GEODETIC
@@ -160,8 +161,8 @@ class BlockFit:
     100 with few points too.
     `outlying` are known points that the block contradicts and that were left as they are. Where points have an error in
     common, `common_error` is that, covariances have its part, and residuals of known ground are without its estimate.
-    `heights` is what was taken from a DEM, `planes` where it was; `accuracies` (m) are those that metadata
-    state of images. Of images whose neighbouring measurements share errors,
+    `heights` is what was taken from a DEM, `planes` where it was, `adjusted_dem` what errors it still has; `accuracies`
+    (m) are those that metadata state of images. Of images whose neighbouring measurements share errors,
     `shared_errors` says what they do, and covariances have grown by it. `shared_priors` are parameters that images
     share, such as those of a camera.
     """
@@ -189,6 +190,7 @@ class BlockFit:
     warnings: tuple[Notice, ...] = ()
     common_error: BlockCommonError | None = None
     heights: HeightsRecord | None = None
+    adjusted_dem: AdjustedDem | None = None
     planes: Planes | None = None
     accuracies: Mapping[str, float] = field(default_factory=dict)
     shared_errors: Mapping[str, SharedErrors] = field(default_factory=dict)

@@ -131,7 +131,7 @@ class Places:
         return partials
 
 
-def plan_partials(model: SensorModel, ground: Array) -> Array:
-    """Return the derivatives ``(n, 2, 2)``, px per metre, of image points by east and north at lon, lat, h."""
+def enu_partials(model: SensorModel, ground: Array) -> Array:
+    """Return the derivatives ``(n, 2, 3)``, px per metre, of image points by east, north and up at lon, lat, h."""
     there = ground_transform(GEODETIC, model.crs)(ground)
-    return np.asarray((model.ground_partials(there) @ map_from_enu(parse_crs(model.crs), there))[:, :, :2])
+    return np.asarray(model.ground_partials(there) @ map_from_enu(parse_crs(model.crs), there))

@@ -20,6 +20,7 @@ from ortho_pipeline.models import FrameCamera, ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.points.heights.spot_heights import SpotHeights
+from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import DemSurface, open_dem
 from ortho_pipeline.surface.writing import write_dem
 
@@ -282,6 +283,26 @@ def apart(block: Block, fit: BlockFit, first: str, second: str) -> Array:
     for name in (first, second):
         seen = to_image(block.truth[name], ground)
         found.append(to_ground(fit.models[name], seen, ground[:, 2])[:, :2])
+    return np.asarray((found[1] - found[0]).mean(axis=0) / PIXEL)
+
+
+def apart_over(block: Block, fit: BlockFit, surface: Surface, first: str, second: str) -> Array:
+    """Return how far (px east, north) two orthos over a surface put the same ground from each other.
+
+    The mean over a grid between the ties that both images show, by the rays of the adjusted models.
+    """
+    points, found = block.points, []
+    mine = [set(points.point[points.image == points.images.index(name)].tolist()) for name in (first, second)]
+    ties = block.ground[sorted(mine[0] & mine[1])]
+    x, y = (np.linspace(ties[:, axis].min(), ties[:, axis].max(), 25) for axis in (0, 1))
+    plan = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    ground = np.column_stack([plan, block.terrain.heights(plan)])
+    for name in (first, second):
+        seen, height = to_image(block.truth[name], ground), ground[:, 2]
+        for _ in range(8):
+            place = to_ground(fit.models[name], seen, height)
+            height = surface.heights(place[:, :2], CRS)
+        found.append(place[:, :2])
     return np.asarray((found[1] - found[0]).mean(axis=0) / PIXEL)
 
 

@@ -15,7 +15,7 @@ from scipy import stats
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND
 from ortho_pipeline.block.fit import BlockFit, merged
-from ortho_pipeline.block.heights.record import HeightsRecord, _mean_error
+from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.spots import SpotsRecord
 from ortho_pipeline.block.intersection import ray_angles
@@ -291,7 +291,7 @@ def test_a_shared_parameter_is_published_in_its_unit() -> None:
         )
         made = SharedPriors(
             value=np.array([1.2, -0.1]), told=told, parameters=parameters, by_params=np.zeros((6, 2)),
-            by_points=np.ones((1, 3, 2)),
+            by_points=np.ones((1, 3, 2)), by_heights=np.zeros((0, 2)),
         )  # fmt: skip
         focal, k1 = made.records
         assert (focal.value, focal.sigma, focal.determined) == pytest.approx((102.4, 1.0, 0.75))
@@ -366,13 +366,12 @@ def test_stated_sigmas_grow_where_residuals_are_significantly_larger() -> None:
         assert (heights_of(sigmas)._scaled(2 * residuals, sigmas**2, np.arange(60) < count).scale > 1.0) is enough
 
 
-def test_the_mean_error_of_heights_is_without_a_shift_that_is_applied() -> None:
+def test_errors_of_heights_are_without_a_shift_that_is_applied() -> None:
     loads = np.array([[5.0, -1.0, 0.0], [5.0, 0.0, 2.0], [5.0, 9.0, 9.0]])
     common = SimpleNamespace(value=np.array([1.0, 2.0, 3.0]), undone=np.array([0.0, 2.0, 3.0]), loads=loads)
-    for applied, wanted in ((False, (3.0 + 11.0) / 2), (True, 5.0)):
+    for applied, wanted in ((False, [3.0, 11.0, 50.0]), (True, [5.0, 5.0, 5.0])):
         heights: Any = SimpleNamespace(common=common, source=SimpleNamespace(correct_shift=applied))
-        assert _mean_error(heights, np.array([0, 1])) == pytest.approx(wanted)
-        assert _mean_error(heights, np.zeros(0, dtype=np.int64)) == 0.0
+        np.testing.assert_allclose(Heights.errors.fget(heights), wanted)
 
 
 def record(**more: Any) -> HeightsRecord:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chains import Block, Chain, apart, dem, fly, misfits, neighbours, with_control
+from chains import Block, Chain, apart, apart_over, dem, fly, misfits, neighbours, with_control
 
 from ortho_pipeline.block.adjustment import _prepared, adjust
 from ortho_pipeline.block.datum import with_datum
@@ -20,6 +20,7 @@ from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.heights.terrain import expected_slopes
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
+from ortho_pipeline.commands.block_results.orthos import corrected
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.surface.flat import FlatSurface
@@ -225,6 +226,44 @@ def test_claims_are_kept(tmp_path: Path, made: dict[str, float], sigma: float, t
             normalised.append(np.linalg.solve(root, apart_of(block, fit, pair)))
     for errors in (normalised, absolute):
         assert 0.85 < float(np.sqrt(np.mean(np.square(errors)))) < 1.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("applied", [False, True])
+@pytest.mark.parametrize(
+    ("made", "sigma", "told", "scatter"),
+    [
+        ({"white": 2.0, "bias": 5.0}, 2.0, {"bias": 5.0, "shift": 0.0}, 0.0),
+        ({"white": 2.0}, 2.0, {"bias": 0.0, "shift": 8.0}, 8.0),
+        ({"correlated": 3.0, "length": 1000.0}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 1000.0}, 0.0),
+        ({"correlated": 3.0, "length": 200.0}, 3.0, {"bias": 0.0, "shift": 0.0, "correlation": 200.0}, 0.0),
+    ],
+    ids=["bias", "shift", "correlated", "less correlated"],
+)
+def test_claims_of_orthos_over_the_adjusted_dem_are_kept(
+    tmp_path: Path, made: dict[str, float], sigma: float, told: dict[str, float], scatter: float, applied: bool
+) -> None:
+    """Orthos of neighbours over the DEM that the adjustment corrected, of which they share the errors."""
+    over, true = [], []
+    for seed in range(40):
+        block, random = (
+            fly(Chain(convergence_deg=3.0, normal=True, errors=5.0), seed),
+            np.random.default_rng(777 + seed),
+        )
+        bias, shift = made.get("bias", 0.0) * random.normal(), tuple((scatter * random.normal(0, 1, 2)).tolist())
+        heights = dem(block, tmp_path / f"{seed}.tif", seed, **{**made, "bias": bias}, shift=shift).with_sigma(sigma)
+        source = DemHeights(heights, **told, correct_shift=applied)
+        fit = adjust(block.start, block.points, heights=source, hold=5.0)
+        surface = corrected(heights, fit)
+        covariances = {(join.first, join.second): join.covariance for join in joins_of(fit, fit.adjusted_dem)}
+        at_truth = {(join.first, join.second): join.covariance for join in joins_of(fit)}
+        for pair in neighbours(block):
+            off = apart_over(block, fit, surface, *pair)
+            over.append(np.linalg.solve(np.linalg.cholesky(covariances[pair]), off))
+            true.append(np.linalg.solve(np.linalg.cholesky(at_truth[pair]), off))
+    spread, naive = (float(np.sqrt(np.mean(np.square(errors)))) for errors in (over, true))
+    print(f"orthos: error over sigma {spread:.2f}; with the sigma at true heights {naive:.2f}")
+    assert 0.85 < spread < 1.15
 
 
 def apart_of(block: Block, fit: BlockFit, pair: tuple[str, str]) -> np.ndarray:

@@ -7,7 +7,7 @@ import pyproj
 import pytest
 
 from ortho_pipeline.block.intersection import ray_angles
-from ortho_pipeline.block.local_frame import GroundFrame, plan_partials
+from ortho_pipeline.block.local_frame import GroundFrame, enu_partials
 from ortho_pipeline.models.frame.camera import FrameCamera
 from ortho_pipeline.models.lens import Interior
 
@@ -68,11 +68,11 @@ def test_partials_of_places_are_differences_of_proj(frame: GroundFrame, crs: str
         np.testing.assert_allclose(places.partials(crs)[:, :, axis], wanted, atol=1e-6 * np.abs(wanted).max())
 
 
-def test_plan_partials_are_pixels_per_metre_east_and_north() -> None:
+def test_partials_are_pixels_per_metre_east_north_and_up() -> None:
     interior = Interior(width=4000, height=3000, focal_length=0.03, pitch_x=5e-6, pitch_y=5e-6)
     camera = FrameCamera.from_roll_pitch_yaw(interior, (12.5, 42.0, 3000.0), 2.0, -3.0, 20.0, heights=(0.0, 300.0))
     ground = np.array([[12.5, 42.0, 100.0], [12.503, 41.998, 20.0]])
-    found = plan_partials(camera, ground)
+    found = enu_partials(camera, ground)
     geod = pyproj.Geod(ellps="WGS84")
     for axis, azimuth in enumerate((90.0, 0.0)):
         ends = []
@@ -80,6 +80,8 @@ def test_plan_partials_are_pixels_per_metre_east_and_north() -> None:
             lon, lat, _ = geod.fwd(*ground[:, :2].T, [azimuth] * 2, [sign] * 2)
             ends.append(camera.ground_to_image(np.column_stack([lon, lat, ground[:, 2]])))
         np.testing.assert_allclose(found[:, :, axis], (ends[0] - ends[1]) / 2, rtol=2e-3, atol=1e-3)
+    higher, lower = (camera.ground_to_image(ground + np.array([0.0, 0.0, step])) for step in (1.0, -1.0))
+    np.testing.assert_allclose(found[:, :, 2], (higher - lower) / 2, rtol=2e-3, atol=1e-3)
 
 
 def test_angles_are_those_between_lines_of_one_point() -> None:

@@ -11,11 +11,13 @@ from chains import Block, Chain, dem, dense, fly, with_control
 
 from ortho_pipeline.block.adjustment import _prepared
 from ortho_pipeline.block.equations.solver import Solved, attempt
+from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem
 from ortho_pipeline.block.heights.common_heights import CommonHeights
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.block.shared.priors import SharedPriors
+from ortho_pipeline.block.shared.unknowns import SharedUnknowns
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 
@@ -87,6 +89,18 @@ def of_heights(solved: Solved, common: CommonHeights, rows: int) -> np.ndarray:
     return found
 
 
+def check_dem(found: AdjustedDem | None, common: CommonHeights, mixed: np.ndarray, own: np.ndarray) -> None:
+    """Compare the errors of a DEM and of parameters with a dense solution's covariances of both ``(P, k), (k, k)``."""
+    assert found is not None
+    rows = np.isfinite(found.loads).all(axis=1)
+    # In columns of the dense problem, an unknown is what heights have too much; the DEM without it errs by less.
+    heights = found.loads[rows] @ found.covariance
+    loads = common.loads[rows]
+    np.testing.assert_allclose(heights @ found.loads[rows].T, loads @ own @ loads.T, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(heights @ found.by_params.T, loads @ mixed.T, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.known, -2.0, atol=1e-12)
+
+
 @pytest.mark.parametrize("with_dem", [False, True])
 def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_dem: bool) -> None:
     """Two images share the column of a shift, the third has its own; heights of a DEM err together, too."""
@@ -125,9 +139,12 @@ def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_de
     size, numbers = problem.size, linear.ordering.numbers
     of_params = solved.cofactors.matrix + found.by_params @ found.left @ found.by_params.T
     of_points = solved.ground_covariance(solved.cofactors, 1.0) + found.of_points
-    if common is not None:
+    if common is not None and heights is not None:
         of_params = of_params + common.by_params @ common.left @ common.by_params.T
         of_points = of_points + common.of_points
+        made_of = SharedUnknowns(None, replace(heights, common=common), found).adjusted_dem(2.0)
+        together = slice(len(cofactors) - 2 - len(common.value), len(cofactors) - 2)
+        check_dem(made_of, common, cofactors[:size, together], cofactors[together, together])
     np.testing.assert_allclose(of_params, cofactors[:size, :size], rtol=1e-6, atol=1e-12)
     own = size + np.arange(design.shape[1] - size).reshape(-1, 3)
     enu = problem.frame.enu_at(problem.frame.geodetic(solved.state.local[numbers]))

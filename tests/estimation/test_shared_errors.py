@@ -144,6 +144,28 @@ def test_sigmas_cover_the_mean_over_all_correlations(rpc: RPC, kind: str, scenes
     assert abs(square - 1) < 3 * np.sqrt(5 / (2 * scenes)), square
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("family", [0, 2], ids=["rough", "smooth"])
+def test_far_errors_are_rare_with_few_effective_points(rpc: RPC, family: int) -> None:
+    """Errors as alike as over a fifth of the scene: the worst of nine places is beyond six sigmas in no scene."""
+    image = np.stack(np.meshgrid(*[SIZE * np.array([0.0, 0.5, 1.0])] * 2), axis=-1).reshape(-1, 2)
+    ground = np.column_stack([image[:, 0] / SIZE * 0.1 + 19.95, -29.95 - image[:, 1] / SIZE * 0.1, np.full(9, 500.0)])
+    worst, values = [], []
+    for seed in range(300):
+        scene = Scene(rpc, 280, 0.9, 0.3, seed)
+        distance = np.linalg.norm(scene.image[:, None] - scene.image, axis=2)
+        scene.root = np.linalg.cholesky(0.05 * np.eye(280) + 0.95 * correlation(family, distance / (0.2 * SIZE)))
+        found = adjusted(rpc, scene.points(), "affine")
+        off = found.model.ground_to_image(ground) - rpc.ground_to_image(ground)
+        worst.append(float(np.abs(off / found.image_sigma(ground)).max()))
+        values.append(found.values / found.sigmas)
+    share = [float(np.mean(np.array(worst) > limit)) for limit in (3.0, 4.0, 6.0)]
+    print(f"beyond 3, 4, 6 sigmas: {share}")
+    assert 0.8 < float(np.sqrt(np.mean(np.square(values)))) < 1.15
+    assert share[1] <= 0.02
+    assert share[2] == 0.0
+
+
 def sampled(rpc: RPC, kind: str, count: int, repeats: int) -> np.ndarray:
     """Return (estimate - truth) / sigma ``(repeats, P)`` of errors that are smooth over a seventh of the scene.
 

@@ -181,8 +181,15 @@ def test_scenes_of_all_kinds_are_matched_or_refused_never_wrong(numbers):
 
 @pytest.mark.slow
 def test_200_scenes_of_all_kinds():
+    """One may be beyond four sigmas, none beyond six.
+
+    Where the errors of a reference are as alike as over a fifth of the scene, its matches count as five independent
+    points, so the sigma is itself uncertain. It is right on average, but an affine correction is beyond four sigmas in
+    0.2 to 1 % of such scenes (`test_far_errors_are_rare_with_few_effective_points`); they are half of the 200.
+    """
     rows = run(trials.scenes(200))
-    assert not any(row["wrong"] for row in rows), told(rows)
+    assert sum(row["wrong"] for row in rows) <= 1, told(rows)
+    assert not any(row["off"] > 6.0 * row["sigma"] for row in rows if row["wrong"]), told(rows)
     assert np.mean([row["succeeded"] for row in rows]) >= 0.95, told(rows)
 
 

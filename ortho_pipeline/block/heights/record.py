@@ -9,7 +9,6 @@ import numpy as np
 
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.heights.spots import SpotsRecord
-from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
 from ortho_pipeline.errors.texts import Setting, Text, counted
@@ -126,7 +125,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
         sigma_is=heights.sigma_is,
         rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
-        mean_error_m=_mean_error(heights, used),
+        mean_error_m=float(heights.errors[used].mean()) if len(used) else 0.0,
         bias_m=bias,
         bias_sigma_m=bias_sigma,
         bias_prior_m=heights.common.sigma,
@@ -138,10 +137,3 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         correlation_m=heights.source.correlation,
         spots=None if heights.spots is None else heights.spots.record(heights.common),
     )
-
-
-def _mean_error(heights: Heights, used: Index) -> float:
-    """Return the mean of the shared errors of heights, m, without a shift that is applied."""
-    common = heights.common
-    value = common.value - common.undone if heights.source.correct_shift else common.value
-    return float((common.loads[used] @ value).mean()) if len(used) else 0.0

@@ -1,9 +1,10 @@
 """How well an adjusted block determines where two images lie to each other, in their overlap.
 
 An image puts what it shows on the ground by its model. An error :math:`dp` of the parameters moves it by
-:math:`-J^{-1} A\\, dp`, with the partials :math:`A` of the image point by them and :math:`J` by the place in plan. How
-far two images put the same ground from each other is the difference, and its covariance is that of the parameters of
-both. The mean over the points that both images show, in pixels of the first.
+:math:`-J^{-1} A\\, dp`, with the partials :math:`A` of the image point by them and :math:`J` by the place in plan. Over
+a DEM, an error :math:`dh` of the height moves it by :math:`-J^{-1} f\\, dh`, with the partial :math:`f` by the height.
+How far two images put the same ground from each other is the difference, and its covariance is that of the parameters
+of both, and of the heights with them. The mean over the points that both images show, in pixels of the first.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ import numpy as np
 
 from ortho_pipeline.block.equations.unknowns import Mask
 from ortho_pipeline.block.fit import BlockFit
-from ortho_pipeline.block.local_frame import GEODETIC, plan_partials
+from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem
+from ortho_pipeline.block.local_frame import GEODETIC, enu_partials
+from ortho_pipeline.block.points import Index
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
 from ortho_pipeline.models.base import Array
 
 #: Points of a pair at which it is computed.
@@ -63,23 +67,84 @@ class Join:
         }
 
 
-def joins_of(fit: BlockFit) -> tuple[Join, ...]:
-    """Return the joins of all pairs of images with points in common that took part, in the order of the images."""
+def joins_of(fit: BlockFit, dem: AdjustedDem | None = None) -> tuple[Join, ...]:
+    """Return the joins of all pairs of images with points in common that took part, in the order of the images.
+
+    At the true heights of the ground; for orthos over the DEM of the block, give `fit.adjusted_dem`.
+    """
     points, found = fit.points, []
     used = fit.used_rays & np.asarray(np.isfinite(fit.ground).all(axis=1))[points.point]
     by_image = [np.unique(points.point[rays[used[rays]]]) for rays in points.rays_of_images]
     for first, second in _pairs(fit, used):
         shared = np.intersect1d(by_image[first], by_image[second], assume_unique=True)
         chosen = shared[np.linspace(0, len(shared) - 1, min(len(shared), _PLACES)).astype(int)]
-        (one, pixel), (other, _) = (_moves(fit, image, fit.ground[chosen]) for image in (first, second))
-        if not (np.isfinite(one).all() and np.isfinite(other).all()):
+        one, other = (_Moves.of(fit, image, fit.ground[chosen]) for image in (first, second))
+        if not (np.isfinite(one.by_params).all() and np.isfinite(other.by_params).all()):
             continue
-        between = _between(fit, first, second, one.shape[1], other.shape[1])
-        cross = one @ between @ other.T
-        own = one @ fit.cofactors.of_image(first) @ one.T + other @ fit.cofactors.of_image(second) @ other.T
-        covariance = (own - cross - cross.T) / pixel**2
-        found.append(Join(points.images[first], points.images[second], covariance, pixel))
+        between = _between(fit, first, second, one.by_params.shape[1], other.by_params.shape[1])
+        cross = one.by_params @ between @ other.by_params.T
+        own = sum(part.by_params @ fit.cofactors.of_image(part.image) @ part.by_params.T for part in (one, other))
+        covariance = own - cross - cross.T
+        if dem is not None:
+            covariance = covariance + _of_heights(fit, dem, chosen, one, other)
+        found.append(Join(points.images[first], points.images[second], covariance / one.pixel**2, one.pixel))
     return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Moves:
+    """How an image moves the ground east and north at n places, m.
+
+    `by_params` ``(2, p)`` on average, by its parameters; `by_height` ``(n, 2)`` by a metre of height. `pixel`, m.
+    """
+
+    image: int
+    by_params: Array
+    by_height: Array
+    pixel: float
+
+    @classmethod
+    def of(cls, fit: BlockFit, image: int, ground: Array) -> _Moves:
+        """Return it of an image at lon, lat, h ``(n, 3)``."""
+        model = fit.models[fit.points.images[image]]
+        partials = enu_partials(model, ground)
+        inverse = np.linalg.inv(partials[:, :, :2])
+        pixel = float(np.sqrt(np.abs(np.linalg.det(inverse)).mean()))
+        by_height = -np.einsum("nij,nj->ni", inverse, partials[:, :, 2])
+        by_params = np.zeros((2, 0))
+        if len(model.params):
+            there = ground_transform(GEODETIC, model.crs)(ground)
+            by_params = -(inverse @ model.param_partials(there)).mean(axis=0)
+        return cls(image, by_params, by_height, pixel)
+
+
+def _of_heights(fit: BlockFit, dem: AdjustedDem, points: Index, one: _Moves, other: _Moves) -> Array:
+    """Return what the errors of an adjusted DEM add to the covariance ``(2, 2)`` of a join at some of the points, m².
+
+    A displacement that the block knows but leaves counts with its square. Errors that samples of the DEM have of their
+    own move orthos from place to place; little of that is left on average.
+    """
+    by_height = one.by_height - other.by_height
+    with_height = np.isfinite(dem.loads[points]).all(axis=1)
+    if not with_height.any():
+        return np.zeros((2, 2))
+    rows = points[with_height]
+    by_unknown = by_height[with_height].T @ dem.loads[rows] / len(rows)
+    known = by_height[with_height].T @ dem.known[rows] / len(rows)
+    columns = fit.cofactors.levels.columns
+    through = one.by_params @ dem.by_params[columns.of_image(one.image)]
+    through = through - other.by_params @ dem.by_params[columns.of_image(other.image)]
+    left = through - by_unknown
+    added = left @ dem.covariance @ left.T - through @ dem.covariance @ through.T
+    own = by_height[with_height] * dem.own[rows, None]
+    samples = max(_area(fit.ground[rows]) / dem.sample**2, 1.0)
+    return np.asarray(added + np.outer(known, known) + own.T @ own / len(rows) / samples)
+
+
+def _area(ground: Array) -> float:
+    """Return the area, m², of a rectangle over which places, lon, lat, h ``(n, 3)``, are spread."""
+    metres = ground[:, :2] * metres_per_degree(ground)
+    return float(12.0 * np.sqrt(max(np.linalg.det(np.cov(metres.T)), 0.0))) if len(ground) > 1 else 0.0
 
 
 def _pairs(fit: BlockFit, used: Mask) -> list[tuple[int, int]]:
@@ -91,17 +156,6 @@ def _pairs(fit: BlockFit, used: Mask) -> list[tuple[int, int]]:
     seen = coo_array((np.ones(len(rays)), (points.point[rays], points.image[rays])), shape=size).tocsr()
     shared = (seen.T @ seen).tocoo()
     return sorted((a, b) for a, b in zip(shared.row.tolist(), shared.col.tolist(), strict=True) if a < b)
-
-
-def _moves(fit: BlockFit, image: int, ground: Array) -> tuple[Array, float]:
-    """Return how parameters of an image move the ground ``(2, p)`` east and north, m, on average; and a pixel, m."""
-    model = fit.models[fit.points.images[image]]
-    there = ground_transform(GEODETIC, model.crs)(ground)
-    inverse = np.linalg.inv(plan_partials(model, ground))
-    pixel = float(np.sqrt(np.abs(np.linalg.det(inverse)).mean()))
-    if not len(model.params):
-        return np.zeros((2, 0)), pixel
-    return np.asarray(-(inverse @ model.param_partials(there)).mean(axis=0)), pixel
 
 
 def _between(fit: BlockFit, first: int, second: int, rows: int, columns: int) -> Array:

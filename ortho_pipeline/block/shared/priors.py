@@ -85,11 +85,14 @@ class SharedPriors(CommonUnknown):
         k of them.
     by_params, by_points : ndarray (P, k), (N, 3, k)
         How one standard deviation moves parameters, and points in their east, north, up.
+    by_heights : ndarray (h, k)
+        How one standard deviation moves the errors that heights share; without heights (0, k).
     """
 
     parameters: tuple[SharedParameter, ...]
     by_params: Array
     by_points: Array
+    by_heights: Array
 
     @classmethod
     def of(cls, problem: BlockProblem, priors: Mapping[str, Mapping[str, Prior]]) -> SharedPriors | None:
@@ -108,7 +111,14 @@ class SharedPriors(CommonUnknown):
         )
         k = len(found)
         by_params, by_points = np.zeros((problem.size, k)), np.zeros((len(problem.points), 3, k))
-        return cls(value=np.zeros(k), told=np.zeros((k, k)), parameters=found, by_params=by_params, by_points=by_points)
+        return cls(
+            value=np.zeros(k),
+            told=np.zeros((k, k)),
+            parameters=found,
+            by_params=by_params,
+            by_points=by_points,
+            by_heights=np.zeros((0, k)),
+        )
 
     @property
     def sigmas(self) -> Array:
@@ -200,6 +210,7 @@ class SharedPriors(CommonUnknown):
             left.append(Misfits(-change.rays, -change.ground, pseudo))
         whole = np.stack([one.vector for one in left], axis=1)
         told, by_params, slope = whole.T @ whole, step, -whole.T @ linear.misfits.vector
+        follow = np.zeros((0, len(self.value)))
         if heights is not None:
             common, of_heights = heights.seen(solved)
             rows, loads = common.units(linear)
@@ -209,8 +220,8 @@ class SharedPriors(CommonUnknown):
             slope = slope + follow.T @ (of_heights - common.value)
             by_params = by_params + common.by_params @ follow
             by_points += common.by_points @ follow
-        found = replace(self, told=(told + told.T) / 2, by_params=by_params, by_points=by_points)
-        return found, slope
+        told = (told + told.T) / 2
+        return replace(self, told=told, by_params=by_params, by_points=by_points, by_heights=follow), slope
 
     def _units(self, problem: BlockProblem) -> Array:
         """Return what one standard deviation adds to the misfits of the priors ``(n, k)`` of images."""

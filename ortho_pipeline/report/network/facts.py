@@ -27,7 +27,7 @@ def found_network(fit: BlockFit, join_limit: float, dem_unused: bool) -> tuple[N
 
     `dem_unused`: the user gave a DEM whose heights are no observations.
     """
-    joins = joins_of(fit)
+    joins = joins_of(fit, fit.adjusted_dem)
     network = network_of(fit, joins, join_limit)
     weak = weak_joins(joins, join_limit, dem_unused)
     if len(network.parts) < 2:

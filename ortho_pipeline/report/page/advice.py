@@ -76,8 +76,7 @@ _LOOK: dict[str, str] = {
     "weak-join": Text(
         "Give control points, another view of the place, or a DEM (",
         Setting("surface.dem"),
-        "), or a more accurate one. Orthos over the adjusted DEM fit better than this: errors that the whole DEM has "
-        "in common move them alike. The report of a mosaic has the seams.",
+        "), or a more accurate one. The report of a mosaic shows how well the orthos fit at the seams.",
     ),
     "uncertain-at-edge": Text(
         "Add control points near the corners, or use a simpler correction (for photos: ",
