@@ -150,11 +150,11 @@ def adjust(
     solved, found, shared = _weighed(solved, inside, shared)
     inside = solved.without_astray(inside)
     notes += _without(points, ~_among(points, set(exclude)) & ~problem.active(inside) & ~judged)
-    notes += found.variances.notes()
-    notes += marks_warning(points.select(problem.active(inside) & inside.ground))
+    notes += [*found.variances.notes(), *marks_warning(points.select(problem.active(inside) & inside.ground))]
     notes += uncertain_images(solved, stated)
     fit = _result(solved, found, shared, inside, points, order, chosen, gauge, rejected, notes)
-    return replace(fit, planes=solved.problem.heights, accuracies=stated_by)
+    adjusted = shared.adjusted_dem(fit.heights)
+    return replace(fit, planes=solved.problem.heights, adjusted_dem=adjusted, accuracies=stated_by)
 
 
 def _first(
@@ -424,7 +424,6 @@ def _result(
         gauge=gauge,
         common_error=common,
         heights=taken,
-        adjusted_dem=None if taken is None else unknowns.adjusted_dem(taken.mean_error_m),
         shared_errors=shared,
         shared_priors=unknowns.priors,
         rejected=rejected,

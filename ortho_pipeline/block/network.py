@@ -23,7 +23,8 @@ class ImagePairRecord(Record):
     """Two images, the number of points that both have rays of, and the median angle between these rays.
 
     `sigma_px` and `sigma_m` are the standard deviation of their relative position along `azimuth_deg`, where it is
-    largest: of orthos over the adjusted DEM, or without heights of a DEM at the true height of the ground. The pair is `weak` if it exceeds the limit.
+    largest: of orthos over the adjusted DEM, or without heights of a DEM at the true height of the ground. The pair is
+    `weak` if it exceeds the limit.
     """
 
     first: str

@@ -15,6 +15,7 @@ from scipy import stats
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND
 from ortho_pipeline.block.fit import BlockFit, merged
+from ortho_pipeline.block.heights.adjusted_dem import known_errors
 from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.spots import SpotsRecord
@@ -371,7 +372,7 @@ def test_errors_of_heights_are_without_a_shift_that_is_applied() -> None:
     common = SimpleNamespace(value=np.array([1.0, 2.0, 3.0]), undone=np.array([0.0, 2.0, 3.0]), loads=loads)
     for applied, wanted in ((False, [3.0, 11.0, 50.0]), (True, [5.0, 5.0, 5.0])):
         heights: Any = SimpleNamespace(common=common, source=SimpleNamespace(correct_shift=applied))
-        np.testing.assert_allclose(Heights.errors.fget(heights), wanted)
+        np.testing.assert_allclose(known_errors(heights), wanted)
 
 
 def record(**more: Any) -> HeightsRecord:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -20,6 +22,9 @@ from ortho_pipeline.block.shared.priors import SharedPriors
 from ortho_pipeline.block.shared.unknowns import SharedUnknowns
 from ortho_pipeline.estimation.observations.prior import Prior
 from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.heights.record import HeightsRecord
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +147,9 @@ def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_de
     if common is not None and heights is not None:
         of_params = of_params + common.by_params @ common.left @ common.by_params.T
         of_points = of_points + common.of_points
-        made_of = SharedUnknowns(None, replace(heights, common=common), found).adjusted_dem(2.0)
+        made_of = SharedUnknowns(None, replace(heights, common=common), found).adjusted_dem(
+            cast("HeightsRecord", SimpleNamespace(mean_error_m=2.0))
+        )
         together = slice(len(cofactors) - 2 - len(common.value), len(cofactors) - 2)
         check_dem(made_of, common, cofactors[:size, together], cofactors[together, together])
     np.testing.assert_allclose(of_params, cofactors[:size, :size], rtol=1e-6, atol=1e-12)

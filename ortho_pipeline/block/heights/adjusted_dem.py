@@ -9,8 +9,15 @@ With :math:`u`, the errors of these unknowns, the adjusted heights err by :math:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ortho_pipeline.models.base import Array
+
+if TYPE_CHECKING:
+    from ortho_pipeline.block.heights.settling import Heights
+    from ortho_pipeline.block.shared.priors import SharedPriors
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,3 +46,30 @@ class AdjustedDem:
     covariance: Array
     own: Array
     sample: float
+
+    @classmethod
+    def of(cls, heights: Heights, priors: SharedPriors | None, mean: float) -> AdjustedDem:
+        """Return it of heights that were adjusted with parameters that images share, less a mean (m)."""
+        common = heights.common
+        loads, by_params, covariance = common.loads, common.by_params, common.left
+        if priors is not None:
+            none = np.zeros((len(common.left), len(priors.value)))
+            loads = np.hstack([loads, loads @ priors.by_heights])
+            by_params = np.hstack([by_params, priors.by_params])
+            covariance = np.block([[covariance, none], [none.T, priors.left]])
+        with_height = heights.of & np.isfinite(heights.terrain.heights)
+        return cls(
+            known=known_errors(heights) - mean,
+            loads=np.where(with_height[:, None], loads, np.nan),
+            by_params=by_params,
+            covariance=covariance,
+            own=heights.sigmas * np.sqrt(heights.own),
+            sample=heights.source.surface.sample_size,
+        )
+
+
+def known_errors(heights: Heights) -> Array:
+    """Return estimates ``(N,)`` of the errors that heights share, m; a shift that later products correct is none."""
+    common = heights.common
+    value = common.value - common.undone if heights.source.correct_shift else common.value
+    return np.asarray(common.loads @ value)

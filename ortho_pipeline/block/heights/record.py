@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ortho_pipeline.block.equations.solver import Solved
+from ortho_pipeline.block.heights.adjusted_dem import known_errors
 from ortho_pipeline.block.heights.spots import SpotsRecord
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import metres
@@ -125,7 +126,7 @@ def record_of(heights: Heights, solved: Solved) -> HeightsRecord:
         sigma_m=float(np.sqrt(np.mean(known**2))) if len(known) else heights.sigma,
         sigma_is=heights.sigma_is,
         rms_m=float(np.sqrt(np.mean(apart**2))) if len(used) else None,
-        mean_error_m=float(heights.errors[used].mean()) if len(used) else 0.0,
+        mean_error_m=float(known_errors(heights)[used].mean()) if len(used) else 0.0,
         bias_m=bias,
         bias_sigma_m=bias_sigma,
         bias_prior_m=heights.common.sigma,

@@ -136,17 +136,6 @@ class Heights:
         return replace(heights, spots=spots.with_loads(bias, source.shift_sigma, shared[len(rows) :], left_there))
 
     @property
-    def errors(self) -> Array:
-        """Estimates ``(N,)`` of the errors that heights share, m; a shift that later products correct is none."""
-        common = self.common
-        return np.asarray(common.loads @ (common.value - common.undone if self.source.correct_shift else common.value))
-
-    @property
-    def own_sigmas(self) -> Array:
-        """Sigmas ``(N,)`` of the errors that heights do not share, m upwards."""
-        return self.sigmas * np.sqrt(self.own)
-
-    @property
     def sigmas(self) -> Array:
         """Sigmas ``(N,)`` of the heights, m upwards."""
         return np.full(len(self.of), self.sigma) if self.stated is None else self.scale * self.stated
@@ -157,7 +146,7 @@ class Heights:
 
     def _planes(self, problem: BlockProblem, of: Mask) -> Planes:
         """Return the planes under points of a mask ``(N,)``."""
-        return self.terrain.planes(problem, of, self.own_sigmas, self.common.offset)
+        return self.terrain.planes(problem, of, self.sigmas * np.sqrt(self.own), self.common.offset)
 
     def _under(self, problem: BlockProblem, local: Array) -> Heights:
         """Return them with the DEM under points at `local` ``(N, 3)``."""
@@ -258,7 +247,7 @@ class Heights:
         # All along the normal; `upright` is its share of the vertical.
         normal = planes.axes[:, 2]
         of_points = np.einsum("nc,ncd,nd->n", normal, solved.points.ground(solved.cofactors, 1.0), normal)
-        upright = np.where(planes.on, planes.sigmas / self.own_sigmas, 1.0)
+        upright = np.where(planes.on, planes.sigmas / (self.sigmas * np.sqrt(self.own)), 1.0)
         weighed, single = planes.sigmas**2, (upright * self.sigmas) ** 2
         # A height that shares samples with others weighs less than by its own variance.
         shared = np.maximum(weighed - single, 0.0)

@@ -10,6 +10,7 @@ from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import NEAR, Solved
 from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem
+from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.shared.common_error import BlockCommonError
 from ortho_pipeline.block.shared.priors import SharedPriors
@@ -53,22 +54,11 @@ class SharedUnknowns:
             solved, priors, heights = priors.settled(solved, selection, heights)
         return solved, SharedUnknowns(error, heights, priors)
 
-    def adjusted_dem(self, mean: float) -> AdjustedDem | None:
-        """Return the errors of the DEM less their `mean` (m), as orthos use it; None without heights."""
-        heights, priors = self.heights, self.priors
-        if heights is None:
+    def adjusted_dem(self, record: HeightsRecord | None) -> AdjustedDem | None:
+        """Return the errors of the DEM as orthos use it, less the mean of the record; None without heights."""
+        if self.heights is None or record is None:
             return None
-        common = heights.common
-        loads, by_params, covariance = common.loads, common.by_params, common.left
-        if priors is not None:
-            none = np.zeros((len(common.left), len(priors.value)))
-            loads = np.hstack([loads, loads @ priors.by_heights])
-            by_params = np.hstack([by_params, priors.by_params])
-            covariance = np.block([[covariance, none], [none.T, priors.left]])
-        without = ~(heights.of & np.isfinite(heights.terrain.heights))
-        loads = np.where(without[:, None], np.nan, loads)
-        sample = heights.source.surface.sample_size
-        return AdjustedDem(heights.errors - mean, loads, by_params, covariance, heights.own_sigmas, sample)
+        return AdjustedDem.of(self.heights, self.priors, record.mean_error_m)
 
     def added(self, covariance: Cofactors) -> tuple[Cofactors, Array, Array]:
         """Return a covariance of the parameters with their parts, and the parts ``(N, 3, 3)`` of that of the ground.
