@@ -21,8 +21,8 @@ from ortho_pipeline.models.base import Array
 from ortho_pipeline.raster.regridded import Regridded
 from ortho_pipeline.raster.source import Grid
 
-#: Side (coarse px) of a window, and the most values of all windows together (float32: 48 MB).
-_SIDE, _VALUES = 256, 12_000_000
+#: Side (coarse px) of a window, and the most values of all windows together (float32: 12 MB).
+_SIDE, _VALUES = 128, 3_000_000
 #: Fewest pixels with a value in both orthos, for each weight.
 _FEWEST = 10
 
