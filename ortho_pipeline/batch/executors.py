@@ -20,7 +20,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar, cast
 
 from ortho_pipeline.errors import InputError, OrthoError
-from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text, installing
 from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.runtime.process_limits import print_no_error_twice, require_memory, startable_threads
 
@@ -378,7 +378,7 @@ def dask_executor(scheduler: str) -> Any:
         raise InputError(
             "dask is not installed",
             field="scheduler",
-            remedy="run pip install '.[dask]' in the source folder of ortho-pipeline",
+            remedy=installing("dask"),
         ) from error
     try:
         client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)

@@ -14,7 +14,7 @@ from html import escape
 from typing import Any
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text, installing
 
 #: Variables of the page and what they are outside of it.
 _COLOURS = {"control": "#2563a8", "check": "#b4500b", "paper": "#ffffff", "ink": "#1b1f24", "stop": "#b3261e"}
@@ -176,9 +176,7 @@ class Drawing:
             raise InputError(
                 "PNG output needs matplotlib, which is not installed",
                 field="kind",
-                remedy=Text(
-                    "run pip install '.[plots]' in the source folder of ortho-pipeline, or use ", Setting("kind", "svg")
-                ),
+                remedy=Text(f"{installing('plots')}, or use ", Setting("kind", "svg")),
             ) from error
         figure = Figure(figsize=(self.width / 100, self.height / 100), dpi=100 * scale, facecolor=_COLOURS["paper"])
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

@@ -100,3 +100,14 @@ def counted(number: int, what: str, plural: str | None = None) -> str:
     ('1 point', '2 points')
     """
     return f"{number} {what if number == 1 else plural or f'{what}s'}"
+
+
+def installing(extra: str) -> str:
+    """Return how to install the packages of an extra of pyproject.toml.
+
+    Examples
+    --------
+    >>> installing("plots")
+    "run pip install '.[plots]' in the source folder of ortho-pipeline"
+    """
+    return f"run pip install '.[{extra}]' in the source folder of ortho-pipeline"

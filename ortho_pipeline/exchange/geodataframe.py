@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import installing
 from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.points import Points, points_of
 from ortho_pipeline.points.image_errors import read_image_errors, says_more
@@ -48,7 +49,7 @@ def to_geodataframe(points: Points) -> GeoDataFrame:
         raise InputError(
             "a GeoDataFrame needs GeoPandas, which is not installed",
             field="points",
-            remedy="run pip install '.[geopandas]' in the source folder of ortho-pipeline",
+            remedy=installing("geopandas"),
         ) from error
     columns: dict[str, Any] = {
         "id": list(points.ids),

@@ -18,7 +18,7 @@ from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.scene_fit import adjustable
 from ortho_pipeline.commands.stac.given import with_items
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.errors.texts import Setting, Text
+from ortho_pipeline.errors.texts import Setting, Text, installing
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import SensorModel
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
@@ -199,7 +199,7 @@ def libraries(field: str) -> tuple[Any, Any]:
         raise InputError(
             f"lazy arrays need {error.name}, which is not installed",
             field=field,
-            remedy="run pip install '.[xarray]' in the source folder of ortho-pipeline",
+            remedy=installing("xarray"),
         ) from error
     return dask, xarray
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import installing
 from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 
@@ -146,6 +147,6 @@ def _new() -> Any:
         raise InputError(
             "plots need matplotlib, which is not installed",
             field="axes",
-            remedy="run pip install '.[plots]' in the source folder of ortho-pipeline",
+            remedy=installing("plots"),
         ) from error
     return pyplot.subplots(layout="constrained")[1]
