@@ -1,5 +1,7 @@
 r"""Sensor plugin for radar images that were geocoded on a plane (GEC), not on terrain: Capella, Umbra, ICEYE, others.
 
+Capella's GEO is projected onto a DEM: a finished ortho, which this model would displace a second time.
+
 A radar measures range. A point above the plane is nearer to the antenna than the point of the plane below it, so it is
 displaced *towards* the radar, by :math:`1 / \tan\theta` of its height at the incidence angle :math:`\theta`. A camera
 on the other side at the elevation :math:`\theta` would show the same displacement; the model is `MapPlane`.
@@ -42,7 +44,9 @@ _REMEDY = "download the metadata again, or give incidence=DEG and azimuth=DEG"
 HALF_RANGE = 1000.0
 #: Incidence angles of radars (degrees).
 _STEEPEST, _FLATTEST = 10.0, 80.0
-_PLANE = "use a product in map geometry on a plane (GEC, GEO), not SLC or GRD"
+_PLANE = "use a product in map geometry on a plane (GEC), not SLC or GRD"
+#: Capella's product that is projected onto a DEM.
+_TERRAIN = "GEO"
 
 
 @hookimpl
@@ -79,7 +83,9 @@ def recognises(dataset: gdal.Dataset) -> bool:
     if path is None and _is_slant(dataset) and not has_rpc(dataset):
         return True
     try:
-        return path is not None and b'"center_pixel"' in read_bounded(path, MAX_SIZE)
+        if path is None or b'"center_pixel"' not in read_bounded(path, MAX_SIZE):
+            return False
+        return _product(read_json(path, MAX_SIZE, _REMEDY)) != _TERRAIN
     except InputError:
         return False
 
@@ -98,7 +104,13 @@ def open_scene(
     path = metadata_of(name)
     facts = {} if path is None else read_extended(path)
     product = facts.get("product", "GEC")
-    if product not in ("GEC", "GEO"):
+    if product == _TERRAIN:
+        raise InputError(
+            "a GEO product is a finished ortho: its maker projected it onto a DEM",
+            file=name,
+            remedy="use it as it is, or order the product GEC. `ortho verify` measures how accurate it is",
+        )
+    if product != "GEC":
         raise InputError(f"a {product} product is in slant or ground range", file=name, remedy=_PLANE)
     crs, corner, pixel = _map_of(dataset)
     stated = {"incidence_deg": incidence, "azimuth_deg": azimuth, "plane_m": plane}
@@ -154,8 +166,7 @@ def read_extended(path: Path) -> dict[str, Any]:
             value = value.get(name) if isinstance(value, dict) else None
         return value
 
-    product = at("product_type")
-    facts: dict[str, Any] = {"product": product[:10] if isinstance(product, str) else "unknown"}
+    facts: dict[str, Any] = {"product": _product(document)}
     for fact, text in (("satellite", at("collect", "platform")), ("acquired", at("collect", "start_timestamp"))):
         if isinstance(text, str):
             facts[fact] = text[:60]
@@ -182,6 +193,12 @@ def read_extended(path: Path) -> dict[str, Any]:
     facts["incidence_deg"] = round(math.degrees(math.acos(min(1.0, up))), 4)
     facts["azimuth_deg"] = round(math.degrees(math.atan2(east, north)) % 360.0, 4)
     return facts | {"plane_m": round(float(ground[0, 2]), 3)}
+
+
+def _product(document: Any) -> str:
+    """Return the type of the product by its metadata, at most 10 characters of it."""
+    stated = document.get("product_type") if isinstance(document, dict) else None
+    return stated[:10] if isinstance(stated, str) else "unknown"
 
 
 def _place(value: Any, path: Path, field: str) -> NDArray[np.float64]:

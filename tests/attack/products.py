@@ -347,7 +347,7 @@ def capella_text() -> str:
         for k in range(5)
     ]  # fmt: skip
     document = {
-        "product_type": "GEO",
+        "product_type": "GEC",
         "collect": {
             "platform": "capella-2", "start_timestamp": "2021-01-01T00:00:00Z", "state": {"state_vectors": vectors},
             "image": {"center_pixel": {"target_position": target.tolist()}},

@@ -12,13 +12,16 @@ from osgeo import gdal, osr
 from products import capella_text
 from used import pixels, used
 
+from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric, geodetic
 from ortho_pipeline.host import open_scene
+from ortho_pipeline.models import MapGrid
+from ortho_pipeline.options import SceneOptions
 
 SIZE, CRS = (60, 50), "EPSG:32633"
-STEM = "CAPELLA_C02_SM_GEO_HH_20210101000000_20210101000003"
+STEM = "CAPELLA_C02_SM_GEC_HH_20210101000000_20210101000003"
 
 
 @pytest.fixture
@@ -102,7 +105,7 @@ def test_angles_as_options_without_metadata(image: Path) -> None:
 
 def test_slant_range_is_refused(image: Path) -> None:
     metadata = image.parent / f"{STEM}_extended.json"
-    metadata.write_text(capella_text().replace('"GEO"', '"SLC"'))
+    metadata.write_text(capella_text().replace('"GEC"', '"SLC"'))
     with pytest.raises(InputError, match="slant or ground range") as caught:
         open_scene(image)
     assert "GEC" in caught.value.remedy
@@ -110,6 +113,17 @@ def test_slant_range_is_refused(image: Path) -> None:
     bare = pixels(image.parent / "bare.tif", SIZE)
     with pytest.raises(InputError, match="no map geometry"):
         open_scene(bare, "sar", {"incidence": "35", "azimuth": "80", "plane": "100"})
+
+
+def test_an_image_on_terrain_is_a_finished_ortho(image: Path) -> None:
+    """Capella's GEO; the model of a plane would displace it a second time."""
+    (image.parent / f"{STEM}_extended.json").write_text(capella_text().replace('"GEC"', '"GEO"'))
+    with pytest.raises(InputError, match=r"no sensor recognises this image.*as a finished ortho is"):
+        open_scene(image)
+    with pytest.raises(InputError, match="a GEO product is a finished ortho") as caught:
+        open_scene(image, "sar")
+    assert "ortho verify" in caught.value.remedy
+    assert isinstance(open_ortho(image, SceneOptions()).model, MapGrid)
 
 
 def test_complex_values_are_slant_range(tmp_path: Path) -> None:
