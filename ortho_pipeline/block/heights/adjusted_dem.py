@@ -34,6 +34,8 @@ class AdjustedDem:
         :math:`B`.
     covariance : ndarray (k, k)
         Of :math:`u`.
+    slopes : ndarray (N, 2)
+        Of the DEM to the east and north, 0 where they are unknown.
     own : ndarray (N,)
         Standard deviations of the errors that each sample of the DEM has of its own, m.
     sample : float
@@ -44,6 +46,7 @@ class AdjustedDem:
     loads: Array
     by_params: Array
     covariance: Array
+    slopes: Array
     own: Array
     sample: float
 
@@ -63,6 +66,7 @@ class AdjustedDem:
             loads=np.where(with_height[:, None], loads, np.nan),
             by_params=by_params,
             covariance=covariance,
+            slopes=np.nan_to_num(heights.terrain.slopes),
             own=heights.sigmas * np.sqrt(heights.own),
             sample=heights.source.surface.sample_size,
         )

@@ -3,8 +3,9 @@
 An image puts what it shows on the ground by its model. An error :math:`dp` of the parameters moves it by
 :math:`-J^{-1} A\\, dp`, with the partials :math:`A` of the image point by them and :math:`J` by the place in plan. Over
 a DEM, an error :math:`dh` of the height moves it by :math:`-J^{-1} f\\, dh`, with the partial :math:`f` by the height.
-How far two images put the same ground from each other is the difference, and its covariance is that of the parameters
-of both, and of the heights with them. The mean over the points that both images show, in pixels of the first.
+There :math:`J` also has :math:`f` times the slope, because the height is read where the image puts it. How far two
+images put the same ground from each other is the difference, and its covariance is that of the parameters of both, and
+of the heights with them. The mean over the points that both images show, in pixels of the first.
 """
 
 from __future__ import annotations
@@ -77,15 +78,17 @@ def joins_of(fit: BlockFit, dem: AdjustedDem | None = None) -> tuple[Join, ...]:
     by_image = [np.unique(points.point[rays[used[rays]]]) for rays in points.rays_of_images]
     for first, second in _pairs(fit, used):
         shared = np.intersect1d(by_image[first], by_image[second], assume_unique=True)
+        there = None if dem is None else shared[np.isfinite(dem.loads[shared]).all(axis=1)]
+        shared = shared if there is None or not len(there) else there
         chosen = shared[np.linspace(0, len(shared) - 1, min(len(shared), _PLACES)).astype(int)]
-        one, other = (_Moves.of(fit, image, fit.ground[chosen]) for image in (first, second))
+        one, other = (_Moves.of(fit, image, chosen, dem) for image in (first, second))
         if not (np.isfinite(one.by_params).all() and np.isfinite(other.by_params).all()):
             continue
         between = _between(fit, first, second, one.by_params.shape[1], other.by_params.shape[1])
         cross = one.by_params @ between @ other.by_params.T
         own = sum(part.by_params @ fit.cofactors.of_image(part.image) @ part.by_params.T for part in (one, other))
         covariance = own - cross - cross.T
-        if dem is not None:
+        if dem is not None and there is not None and len(there):
             covariance = covariance + _of_heights(fit, dem, chosen, one, other)
         found.append(Join(points.images[first], points.images[second], covariance / one.pixel**2, one.pixel))
     return tuple(found)
@@ -104,12 +107,15 @@ class _Moves:
     pixel: float
 
     @classmethod
-    def of(cls, fit: BlockFit, image: int, ground: Array) -> _Moves:
-        """Return it of an image at lon, lat, h ``(n, 3)``."""
-        model = fit.models[fit.points.images[image]]
+    def of(cls, fit: BlockFit, image: int, points: Index, dem: AdjustedDem | None) -> _Moves:
+        """Return it of an image at some of the points."""
+        model, ground = fit.models[fit.points.images[image]], fit.ground[points]
         partials = enu_partials(model, ground)
-        inverse = np.linalg.inv(partials[:, :, :2])
-        pixel = float(np.sqrt(np.abs(np.linalg.det(inverse)).mean()))
+        plan = partials[:, :, :2]
+        pixel = float(np.sqrt((1.0 / np.abs(np.linalg.det(plan))).mean()))
+        if dem is not None:
+            plan = plan + partials[:, :, 2:] * dem.slopes[points, None, :]
+        inverse = np.linalg.inv(plan)
         by_height = -np.einsum("nij,nj->ni", inverse, partials[:, :, 2])
         by_params = np.zeros((2, 0))
         if len(model.params):
@@ -119,26 +125,22 @@ class _Moves:
 
 
 def _of_heights(fit: BlockFit, dem: AdjustedDem, points: Index, one: _Moves, other: _Moves) -> Array:
-    """Return what the errors of an adjusted DEM add to the covariance ``(2, 2)`` of a join at some of the points, m².
+    """Return what the errors of an adjusted DEM add to the covariance ``(2, 2)`` of a join at points with heights, m².
 
     A displacement that the block knows but leaves counts with its square. Errors that samples of the DEM have of their
     own move orthos from place to place; little of that is left on average.
     """
     by_height = one.by_height - other.by_height
-    with_height = np.isfinite(dem.loads[points]).all(axis=1)
-    if not with_height.any():
-        return np.zeros((2, 2))
-    rows = points[with_height]
-    by_unknown = by_height[with_height].T @ dem.loads[rows] / len(rows)
-    known = by_height[with_height].T @ dem.known[rows] / len(rows)
+    by_unknown = by_height.T @ dem.loads[points] / len(points)
+    known = by_height.T @ dem.known[points] / len(points)
     columns = fit.cofactors.levels.columns
     through = one.by_params @ dem.by_params[columns.of_image(one.image)]
     through = through - other.by_params @ dem.by_params[columns.of_image(other.image)]
     left = through - by_unknown
     added = left @ dem.covariance @ left.T - through @ dem.covariance @ through.T
-    own = by_height[with_height] * dem.own[rows, None]
-    samples = max(_area(fit.ground[rows]) / dem.sample**2, 1.0)
-    return np.asarray(added + np.outer(known, known) + own.T @ own / len(rows) / samples)
+    own = by_height * dem.own[points, None]
+    samples = max(_area(fit.ground[points]) / dem.sample**2, 1.0)
+    return np.asarray(added + np.outer(known, known) + own.T @ own / len(points) / samples)
 
 
 def _area(ground: Array) -> float:
