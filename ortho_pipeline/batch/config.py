@@ -352,6 +352,11 @@ def _explained(error: pydantic.ValidationError, lines: Mapping[Place, int], path
         remedy = _SEE
         if fault["type"] == "extra_forbidden":
             message, remedy = "unknown field", _allowed(place)
+        elif place == ("output",):
+            message, remedy = (
+                "this is no folder",
+                "at the top, 'output' is a folder; the properties of orthos belong in 'output' of 'defaults'",
+            )
         line = lines.get(known, lines.get(known[:-1], 1))
         faults.append((f"line {line}" + (f", {dotted(known)}" if known else ""), message, remedy))
     faults = list(dict.fromkeys(faults))
@@ -377,7 +382,10 @@ def _allowed(place: Place) -> str:
         if isinstance(part, str):
             model = {"scenes": Entry, "defaults": Settings, "mosaic": MosaicSettings, **groups}.get(part, model)
     name, names = str(place[-1]), list(model.model_fields)
+    inside = "" if len(place) > 1 else " of 'defaults' or of a scene"
+    if inside and name in groups:
+        return f"{name!r} belongs in 'defaults' or in a scene"
     if homes := [repr(group) for group, fields in groups.items() if name in fields.model_fields]:
-        return f"{name!r} belongs in {' or '.join(homes)}"
+        return f"{name!r} belongs in {' or '.join(homes)}{inside}"
     close = difflib.get_close_matches(name, names, 1)
     return f"did you mean {close[0]!r} instead of {name!r}?" if close else f"use one of {', '.join(names)}"

@@ -108,7 +108,7 @@ def open_scene(
         raise InputError(
             "a GEO product is a finished ortho: its maker projected it onto a DEM",
             file=name,
-            remedy="use it as it is, or order the product GEC. `ortho verify` measures how accurate it is",
+            remedy="use it as it is, or order the product GEC",
         )
     if product != "GEC":
         raise InputError(f"a {product} product is in slant or ground range", file=name, remedy=_PLANE)

@@ -122,7 +122,7 @@ def test_an_image_on_terrain_is_a_finished_ortho(image: Path) -> None:
         open_scene(image)
     with pytest.raises(InputError, match="a GEO product is a finished ortho") as caught:
         open_scene(image, "sar")
-    assert "ortho verify" in caught.value.remedy
+    assert "use it as it is" in caught.value.remedy
     assert isinstance(open_ortho(image, SceneOptions()).model, MapGrid)
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
+from ortho_pipeline.files.shell import converted
+from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -107,7 +109,8 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
             f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
             file=other.path,
             field="orthos",
-            remedy=Text("make all orthos with the same CRS and pixel size (", Setting("output.like"), ")"),
+            remedy=f"make it again on the grid of {one.name!r}, or resample it: `gdalwarp -t_srs {crs_text(first.crs)} "
+            f"-tr {first.dx:g} {first.dy:g} -tap -r cubic {converted(other.path, 'on_grid')}`",
         )
     if off > _SAME:
         raise InputError(
