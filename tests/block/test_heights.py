@@ -9,7 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chains import Block, Chain, apart, apart_over, dem, fly, misfits, neighbours, with_control
+from chains import (
+    CRS,
+    Block,
+    Chain,
+    apart,
+    apart_over,
+    dem,
+    fly,
+    misfits,
+    neighbours,
+    to_ground,
+    to_image,
+    with_control,
+)
 
 from ortho_pipeline.block.adjustment import _prepared, adjust
 from ortho_pipeline.block.datum import with_datum
@@ -19,7 +32,7 @@ from ortho_pipeline.block.heights import settling
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.source import DemHeights
 from ortho_pipeline.block.heights.terrain import expected_slopes
-from ortho_pipeline.block.relative.joins import joins_of, weak_joins
+from ortho_pipeline.block.relative.joins import _Moves, joins_of, weak_joins
 from ortho_pipeline.commands.block_results.orthos import corrected
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged
 from ortho_pipeline.geodesy.crs import ground_transform
@@ -226,6 +239,34 @@ def test_claims_are_kept(tmp_path: Path, made: dict[str, float], sigma: float, t
             normalised.append(np.linalg.solve(root, apart_of(block, fit, pair)))
     for errors in (normalised, absolute):
         assert 0.85 < float(np.sqrt(np.mean(np.square(errors)))) < 1.15
+
+
+def test_orthos_move_along_the_slopes_of_the_dem(tmp_path: Path) -> None:
+    """What parameters and heights move, by rays of changed models that meet a changed DEM."""
+    block = fly(Chain(images=2, convergence_deg=20.0, ties=60, relief=80.0), 3)
+    surface = dem(block, tmp_path / "dem.tif", 3, cell=5.0)
+    fit = adjust(block.start, block.points, heights=surface.with_sigma(0.1), hold=5.0)
+    assert fit.adjusted_dem is not None
+    assert np.abs(fit.adjusted_dem.slopes).max() > 0.2
+    points = np.flatnonzero(np.isfinite(fit.adjusted_dem.loads).all(axis=1))
+    ground, model = ground_transform("EPSG:4979", CRS)(fit.ground[points]), fit.models["i0"]
+    seen = to_image(model, ground)
+
+    def places(params: np.ndarray, above: float) -> np.ndarray:
+        height = ground[:, 2]
+        for _ in range(12):
+            place = to_ground(model.with_params(params), seen, height)
+            height = surface.heights(place[:, :2], CRS) + above
+        return np.asarray(place[:, :2])
+
+    moves = _Moves.of(fit, 0, points, fit.adjusted_dem)
+    for k, step in enumerate(np.diag(np.full(len(model.params), 0.5))):
+        wanted = (places(model.params + step, 0.0) - places(model.params - step, 0.0)).mean(axis=0)
+        np.testing.assert_allclose(moves.by_params[:, k], wanted, rtol=0.01, atol=0.01 * np.abs(wanted).max())
+    wanted = (places(model.params, 1.0) - places(model.params, -1.0)).mean(axis=0) / 2
+    np.testing.assert_allclose(moves.by_height.mean(axis=0), wanted, rtol=0.01, atol=0.01 * np.abs(wanted).max())
+    level = _Moves.of(fit, 0, points, None).by_height.mean(axis=0)
+    assert np.abs(level - wanted).max() > 0.02 * np.abs(wanted).max(), "slopes would not matter here"
 
 
 @pytest.mark.slow
