@@ -11,6 +11,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
@@ -102,6 +103,9 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            text = f"at a corner, the sigma of a predicted image position is {factor:.0f} times that of a measured one"
+            size = significant(factor * sigma)
+            text = (
+                f"at a corner, a predicted position has a sigma of {size} px, {factor:.0f} times that of a measured one"
+            )
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

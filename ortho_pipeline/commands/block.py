@@ -41,6 +41,7 @@ from ortho_pipeline.commands.control.block_points import (
     settled_scenes,
 )
 from ortho_pipeline.commands.heights.opening import open_surface
+from ortho_pipeline.commands.rectification import no_rpc
 from ortho_pipeline.commands.resolved.ledger import Ledger, provenance
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.results import Result, attempted, to_store
@@ -354,7 +355,7 @@ def _exported(
             exported[label] = rpc.export_rpc(model)
             notes += [notice.in_image(label) for notice in exported[label].warnings]
         except InputError as error:
-            notes.append(Notice("no-rpc", Text("no RPC written: ", error.message)).in_image(label))
+            notes.append(no_rpc(error).in_image(label))
             del files[f"{label} rpc"]
     return exported, notes
 

@@ -313,12 +313,17 @@ def _acquired(facts: Mapping[str, Any], output: OutputOptions) -> Any:
     return None
 
 
+def no_rpc(error: InputError) -> Notice:
+    """Return the notice of a model that no RPC represents."""
+    return Notice("no-rpc", f"no RPC written: {error.message.replace('this RPC', 'the RPC of this model')}")
+
+
 def _as_rpc(model: SensorModel) -> tuple[rpc.RpcExport | None, list[Notice]]:
     """Return the model as RPC, and notices; None if no RPC represents it."""
     try:
         exported = rpc.export_rpc(model)
     except InputError as error:
-        return None, [Notice("no-rpc", Text("no RPC written: ", error.message))]
+        return None, [no_rpc(error)]
     return exported, list(exported.warnings)
 
 

@@ -232,7 +232,8 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     if isinstance(surface, FlatSurface):
         difference = points.ground[:, 2] - surface.height
         return None, _not_the_ground(difference[np.isfinite(difference)], seen)
-    difference = surface.above(points.ground, points.crs)
+    # Matches have the heights of the DEM.
+    difference = np.where(points.groups >= 0, np.nan, surface.above(points.ground, points.crs))
     difference = difference[np.isfinite(difference)]
     if not len(difference):
         return None, []

@@ -28,7 +28,6 @@ from ortho_pipeline.batch.config import read_config
 from ortho_pipeline.batch.plan import plan
 from ortho_pipeline.batch.runner import run as run_pipeline
 from ortho_pipeline.cli.program import cli
-from ortho_pipeline.commands.mosaic.assembly import mosaic
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.commands.sharpening.registration import Agreement, displaced
@@ -605,15 +604,6 @@ def _arrays(printed: Printed, folder: Path) -> None:
     remedy = refused(open_scene, tiff(folder / "grey.tif", GREY), "geolocation")
     printed.paste(remedy, IN="lon.dat", OUT="lon.tif")
     open_dataset(folder / "lon.tif")
-
-
-@case("warp", "gdalwarp -t_srs")
-def _ortho_of_another_zone(printed: Printed, folder: Path) -> None:
-    one, other = (folder / name for name in ("one.tif", "other.tif"))
-    gdal.Warp(str(one), str(SAMPLE / "reference.tif"), xRes=5, yRes=5, targetAlignedPixels=True).FlushCache()
-    gdal.Warp(str(other), str(SAMPLE / "reference.tif"), dstSRS="EPSG:32637").FlushCache()
-    printed.paste(refused(mosaic, [one, other], folder / "mosaic.tif"))
-    assert mosaic([one, folder / "other_on_grid.tif"], folder / "mosaic.tif").files
 
 
 @case("ortho_sar", "gdalwarp -t_srs")

@@ -301,7 +301,7 @@ def _date(
         file=path,
         field="date",
         remedy=Text(
-            "give a CSV file with the columns file and date, or the place of the date in the file names: ",
+            "give a CSV file with the columns file and date (2024-01-31), or the place of the date in the file names: ",
             Setting("stack.date_pattern", "%Y%m%d"),
         ),
     )

@@ -68,7 +68,9 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
             raise InputError(
                 f"the correction {points.correction!r} needs control points",
                 field="points.gcps",
-                remedy=Text("give a file of points, or match an orthoimage (", Setting("match.reference"), ")"),
+                remedy=Text(
+                    "give a file of points, match an orthoimage (", Setting("match.reference"), "), or leave it out"
+                ),
             )
         if points.gcps is None:
             names = [one.name for one in fields(points) if one.name not in ("gcps", "correction")]

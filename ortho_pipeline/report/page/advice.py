@@ -85,7 +85,6 @@ _LOOK: dict[str, str] = {
     ),
     "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
-    "search-by-default": Text("Change the radius with ", Setting("match.search"), "."),
     "points-cover-part": "Add points in the empty parts: control, or ties if images overlap there.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
     "crowded-ties": "Small images need few ties. More do not make the result more accurate.",
@@ -116,6 +115,7 @@ _LOOK: dict[str, str] = {
     "sharpen-no-gain": "Check the registration of the bands, and use the multispectral ortho.",
 }
 _KNOW: dict[str, str] = {
+    "search-by-default": Text("If matching fails, change the radius with ", Setting("match.search"), "."),
     "control-without-height": "Add heights if you have them.",
     "unstated-sigma": Text("State the accuracy of the points with ", Setting("points.ground_sigma"), "."),
     "parameters-not-justified": Text(

@@ -51,7 +51,8 @@ def headline(record: StackRecord) -> str:
         return "No date could be corrected."
     worst = max(_INTERVAL * max(one.sigma_px or (0.0, 0.0)) for one in known)
     reference = {"mean": "the mean of all dates", "reference": "the reference"}.get(record.datum, record.datum)
-    return f"{counted(len(known), 'date')} agree with {reference} within {worst:.2f} px (95 % interval, per axis)."
+    text = f"{counted(len(known), 'date')} agree with {reference} within {worst:.2f} px (95 % interval, per axis)."
+    return text if record.datum == "reference" else f"{text} Nothing here tests the absolute position."
 
 
 def _years(record: StackRecord) -> list[float]:

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.files.shell import converted
-from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -105,12 +103,11 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
     if grid.crs != first.crs or not same_pixels:
         raise InputError(
-            f"the ortho {other.name!r} has pixels of {grid.dx:g} x {grid.dy:g} in {grid.crs.name}, "
+            f"this raster has pixels of {grid.dx:g} x {grid.dy:g} in {grid.crs.name}, "
             f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
             file=other.path,
             field="orthos",
-            remedy=f"make it again on the grid of {one.name!r}, or resample it: `gdalwarp -t_srs {crs_text(first.crs)} "
-            f"-tr {first.dx:g} {first.dy:g} -tap -r cubic {converted(other.path, 'on_grid')}`",
+            remedy=f"make its ortho again on the grid of {one.name!r}, or resample it as docs/mosaic.md says",
         )
     if off > _SAME:
         raise InputError(
