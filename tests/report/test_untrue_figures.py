@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from ortho_pipeline import open_dem, open_scene, read_points
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.rectification import no_rpc
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.report.document import build_report
 from ortho_pipeline.report.wording import NO_SCALE
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -97,3 +101,18 @@ def test_with_the_right_heights_all_of_them_show_it(outputs):
     assert "unknown" not in printed
     item = json.loads((out / "tiny" / "tiny_stac.json").read_text())
     assert item["properties"]["accuracy:geometric_rmse"] > 0
+
+
+def test_matches_are_not_compared_with_the_dem_that_gave_their_heights():
+    scene, points = open_scene(SAMPLE / "scene.tif"), read_points(SAMPLE / "gcps.geojson")
+    dem, count = open_dem(SAMPLE / "dem.tif"), len(points)
+    surveyed = build_report(scene=scene, fit=scene.fit(points, "shift"), surface=dem)
+    assert surveyed.heights is not None
+    assert surveyed.heights.n == count
+    matched = points.with_covariance_image(np.broadcast_to(0.01 * np.eye(2), (count, 2, 2)), np.arange(count))
+    assert build_report(scene=scene, fit=scene.fit(matched, "shift"), surface=dem).heights is None
+
+
+def test_an_rpc_that_is_not_written_is_called_that_of_the_model():
+    said = str(no_rpc(InputError("this RPC maps several places on the ground to one pixel")))
+    assert said == "no RPC written: the RPC of this model maps several places on the ground to one pixel"

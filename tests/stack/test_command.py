@@ -81,6 +81,7 @@ def test_corrections_are_the_errors(made):
     assert record.closure_after.loops == 4
     page = (made[1] / "stack.html").read_text()
     assert "4 dates agree with the mean of all dates within" in page
+    assert "Nothing here tests the absolute position." in page
     assert 'data-plot="timeline"' in page
 
 
