@@ -225,9 +225,12 @@ def painted(folder: Path) -> None:
     seen, tiles = [], []
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        # An address works once; then a cookie of the context opens the page.
+        context = browser.new_context(viewport={"width": 1400, "height": 860})
         for _ in range(5):
-            page = browser.new_page(viewport={"width": 1400, "height": 860})
+            page = context.new_page()
             page.goto(address)
+            address = page.url
             loaded = "performance.getEntriesByType('resource')"
             tile = f"{loaded}.find((one) => one.name.includes('/tiles/') && one.responseEnd)"
             page.wait_for_function(f"() => performance.getEntriesByType('paint').length > 1 && {tile}")
