@@ -66,7 +66,8 @@ class HeightsRecord(Record):
             text = f"DEM accuracy not given; assuming {metres(self.sigma_m)}"
             found.append(Notice("dem-sigma-by-default", text, dem_sigma_m=self.sigma_m))
         elif self.sigma_is == "estimated":
-            text = f"DEM accuracy not given; estimated as {metres(self.sigma_m)} from {counted(self.used, 'height')}"
+            size, used = metres(self.sigma_m), counted(self.used, "height")
+            text = f"DEM accuracy not given; its scatter is estimated as {size} from {used}"
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         elif self.sigma_is == "enlarged":
             text = Text(
