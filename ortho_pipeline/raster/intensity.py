@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,8 @@ class Intensity:
         # The largest integer means "at least this value".
         kind = source.dtype
         self.saturated = float(np.iinfo(kind).max) if kind.kind in "iu" else np.inf
+        #: What a matcher found in the pixels, by what it looked for: it matches an ortho several times.
+        self.found: dict[tuple[Any, ...], Any] = {}
 
     @cached_property
     def averaged(self) -> tuple[int, ...]:

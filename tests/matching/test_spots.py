@@ -12,7 +12,7 @@ from pairs import Pair
 from servers import serving
 
 from ortho_pipeline.commands.orthos.verifying import verify
-from ortho_pipeline.imaging.matching.candidates import at_spots, spots_of
+from ortho_pipeline.imaging.matching.candidates import at_spots, candidates, spots_of
 from ortho_pipeline.options import MatchOptions, SceneOptions
 
 gdal.UseExceptions()
@@ -27,8 +27,11 @@ class Pixels:
         band = SimpleNamespace(GetBlockSize=lambda: [block, block])
         self.source = SimpleNamespace(path=path, bands=[band])
         self.width = self.height = size
+        self.found: dict[Any, Any] = {}
+        self.windows = 0
 
     def read(self, left: int, top: int, width: int, height: int, factor: int = 1) -> np.ndarray:
+        self.windows += 1
         return np.random.default_rng([left, top]).normal(size=(height, width)).astype(np.float32)
 
 
@@ -54,6 +57,18 @@ def test_chips_stay_in_the_windows_that_the_search_has_read():
     assert sorted(cells.tolist()) == list(range(9, 9 * 9))
     middles = np.stack(np.divmod(cells // 9, 3)[::-1], axis=1) * 1000 + 500
     assert np.abs(origins + 20 - middles).max() <= 168 / 2 - 20
+
+
+def test_an_image_that_is_matched_again_is_not_searched_again():
+    near, every = view("tile.tif", 1000, 512), np.ones((4, 4), dtype=bool)
+    first = candidates(near, (0, 0, 1000, 1000), (4, 4), 40, 1, every)
+    again = candidates(near, (0, 0, 1000, 1000), (4, 4), 40, 1, every)
+    for one, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert near.intensity.windows == 16
+    for changed in (((0, 0, 900, 1000), (4, 4), 40, 1), ((0, 0, 1000, 1000), (4, 4), 30, 1)):
+        candidates(near, *changed, every)
+    assert near.intensity.windows == 48
 
 
 @pytest.mark.slow

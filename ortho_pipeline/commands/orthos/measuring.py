@@ -185,10 +185,11 @@ def _matched(
 ) -> MeasuredOrtho:
     """Match with one band or all, again until the correction follows the displacement."""
 
+    source = RasterSource(scene.path, **opened.access)
+    intensity = _intensity(source, () if band is None else (band,), masks, opened)
+
     def matching(model: SensorModel, again: MatchOptions) -> Matched:
         view = replace(scene, models={model.kind: model})
-        source = RasterSource(scene.path, **opened.access)
-        intensity = _intensity(source, () if band is None else (band,), masks, opened)
         return match_scene(
             view, again, FlatSurface(0.0), opened, output.threads, output.memory, intensity=intensity
         )  # fmt: skip

@@ -109,8 +109,12 @@ def _best_of(
     view: SceneView, parts: Sequence[tuple[tuple[float, float, float, float], int]], size: int, factor: int
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     chosen = []
+    found = view.intensity.found
     for cell, number in parts:
-        place = _best(view, cell, size, factor)
+        asked = cell, size, factor
+        if asked not in found:
+            found[asked] = _best(view, cell, size, factor)
+        place = found[asked]
         if place is not None:
             chosen.append((*place, number))
     table = np.array(chosen, dtype=int).reshape(-1, 3)
