@@ -143,7 +143,7 @@ _KNOW: dict[str, str] = {
     "part-left-out": "Rectify the other parts separately.",
     "radar-on-a-plane": Text("Give a DEM (", Setting("surface.dem"), ")."),
     "no-rpc-text": "Nothing to do.",
-    "gcps-beside-rpc": "If you open the file in other programs: they may use the GCPs instead of the RPC.",
+    "gcps-beside-rpc": "Nothing to do here. Other programs may use the GCPs instead of the RPC.",
     "piece-left-out": "Nothing to do, if you want only the file that you opened.",
 }
 _LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _LOOK), ("know", _KNOW))
