@@ -288,8 +288,8 @@ def _of_shift(verified: Verified) -> list[Cause]:
         )
         return [Cause("datum", text, length**2)]
     azimuth = math.degrees(math.atan2(bias[0], bias[1])) % 360
-    shifted = f"the whole ortho is shifted by {size_m(length)} towards azimuth {azimuth:.0f}°"
-    return [Cause("shift", f"{shifted}. If the reference is right, correct it with ortho align", length**2)]
+    shifted = f"ortho or reference is shifted: the ortho lies {size_m(length)} towards azimuth {azimuth:.0f}°"
+    return [Cause("shift", f"{shifted}. If the reference is right, correct the ortho with ortho align", length**2)]
 
 
 def _of_step(step: FieldStep, measured: MeasuredOrtho) -> Cause:
