@@ -13,6 +13,7 @@ be checked with a real product; a notice says so. For other products the angles 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ _STEEPEST, _FLATTEST = 10.0, 80.0
 _PLANE = "use a product in map geometry on a plane (GEC), not SLC or GRD"
 #: Capella's product that is projected onto a DEM.
 _TERRAIN = "GEO"
+_ON_TERRAIN = re.compile(rb'"product_type"\s*:\s*"GEO"')
 
 
 @hookimpl
@@ -83,11 +85,10 @@ def recognises(dataset: gdal.Dataset) -> bool:
     if path is None and _is_slant(dataset) and not has_rpc(dataset):
         return True
     try:
-        if path is None or b'"center_pixel"' not in read_bounded(path, MAX_SIZE):
-            return False
-        return _product(read_json(path, MAX_SIZE, _REMEDY)) != _TERRAIN
+        text = b"" if path is None else read_bounded(path, MAX_SIZE)
     except InputError:
         return False
+    return b'"center_pixel"' in text and _ON_TERRAIN.search(text) is None
 
 
 def open_scene(
@@ -166,7 +167,8 @@ def read_extended(path: Path) -> dict[str, Any]:
             value = value.get(name) if isinstance(value, dict) else None
         return value
 
-    facts: dict[str, Any] = {"product": _product(document)}
+    product = at("product_type")
+    facts: dict[str, Any] = {"product": product[:10] if isinstance(product, str) else "unknown"}
     for fact, text in (("satellite", at("collect", "platform")), ("acquired", at("collect", "start_timestamp"))):
         if isinstance(text, str):
             facts[fact] = text[:60]
@@ -193,12 +195,6 @@ def read_extended(path: Path) -> dict[str, Any]:
     facts["incidence_deg"] = round(math.degrees(math.acos(min(1.0, up))), 4)
     facts["azimuth_deg"] = round(math.degrees(math.atan2(east, north)) % 360.0, 4)
     return facts | {"plane_m": round(float(ground[0, 2]), 3)}
-
-
-def _product(document: Any) -> str:
-    """Return the type of the product by its metadata, at most 10 characters of it."""
-    stated = document.get("product_type") if isinstance(document, dict) else None
-    return stated[:10] if isinstance(stated, str) else "unknown"
 
 
 def _place(value: Any, path: Path, field: str) -> NDArray[np.float64]:

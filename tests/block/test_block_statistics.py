@@ -15,7 +15,7 @@ from scipy import stats
 from ortho_pipeline.block.adjustment import adjust
 from ortho_pipeline.block.equations.problem import PERFECT_GROUND
 from ortho_pipeline.block.fit import BlockFit, merged
-from ortho_pipeline.block.heights.adjusted_dem import known_errors
+from ortho_pipeline.block.heights.adjusted_dem import AdjustedDem, known_errors
 from ortho_pipeline.block.heights.record import HeightsRecord
 from ortho_pipeline.block.heights.settling import Heights
 from ortho_pipeline.block.heights.spots import SpotsRecord
@@ -373,6 +373,20 @@ def test_errors_of_heights_are_without_a_shift_that_is_applied() -> None:
     for applied, wanted in ((False, [3.0, 11.0, 50.0]), (True, [5.0, 5.0, 5.0])):
         heights: Any = SimpleNamespace(common=common, source=SimpleNamespace(correct_shift=applied))
         np.testing.assert_allclose(known_errors(heights), wanted)
+
+
+def test_heights_of_unknown_accuracy_say_nothing_of_orthos() -> None:
+    """A raster of sigmas may have voids where the DEM has heights."""
+    common = SimpleNamespace(
+        loads=np.ones((4, 3)), by_params=np.zeros((2, 3)), left=np.eye(3), value=np.zeros(3), undone=np.zeros(3)
+    )
+    terrain = SimpleNamespace(heights=np.array([1.0, np.nan, 1.0, 1.0]), slopes=np.zeros((4, 2)))
+    source = SimpleNamespace(correct_shift=False, surface=SimpleNamespace(sample_size=10.0))
+    heights: Any = SimpleNamespace(
+        common=common, terrain=terrain, source=source, of=np.ones(4, dtype=bool), own=np.ones(4),
+        sigmas=np.array([2.0, 2.0, np.nan, np.inf]),
+    )  # fmt: skip
+    assert np.isfinite(AdjustedDem.of(heights, None, 0.0).loads).all(axis=1).tolist() == [True, False, False, False]
 
 
 def record(**more: Any) -> HeightsRecord:

@@ -126,6 +126,14 @@ def test_an_image_on_terrain_is_a_finished_ortho(image: Path) -> None:
     assert isinstance(open_ortho(image, SceneOptions()).model, MapGrid)
 
 
+def test_damaged_metadata_are_told_and_not_passed_over(image: Path) -> None:
+    metadata = image.parent / f"{STEM}_extended.json"
+    metadata.write_text(capella_text()[:-20])
+    with pytest.raises(InputError) as caught:
+        open_scene(image)
+    assert (caught.value.file, "download the metadata again" in caught.value.remedy) == (str(metadata), True)
+
+
 def test_complex_values_are_slant_range(tmp_path: Path) -> None:
     """SLC and SICD of any vendor, which nothing else knows."""
     gdal.GetDriverByName("GTiff").Create(str(tmp_path / "slc.tif"), *SIZE, 1, gdal.GDT_CFloat32).FlushCache()

@@ -60,7 +60,7 @@ class AdjustedDem:
             loads = np.hstack([loads, loads @ priors.by_heights])
             by_params = np.hstack([by_params, priors.by_params])
             covariance = np.block([[covariance, none], [none.T, priors.left]])
-        with_height = heights.of & np.isfinite(heights.terrain.heights)
+        with_height = heights.of & np.isfinite(heights.terrain.heights) & np.isfinite(heights.sigmas)
         return cls(
             known=known_errors(heights) - mean,
             loads=np.where(with_height[:, None], loads, np.nan),
