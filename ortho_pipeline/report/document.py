@@ -233,7 +233,7 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
         difference = points.ground[:, 2] - surface.height
         return None, _not_the_ground(difference[np.isfinite(difference)], seen)
     # Matches have the heights of the DEM.
-    difference = np.where(points.groups >= 0, np.nan, surface.above(points.ground, points.crs))
+    difference = surface.above(points.ground[points.groups < 0], points.crs)
     difference = difference[np.isfinite(difference)]
     if not len(difference):
         return None, []

@@ -78,18 +78,18 @@ def joins_of(fit: BlockFit, dem: AdjustedDem | None = None) -> tuple[Join, ...]:
     by_image = [np.unique(points.point[rays[used[rays]]]) for rays in points.rays_of_images]
     for first, second in _pairs(fit, used):
         shared = np.intersect1d(by_image[first], by_image[second], assume_unique=True)
-        there = None if dem is None else shared[np.isfinite(dem.loads[shared]).all(axis=1)]
-        shared = shared if there is None or not len(there) else there
+        with_height = shared[:0] if dem is None else shared[np.isfinite(dem.loads[shared]).all(axis=1)]
+        over, shared = (dem, with_height) if len(with_height) else (None, shared)
         chosen = shared[np.linspace(0, len(shared) - 1, min(len(shared), _PLACES)).astype(int)]
-        one, other = (_Moves.of(fit, image, chosen, dem) for image in (first, second))
+        one, other = (_Moves.of(fit, image, chosen, over) for image in (first, second))
         if not (np.isfinite(one.by_params).all() and np.isfinite(other.by_params).all()):
             continue
         between = _between(fit, first, second, one.by_params.shape[1], other.by_params.shape[1])
         cross = one.by_params @ between @ other.by_params.T
         own = sum(part.by_params @ fit.cofactors.of_image(part.image) @ part.by_params.T for part in (one, other))
         covariance = own - cross - cross.T
-        if dem is not None and there is not None and len(there):
-            covariance = covariance + _of_heights(fit, dem, chosen, one, other)
+        if over is not None:
+            covariance = covariance + _of_heights(fit, over, chosen, one, other)
         found.append(Join(points.images[first], points.images[second], covariance / one.pixel**2, one.pixel))
     return tuple(found)
 

@@ -202,8 +202,8 @@ def _few(ties: Ties, names: tuple[str, ...]) -> list[Notice]:
         if number >= _FEW:
             continue
         why = f" ({pair.reason})" if pair.reason else ""
-        number_of = f"only {counted(number, 'tie point')} (fewer than {_FEW})"
-        text = f"{number_of} between {label}, which show the same ground{why}"
+        few = f"only {counted(number, 'tie point')} (fewer than {_FEW})"
+        text = f"{few} between {label}, which show the same ground{why}"
         notices.append(Notice("few-ties", text, images=[names[image] for image in pair.images], count=number))
     return notices
 
