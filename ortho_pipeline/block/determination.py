@@ -105,7 +105,8 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         if factor > EXTRAPOLATION_WARNING and not held:
             size = significant(factor * sigma)
             text = (
-                f"at a corner, a predicted position has a sigma of {size} px, {factor:.0f} times that of a measured one"
+                f"at a corner, the absolute position has a sigma of {size} px, {factor:.0f} times that of a measured "
+                "point"
             )
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

@@ -270,7 +270,7 @@ class MatchOptions:
         Sequence[PathLike],
         Option(
             "--reference",
-            "Orthoimages to match for control points. Where several overlap, the first is used.",
+            "Orthoimages to match. Where several overlap, the first is used.",
             "ORTHO[,...]",
             kind="files",
         ),

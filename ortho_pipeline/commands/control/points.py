@@ -69,7 +69,10 @@ def refuse_contradictions(points: PointOptions, match: MatchOptions) -> None:
                 f"the correction {points.correction!r} needs control points",
                 field="points.gcps",
                 remedy=Text(
-                    "give a file of points, match an orthoimage (", Setting("match.reference"), "), or leave it out"
+                    "give a file of points, match an orthoimage (",
+                    Setting("match.reference"),
+                    "), or leave out ",
+                    Setting("points.correction"),
                 ),
             )
         if points.gcps is None:

@@ -134,7 +134,7 @@ _KNOW: dict[str, str] = {
     "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
     "correction-by-matches": "Nothing to do, unless you know a better correction.",
     "dem-datum-overridden": "Check that your datum is right.",
-    "no-rpc": "Use the ortho or the model file.",
+    "no-rpc": "Nothing to do here. Give other programs the ortho or the model file.",
     "crop-stated": "Check the offset.",
     "crop-noted": "Nothing to do.",
     "crop-kept": "Nothing to do.",

@@ -102,12 +102,15 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     same_pixels = math.isclose(grid.dx, first.dx, rel_tol=1e-9) and math.isclose(grid.dy, first.dy, rel_tol=1e-9)
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
     if grid.crs != first.crs or not same_pixels:
+        remedy = f"make its ortho again with the CRS and the pixel size of {one.name!r}, or resample it to these"
+        if grid.crs.is_compound and not first.crs.is_compound:
+            remedy = "its CRS has heights, so this is probably a DEM: leave it out"
         raise InputError(
             f"this raster has pixels of {grid.dx:g} x {grid.dy:g} in {grid.crs.name}, "
             f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
             file=other.path,
             field="orthos",
-            remedy=f"make its ortho again on the grid of {one.name!r}, or resample it as docs/mosaic.md says",
+            remedy=remedy,
         )
     if off > _SAME:
         raise InputError(
