@@ -352,3 +352,16 @@ def test_an_image_without_a_map_grid_is_no_part_of_a_mosaic(tmp_path):
     done = CliRunner().invoke(cli, ["mosaic", str(path), "-o", str(tmp_path / "mosaic.tif")])
     assert "raw.tif: CRS: this raster has no coordinate system" in done.output
     assert "rectify the image" in done.output
+
+
+@pytest.mark.parametrize(("crs", "remedy"), [("EPSG:32636+5773", "probably a DEM"), ("EPSG:32637", "make its ortho")])
+def test_a_raster_in_another_crs_is_refused_with_what_it_probably_is(tmp_path, crs, remedy):
+    for name, its in (("a", "EPSG:32636"), ("b", crs)):
+        raster = gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"{name}.tif"), 8, 8)
+        raster.SetProjection(pyproj.CRS(its).to_wkt())
+        raster.SetGeoTransform((500000.0, 10.0, 0.0, 4100000.0, 0.0, -10.0))
+        raster.FlushCache()
+    paths = [str(tmp_path / f"{name}.tif") for name in "ab"]
+    done = CliRunner().invoke(cli, ["mosaic", *paths, "-o", str(tmp_path / "m.tif"), "--order", "first-on-top"])
+    assert done.exit_code == 2
+    assert remedy in " ".join(done.output.split())
