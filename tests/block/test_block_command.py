@@ -332,7 +332,7 @@ def test_empty_parts_of_images_are_said(stereo: Stereo, tmp_path: Path) -> None:
     (notice,) = (one for one in report["notices"] if one["code"] == "points-cover-part")
     assert set(notice["share"]) == {"aft_BAND", "fore_BAND"}
     assert max(notice["share"].values()) < 0.7
-    assert "control, or ties if images overlap there" in (tmp_path / "out" / "block_report.html").read_text()
+    assert "ties where images overlap, control elsewhere" in (tmp_path / "out" / "block_report.html").read_text()
 
 
 def test_ties_alone_hold_the_datum_and_say_so(stereo: Stereo, tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ _LOOK: dict[str, str] = {
     ),
     "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
-    "points-cover-part": "Add points in the empty parts: control, or ties if images overlap there.",
+    "points-cover-part": "Add points in the empty parts: ties where images overlap, control elsewhere.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
     "crowded-ties": "Small images need few ties. More do not make the result more accurate.",
     "few-ties": "Measure some ties between these images.",
