@@ -110,11 +110,11 @@ def refuse_many(names: Sequence[str], count: int, what: str, source: str, remedy
 
 
 def _common(problem: Problem) -> Solution:
-    """Return the solution of all points, or one step towards it if gross errors prevent convergence."""
+    """Return the solution of all points, or one step towards it if gross errors prevent it."""
     everything = np.ones(len(problem.rows), dtype=bool)
     try:
         return problem.solve(everything)
-    except NotConverged:
+    except (DegeneratePoints, NotConverged):
         return problem.solve(everything, linear=True)
 
 

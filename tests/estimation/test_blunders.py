@@ -124,6 +124,28 @@ def test_a_camera_that_wrong_points_bend_is_linearised_again() -> None:
     assert set(np.flatnonzero(~keep)) == set(wrong) == set(reasons)
 
 
+@pytest.mark.parametrize("seed", [8, 10, 16, 23])
+def test_points_that_bend_a_camera_until_nothing_determines_it_are_found(seed: int) -> None:
+    """Four of fourteen points are up to 9,000 px off: the adjustment of all has no unique solution."""
+    interior = Interior(1000, 1500, 0.120, 1e-4, 1e-4)
+    true = FrameCamera.from_map(
+        interior, "EPSG:32636", [480e3, 4.42e6, 6000.0, 0.1, -0.2, 2.5], frame="map", heights=(700.0, 1900.0)
+    )
+    random = np.random.default_rng(seed)
+    image = random.uniform([30, 30], [970, 1470], (14, 2))
+    ground = true.image_to_ground(image, random.uniform(700, 1900, 14))
+    image += random.normal(0, 0.3, (14, 2))
+    wrong = random.permutation(14)[:4]
+    image[wrong] += random.uniform(-9000, 9000, (4, 2))
+    start = true.with_params(true.params + np.array([300.0, -200.0, 250.0, 0.04, 0.03, -0.06]))
+    points = Points.of(image, ground, "EPSG:32636", sigma_image=0.3)
+    problem = Problem.of(start, points, np.ones(14, dtype=bool), {})
+    with pytest.raises(DegeneratePoints):
+        problem.solve(np.ones(14, dtype=bool))
+    keep, reasons = find_blunders(problem)
+    assert set(np.flatnonzero(~keep)) == set(wrong) == set(reasons)
+
+
 def test_two_points_cannot_show_which_is_wrong_and_three_can(level: RPC) -> None:
     misses = np.array([(0.3, 0.1), (900.0, 700.0), (0.1, 0.2)])
     two, three = (find_blunders(problem_of(level, points_of(level, misses[:count]))) for count in (2, 3))
