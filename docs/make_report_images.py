@@ -17,18 +17,16 @@ SAMPLE, IMAGES = ROOT / "sample_data", ROOT / "docs" / "images"
 
 
 def main() -> None:
-    """Take pictures of the report of the sample scene (first screen, dark, chips) and of that of the stereo pair."""
+    """Take pictures of the report of the sample scene (first screen, chips) and of that of the stereo pair."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as started:
         points, surface = PointOptions(gcps=SAMPLE / "gcps.geojson"), SurfaceOptions(dem=SAMPLE / "dem.tif")
         made = commands.rectify(SAMPLE / "scene.tif", folder, points=points, surface=surface)
         browser = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        for name, scheme in (("report", "light"), ("report-dark", "dark")):
-            page = browser.new_page(viewport={"width": 1280, "height": 760}, color_scheme=scheme)  # type: ignore[arg-type]
-            page.goto(made.files["html"].resolve().as_uri())
-            page.screenshot(path=IMAGES / f"{name}.jpg", type="jpeg", quality=80)
-            if scheme == "light":
-                page.locator(".measured").screenshot(path=IMAGES / "report-chips.jpg", type="jpeg", quality=80)
+        page = browser.new_page(viewport={"width": 1280, "height": 760})
+        page.goto(made.files["html"].resolve().as_uri())
+        page.screenshot(path=IMAGES / "report.jpg", type="jpeg", quality=80)
+        page.locator(".measured").screenshot(path=IMAGES / "report-chips.jpg", type="jpeg", quality=80)
         pair = [SAMPLE / "cartosat" / name for name in ("BANDF.tif", "BANDA.tif")]
         options = BlockOptions(points=SAMPLE / "cartosat" / "points.csv", correction="shift")
         page = browser.new_page(viewport={"width": 1280, "height": 760})

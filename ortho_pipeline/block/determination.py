@@ -103,10 +103,7 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            size = significant(factor * sigma)
-            text = (
-                f"at a corner, the absolute position has a sigma of {size} px, {factor:.0f} times that of a measured "
-                "point"
-            )
+            corner, points = significant(factor * sigma), significant(inside * sigma)
+            text = f"its absolute position has a sigma of {corner} px at a corner, of {points} px at its points"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

@@ -301,7 +301,8 @@ def _date(
         file=path,
         field="date",
         remedy=Text(
-            "give a CSV file with the columns file and date (2024-01-31), or the place of the date in the file names: ",
+            "instead of the folder, give a CSV file with the columns file and date (2024-01-31); or the place of the "
+            "date in the file names: ",
             Setting("stack.date_pattern", "%Y%m%d"),
         ),
     )

@@ -68,8 +68,8 @@ class HeightsRecord(Record):
         elif self.sigma_is == "estimated":
             size, used = metres(self.sigma_m), counted(self.used, "height")
             text = (
-                f"DEM accuracy not given; its scatter is estimated as {size} from {used}. An error that all heights share "
-                f"has a sigma of {metres(self.bias_prior_m)} before the adjustment"
+                f"DEM accuracy not given; its scatter is estimated as {size} from {used}. An error that all heights "
+                f"share has a sigma of {metres(self.bias_prior_m)} before the adjustment"
             )
             found.append(Notice("dem-sigma-estimated", text, dem_sigma_m=self.sigma_m, count=self.used))
         elif self.sigma_is == "enlarged":

@@ -9,7 +9,7 @@ from datetime import datetime
 from ortho_pipeline.display.drawing import Axes, Drawing, style_sheet
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.display.pages import render
-from ortho_pipeline.errors.texts import counted
+from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files import write_text
 from ortho_pipeline.report.page.advice import WORDS, signals
 from ortho_pipeline.report.stack.records import StackRecord
@@ -20,6 +20,17 @@ _MAP, _PAD, _ARROW = 420.0, 16.0, 26.0
 #: Half of a 95 % interval in sigmas.
 _INTERVAL = 1.96
 _ROWS = 400
+_USE = Text("You can use the stack within this accuracy.")
+_FIT = Text(
+    "The dates fit each other within this accuracy. If the absolute position matters, choose a date that was made with "
+    "control points as the datum (",
+    Setting("stack.datum"),
+    "), or give a reference (",
+    Setting("match.reference"),
+    " and ",
+    Setting("stack.datum", "reference"),
+    ").",
+)
 
 
 def write_page(record: StackRecord, path: str | os.PathLike[str]) -> None:
@@ -31,6 +42,8 @@ def write_page(record: StackRecord, path: str | os.PathLike[str]) -> None:
         "report/stack.html.j2",
         stack=record,
         headline=headline(record),
+        datum=_datum(record),
+        next=_USE if record.datum == "reference" else _FIT,
         css=style_sheet(),
         timeline=timeline(record).svg(),
         graph=graph(record).svg(),
@@ -50,9 +63,12 @@ def headline(record: StackRecord) -> str:
     if not known:
         return "No date could be corrected."
     worst = max(_INTERVAL * max(one.sigma_px or (0.0, 0.0)) for one in known)
-    reference = {"mean": "the mean of all dates", "reference": "the reference"}.get(record.datum, record.datum)
-    text = f"{counted(len(known), 'date')} agree with {reference} within {worst:.2f} px (95 % interval, per axis)."
+    text = f"{counted(len(known), 'date')} agree with {_datum(record)} within {worst:.2f} px (95 % interval, per axis)."
     return text if record.datum == "reference" else f"{text} Nothing here tests the absolute position."
+
+
+def _datum(record: StackRecord) -> str:
+    return {"mean": "the mean of all dates", "reference": "the reference"}.get(record.datum, record.datum)
 
 
 def _years(record: StackRecord) -> list[float]:
