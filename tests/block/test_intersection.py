@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -153,3 +154,38 @@ def test_steps_solve_the_normal_equations_are_not_too_long_and_parallel_rays_hav
     np.testing.assert_allclose(step[1], long * _LONGEST / np.linalg.norm(long))
     np.testing.assert_array_equal(step[3:], 0.0)
     assert _solved(np.zeros((0, 3, 3)), np.zeros((0, 3)))[0].shape == (0, 3)
+
+
+def test_points_of_one_two_and_three_rays_weigh_by_covariances() -> None:
+    """One point has a single ray: it has no place, and no part in the standard error of unit weight."""
+    points = block(noise=0.5, drop=[1, 2, 5])
+    random = np.random.default_rng(6)
+    root = random.normal(size=(points.rays, 2, 2)) + 2 * np.eye(2)
+    shape = root @ root.swapaxes(1, 2)
+    shape *= 2 / np.trace(shape, axis1=1, axis2=2)[:, None, None]
+    points = replace(points, shape_image=shape)
+    found, squares = intersect(MODELS, points), 0.0
+    assert found.rays.tolist() == [3, 2, 1]
+    covariances = []
+    for point in range(2):
+        rows, right, rays = design(points, point)
+        inverse = np.zeros((len(rows), len(rows)))
+        for k, ray in enumerate(rays):
+            # The rows are over sigma already.
+            inverse[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.linalg.inv(shape[ray])
+        cofactors = np.linalg.inv(rows.T @ inverse @ rows)
+        step = cofactors @ rows.T @ inverse @ (right - rows @ TRUTH[point])
+        np.testing.assert_allclose(in_map(found.ground[[point]])[0], TRUTH[point] + step, atol=1e-4)
+        left = right - rows @ (TRUTH[point] + step)
+        squares += left @ inverse @ left
+        np.testing.assert_allclose(
+            found.residuals[rays] / points.sigma_image[rays, None], left.reshape(-1, 2), atol=1e-4
+        )
+        covariances.append(cofactors)
+    # Five rays are ten equations for six unknowns.
+    assert found.sigma0 == pytest.approx(np.sqrt(squares / 4), rel=1e-4)
+    np.testing.assert_allclose(found.covariance[:2], squares / 4 * np.array(covariances), rtol=2e-3, atol=2e-3)
+    assert np.isnan(found.covariance[2]).all()
+    assert np.isnan(found.residuals[points.point == 2]).all()
+    assert np.isnan(found.angles_deg).tolist() == [False, False, True]
+    assert repr(found) == f"<2 of 3 points intersected from 6 rays: sigma0 {found.sigma0:.3g}>"

@@ -57,6 +57,9 @@ def test_all_images_at_once_are_the_models_one_by_one(rpc: RPC, monkeypatch: pyt
         own = by_params.shape[2]
         np.testing.assert_allclose(found.by_params[seen, :, :own], by_params[np.isfinite(wanted[:, 0])], rtol=1e-10)
         assert not found.by_params[seen, :, own:].any()
+        lost = np.setdiff1d(used, seen)
+        assert np.isnan(found.by_point[lost]).any(axis=(1, 2)).all()
+        assert not own or np.isnan(found.by_params[lost]).any(axis=(1, 2)).all()
     of_none = np.flatnonzero(image == len(models))
     assert not any(part[of_none].any() for part in (found.image, found.by_point, found.by_params))
     monkeypatch.setattr(rays, "_SHARE", 100)

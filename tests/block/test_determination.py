@@ -1,0 +1,194 @@
+"""Blocks that are refused because their points leave images open: limits at both sides, and the names in messages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from chains import ORIGIN, Chain, fly
+
+from ortho_pipeline.block import determination
+from ortho_pipeline.block.adjustment import _prepared
+from ortho_pipeline.block.determination import refuse_too_few, refuse_undetermined, uncertain_images
+from ortho_pipeline.block.equations.linear import Linear
+from ortho_pipeline.block.equations.problem import BlockProblem, Pseudo, Selection, State
+from ortho_pipeline.block.equations.unknowns import Columns
+from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
+from ortho_pipeline.models import ImageCorrection
+
+Prepared = tuple[BlockProblem, State, Selection]
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    """Return a block of an image with an affine correction, one without parameters, and one with a shift and drift."""
+    flown = fly(Chain(images=3, convergence_deg=15.0, overlap=0.7, ties=40, errors=2.0, pairwise=False), 8)
+    models = [ImageCorrection.identity(one.model, kind, ORIGIN) for one, kind in
+              zip(flown.start.values(), ("affine", "none", "shift-drift"), strict=True)]  # fmt: skip
+    return _prepared(tuple(models), flown.points, {}, ())
+
+
+def with_rays(prepared: Prepared, image: int, count: int) -> Selection:
+    """Return a selection of so many rays of an image."""
+    problem, _, selection = prepared
+    rays, mine = selection.rays.copy(), np.flatnonzero(problem.points.image == image)
+    rays[mine[count:]] = False
+    return Selection.of(rays, selection.ground)
+
+
+@pytest.mark.parametrize(
+    ("image", "rays", "priors", "least"),
+    [
+        (0, 2, (), 3), (0, 3, (), None), (0, 2, (4,), 3), (0, 2, (1, 4), None), (0, 1, (1, 4), 2), (0, 1, (1, 4, 5), 2),
+        (0, 1, (0, 1, 4, 5), None), (2, 1, (), 2), (2, 2, (), None), (2, 1, (7,), 2), (2, 1, (6, 7), None),
+        (2, 1, (0, 1), 2), (1, 0, (), None),
+    ],
+)  # fmt: skip
+def test_an_image_needs_as_many_equations_as_parameters(
+    prepared: Prepared, image: int, rays: int, priors: tuple[int, ...], least: int | None
+) -> None:
+    """A ray is two, a prior of this image is one."""
+    problem = replace(prepared[0], pseudo=tuple(Pseudo(column, 0.0, 1.0) for column in priors))
+    if least is None:
+        refuse_too_few(problem, with_rays(prepared, image, rays))
+        return
+    count = {0: 6, 2: 4}[image]
+    with pytest.raises(
+        TooFewPoints, match=rf"{rays} points? in the image 'i{image}' cannot determine its {count}"
+    ) as no:
+        refuse_too_few(problem, with_rays(prepared, image, rays))
+    assert f"measure at least {least} points in it" in str(no.value.remedy)
+
+
+def test_constraints_of_a_model_are_equations_too(prepared: Prepared) -> None:
+    problem, _, _ = prepared
+    selection = with_rays(prepared, 0, 2)
+    for known, enough in ((1, False), (2, True)):
+        model = SimpleNamespace(params=np.zeros(6), constraints=lambda known=known: [None] * known)
+        made: Any = replace(problem, models=(model, *problem.models[1:]))  # type: ignore[arg-type]
+        if enough:
+            refuse_too_few(made, selection)
+            continue
+        with pytest.raises(TooFewPoints, match="2 points in the image 'i0'") as no:
+            refuse_too_few(made, selection)
+        assert "measure at least 3 points" in str(no.value.remedy)
+
+
+def test_rays_of_points_that_no_other_image_shows_do_not_count(prepared: Prepared) -> None:
+    problem, _, selection = prepared
+    points = problem.points
+    alone = with_rays(prepared, 2, 0)
+    only = Selection.of(alone.rays & (points.image == 0), selection.ground)
+    with pytest.raises(TooFewPoints, match="no point is in two images"):
+        refuse_too_few(problem, only)
+    # Three rays of the first image are in the second, too; the others are alone there.
+    shown = np.intersect1d(points.point[points.image == 0], points.point[points.image == 1])[:2]
+    some = Selection.of(alone.rays & ((points.image == 0) | np.isin(points.point, shown)), selection.ground)
+    with pytest.raises(TooFewPoints, match="2 points in the image 'i0'"):
+        refuse_too_few(problem, some)
+
+
+# -- undetermined parameters -------------------------------------------------------------------------------------------
+
+
+def solved_of(condition: float, images: int = 6) -> Any:
+    """Return a solution of images with a shift each."""
+    models = [SimpleNamespace(param_names=("col_shift", "row_shift"))] * images
+    points = SimpleNamespace(images=tuple(f"i{k}" for k in range(images)), source="")
+    problem = SimpleNamespace(columns=Columns.of([2] * images), models=models, points=points, size=2 * images)
+    return SimpleNamespace(problem=problem, condition=condition, linear=None)
+
+
+@pytest.mark.parametrize(
+    ("vector", "names"),
+    [
+        ((0, -0.9, 0, 0, 0.26, 0.28, 0, 0, 0, 0, 0, 0),
+         "row_shift of the image 'i0'; row_shift of the image 'i2' (condition"),
+        ((0.1, 0, 0.5, -0.6, 0, 0, 0, 0, 0, 0, 0.19, -0.17),
+         "col_shift, row_shift of the image 'i1'; col_shift of the image 'i5' (condition"),
+        ((0.4, 0, 0.4, 0, 0, 0.4, 0.4, 0, 0, 0, 0, 0), "row_shift of the image 'i2'; col_shift of the image 'i3' ("),
+        ((0.4, 0, 0.4, 0, 0, 0.4, 0.4, 0, 0.4, 0, 0, 0),
+         "col_shift of the image 'i3'; and those of 1 more image (condition"),
+        ((0.4, 0, 0.4, 0, 0, 0.4, 0.4, 0, 0.4, 0.4, 0, 0.4), "'i3'; and those of 2 more images (condition"),
+    ],
+)  # fmt: skip
+def test_the_parameters_of_the_weakest_combination_are_named(
+    monkeypatch: pytest.MonkeyPatch, vector: tuple[float, ...], names: str
+) -> None:
+    """Those with more than three tenths of the largest part; at most four images."""
+    monkeypatch.setattr(determination, "weakest", lambda linear: np.array(vector))
+    refuse_undetermined(solved_of(1e6))
+    with pytest.raises(DegeneratePoints) as no:
+        refuse_undetermined(solved_of(1.01e6))
+    assert names in str(no.value)
+    assert "i4" not in str(no.value)
+    none = solved_of(math.inf)
+    none.problem.size = 0
+    refuse_undetermined(none)
+
+
+# -- uncertain images --------------------------------------------------------------------------------------------------
+
+
+def corner_spread(model: Any, cofactors: np.ndarray) -> float:
+    """Return the largest sigma (px) of a coordinate at a corner, by differences of the image points."""
+    spreads = []
+    for corner in model.corners:
+        partials = []
+        for k in range(len(model.params)):
+            step = 1e-3 * np.eye(len(model.params))[k]
+            ends = [model.with_params(model.params + way * step).ground_to_image(corner[None])[0] for way in (1, -1)]
+            partials.append((ends[0] - ends[1]) / 2e-3)
+        rows = np.array(partials).T
+        spreads.append(np.sqrt(np.diag(rows @ cofactors @ rows.T)))
+    return float(np.max(spreads))
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_the_uncertainty_is_that_of_the_worst_corner_and_of_the_middle_of_the_rays(
+    prepared: Prepared, held: bool
+) -> None:
+    problem, state, selection = prepared
+    sigmas = np.random.default_rng(1).uniform(0.1, 0.5, problem.points.rays)
+    problem = replace(problem, points=problem.points.with_image_sigmas(sigmas))
+    pseudo = (Pseudo(0, 0.0, 1.0, held=True), Pseudo(1, 0.0, 1.0)) if held else (Pseudo(1, 0.0, 1.0),)
+    problem = replace(problem, pseudo=pseudo)
+    linear = Linear.at(problem, state, selection)
+    random = np.random.default_rng(2)
+    scale = np.array([1.0, 4e-3, 4e-3, 1.0, 4e-3, 4e-3])
+    roots = {0: scale[:, None] * random.normal(size=(6, 6)), 2: random.normal(size=(4, 4)) * scale[[0, 2, 3, 5], None]}
+    medians = {image: float(np.median(sigmas[problem.points.image == image])) for image in roots}
+
+    def found(times: float) -> Any:
+        cofactors = SimpleNamespace(of_image=lambda image: times**2 * roots[image] @ roots[image].T)
+        solved: Any = SimpleNamespace(problem=problem, linear=linear, state=state, cofactors=cofactors)
+        return uncertain_images(solved, problem.points.with_image_sigmas(0.1 * sigmas))
+
+    wanted = {
+        image: corner_spread(state.models[image], root @ root.T) / medians[image] for image, root in roots.items()
+    }
+    first, other = sorted(wanted, key=lambda image: wanted[image])
+    assert wanted[first] < 0.99 * wanted[other]
+    for factor, named in ((9.99 / wanted[other], []), (10.01 / wanted[other], [other])):
+        notices = found(factor)
+        assert [one.fields["factor"] for one in notices] == ([] if held else [
+            pytest.approx(factor * wanted[image], rel=1e-6) for image in named
+        ])  # fmt: skip
+        assert all(f"i{other}" in str(one) for one in notices)
+    # At the rays themselves: the median over all coordinates, in their own sigmas.
+    inside = {}
+    for image, root in roots.items():
+        used = linear.ordering.rays_of_image[image]
+        rows = linear.by_params[used][:, :, : len(root)]
+        inside[image] = math.sqrt(float(np.median(np.einsum("kip,pq,kiq->ki", rows, root @ root.T, rows))))
+    worst = max(inside.values())
+    found(99.0 / worst)
+    if held:
+        found(101.0 / worst)
+        return
+    with pytest.raises(DegeneratePoints, match="101 times less"):
+        found(101.0 / worst)
