@@ -6,6 +6,7 @@ import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -247,3 +248,95 @@ def test_a_scalar_agrees_with_a_covariance_within_one_per_cent(tmp_path: Path, f
         else:
             with pytest.raises(InputError, match="gives"):
                 make(factor * 3**0.5)
+
+
+# -- limits ----------------------------------------------------------------------------------------------------------
+
+
+def changed(points: Points, **fields: Any) -> Points:
+    return replace(points, **fields)
+
+
+@pytest.mark.parametrize(("rest", "possible"), [(2e-12, True), (0.4e-12, False)])
+def test_a_covariance_is_singular_if_its_correlation_is_one(tmp_path: Path, rest: float, possible: bool) -> None:
+    """Its square is one less a millionth of a millionth; variances of 4 and 9 px2."""
+    both = 6 * (1 - rest) ** 0.5
+    for sign in (1, -1):
+        matrix = [[4, sign * both], [sign * both, 9]]
+        for make in (
+            lambda matrix=matrix: made(1).with_covariance_image([matrix]).covariance_image[0],
+            lambda matrix=matrix: read(tmp_path / "p.csv", f",4,9,{matrix[0][1]!r},").covariance_image[0],
+        ):
+            if possible:
+                np.testing.assert_array_equal(make(), matrix)
+            else:
+                with pytest.raises(InputError, match="positive definite"):
+                    make()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_covariances_that_differ_by_rounding_are_their_mean(order: int) -> None:
+    """By less than a millionth of a millionth of the trace, here 13 px2."""
+    near, far = ([[4, 1.0], [1.0 + skew, 9]] for skew in (1.2e-11, 1.4e-11))
+    if order < 0:
+        near, far = (np.transpose(matrix).tolist() for matrix in (near, far))
+    found = made(1).with_covariance_image([near]).covariance_image[0]
+    assert found[0, 1] == found[1, 0] == pytest.approx(1.0 + 0.6e-11, abs=1e-13)
+    assert (found[0, 0], found[1, 1]) == (4, 9)
+    with pytest.raises(InputError, match="symmetric"):
+        made(1).with_covariance_image([far])
+
+
+def test_the_message_names_the_point_with_the_error() -> None:
+    """Points before it err alike in all directions or not."""
+    plain = changed(made(5), covariance_image=None, groups=None)
+    good = plain.covariance_image.copy()
+    good[1] = [[4, 1], [1, 2]]
+    points = plain.with_covariance_image(good)
+    np.testing.assert_array_equal(points.covariance_image, good)
+    for k, wrong, said in (
+        (3, [[1, 2], [2, 1]], "positive definite"), (4, [[1, 0.1], [0.2, 1]], "symmetric"),
+        (2, [[np.nan, 0], [0, 1]], "finite"),
+    ):  # fmt: skip
+        bad = good.copy()
+        bad[k] = np.array(wrong)
+        with pytest.raises(InputError, match=rf"of point {k + 1} is not {said}"):
+            points.with_covariance_image(bad)
+        with pytest.raises(InputError, match=rf"of point {k + 1} is not {said}"):
+            replace(points, covariance_image=bad)
+    sigma = points.sigma_image.copy()
+    sigma[1] *= 1.02
+    with pytest.raises(InputError, match=rf"of point 2 is {sigma[1]:g}, but its covariance_image gives {3**0.5:g}"):
+        replace(points, sigma_image=sigma)
+
+
+def test_a_direction_may_differ_in_one_element() -> None:
+    """Variances that differ, or a covariance, each alone."""
+    matrices = np.array([[[4.0, 0], [0, 9]], [[4, 1], [1, 4]], [[4, -1], [-1, 4]], [[4, 0], [0, 4]]])
+    points = made(4).with_covariance_image(matrices)
+    np.testing.assert_array_equal(points.covariance_image, matrices)
+    np.testing.assert_array_equal(points.sigma_image, np.sqrt([6.5, 4, 4, 4]))
+    # The last one has the same error in all directions: it is scaled by its sigma alone.
+    twice = replace(points, sigma_image=points.sigma_image * [1, 1, 1, 2])
+    np.testing.assert_array_equal(twice.covariance_image[3], [[16, 0], [0, 16]])
+
+
+@pytest.mark.parametrize(("group", "known"), [("0", 0), (str(2**53 - 1), 2**53 - 1), (str(2**53), None), ("", -1)])
+def test_groups_are_numbered_from_zero(tmp_path: Path, group: str, known: int | None) -> None:
+    if known is None:
+        with pytest.raises(InputError, match="not a group"):
+            read(tmp_path / "p.csv", f"0.5,,,,{group}")
+    else:
+        assert read(tmp_path / "p.csv", f"0.5,,,,{group}").groups.tolist() == [known]
+
+
+def test_errors_in_common_may_be_zero_and_are_finite(tmp_path: Path) -> None:
+    points = made(3)
+    for name in ("sigma_common", "sigma_alike"):
+        assert getattr(changed(points, **{name: [0, 0.25, 2]}), name).tolist() == [0, 0.25, 2]
+        for wrong in ([0, -1e-9, 1], [0, np.inf, 1], [np.nan, 0, 1], [1, 1]):
+            with pytest.raises(InputError) as caught:
+                changed(points, **{name: wrong})
+            assert caught.value.field == name
+    assert read(tmp_path / "p.csv", "0.5,,,,,0").sigma_common.tolist() == [0.0]
+    assert read(tmp_path / "p.csv", "0.5,,,,,0.75").sigma_common.tolist() == [0.75]

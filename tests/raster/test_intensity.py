@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from osgeo import gdal
+from scipy.ndimage import gaussian_filter
+from scipy.stats import entropy
 
 from ortho_pipeline.raster.intensity import Intensity, contents, enlarged
 from ortho_pipeline.raster.pyramid import Pyramid, stretch
@@ -139,3 +141,80 @@ def test_the_stretch_is_from_percentile_1_to_99() -> None:
     assert stretch(np.full(3, np.nan, np.float32)) is None
     low, high = stretch(np.full(3, 5.0, np.float32)) or (0.0, 0.0)
     assert low == 5.0 < high < 5.001
+
+
+@pytest.mark.parametrize(
+    ("content", "bands"),
+    [
+        # At least half of the content of the best, at most four, in the order of the file.
+        ((4.0, 2.0, 1.99, 0.0, 3.0), (1, 2, 5)), ((5.0, 9.0, 4.6, 4.7, 4.8, 4.9), (1, 2, 5, 6)),
+        ((0.0, 0.0, 0.1), (3,)), ((2.0, 2.0, 2.0, 2.0, 2.0), (1, 2, 3, 4)),
+    ],
+)  # fmt: skip
+def test_bands_with_half_of_the_best_content_are_averaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: tuple[float, ...], bands: tuple[int, ...]
+) -> None:
+    monkeypatch.setattr("ortho_pipeline.raster.intensity.contents", lambda samples: np.array(content[: len(samples)]))
+    pixels = np.ones((len(content), 70, 80), np.float32)
+    assert Intensity(raster(tmp_path / "a.tif", pixels)).averaged == bands
+    assert Intensity(raster(tmp_path / "a.tif", pixels)).best(1) == (int(np.argmax(content)) + 1,)
+
+
+def test_content_is_that_of_differences_along_both_axes() -> None:
+    """Entropy in 255 steps of the range from percentile 1 to 99, times the correlation of neighbours, by SciPy."""
+    random = np.random.default_rng(8)
+    bands = gaussian_filter(random.normal(size=(3, 2, 50, 40)), (0, 0, 1.5, 0.8)).astype(np.float32)
+    bands[2] *= [[[3.0]], [[-40.0]]]
+    bands[1, 0, :3, :7] = np.nan
+    wanted = []
+    for band in bands:
+        low, high = np.nanquantile(band, (0.01, 0.99))
+        steps = 255 * (np.clip(band, low, high) - low) / (high - low)
+        bits = 0.0
+        for one, next_ in ((steps[:, :-1], steps[:, 1:]), (steps[..., :-1], steps[..., 1:])):
+            change = (next_ - one)[np.isfinite(next_ - one)]
+            alike = 1 - np.mean(change**2) / (2 * np.nanvar(steps))
+            bits += alike * entropy(np.bincount(np.rint(change).astype(int) + 255), base=2) / 2
+        wanted.append(bits)
+    np.testing.assert_allclose(contents(bands), wanted, rtol=1e-3)
+    assert min(wanted) > 1.0
+
+
+@pytest.mark.parametrize(("empty", "counts"), [(9, True), (11, False)])
+def test_a_band_with_nine_tenths_of_the_values_of_the_fullest_counts(empty: int, counts: bool) -> None:
+    full = np.cumsum(np.random.default_rng(3).normal(size=(1, 100, 60)), axis=1).astype(np.float32)
+    less = full.copy()
+    less[:, :empty] = np.nan
+    found = contents(np.stack([less, full]))
+    assert found[1] > 0
+    assert bool(found[0] > 0) is counts
+
+
+@pytest.mark.parametrize(("down", "across"), [(0.0395, 0.0395), (0.0405, 0.0395), (0.0395, 0.0405)])
+def test_the_finest_detail_of_an_enlarged_raster_is_less_than_a_part_of_the_middle(down: float, across: float) -> None:
+    """Waves of 3/32 and of more than 3/8 cycles per pixel: the power of the fine ones is 0.0016 of the others.
+
+    Those of 1/32 and of 5/16 are neither.
+    """
+
+    def waves(count: int, fine: float) -> np.ndarray:
+        turns = 2 * np.pi * np.arange(count) / count
+        parts = ((count // 32, 9.0), (3 * count // 32, 1.0), (5 * count // 16, 10.0), (3 * count // 8 + 1, fine))
+        return sum((size * np.cos(number * turns + number) for number, size in parts), start=np.zeros(count))
+
+    windows = (waves(64, down)[:, None] + waves(96, across) + np.array([5.0, -3.0])[:, None, None]).astype(np.float32)
+    assert windows.shape == (2, 64, 96)
+    assert enlarged(windows) is (max(down, across) < 0.04)
+
+
+def test_a_coarse_copy_is_of_overviews_where_there_are_some(tmp_path: Path) -> None:
+    """These are means here; without them it has single pixels."""
+    pixels = np.random.default_rng(6).uniform(1, 100, (2, 128, 192)).astype(np.float32)
+    means = pixels.mean(axis=0).reshape(8, 16, 12, 16).mean(axis=(1, 3))
+    source = raster(tmp_path / "a.tif", pixels)
+    assert np.abs(Pyramid(source, (1, 2)).coarse - means).max() > 5
+    del source
+    dataset = gdal.Open(str(tmp_path / "a.tif"))
+    dataset.BuildOverviews("AVERAGE", [2, 4, 8, 16])
+    del dataset
+    np.testing.assert_allclose(Pyramid(RasterSource(tmp_path / "a.tif"), (1, 2)).coarse, means, rtol=1e-4)

@@ -9,8 +9,9 @@ import pyproj
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile
-from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened
+from ortho_pipeline.raster.pansharpened import CommonExtent, Pansharpened, sharpened, upsampled
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -124,3 +125,87 @@ def test_pixels_without_a_value_have_that_of_the_product(tmp_path: Path) -> None
     assert valid.sum() == 64 * 64 - 1
     np.testing.assert_array_equal(pixels[:, 10, 20], [-9, -9])
     np.testing.assert_allclose(pixels[:, valid], 500.0)
+
+
+@pytest.mark.parametrize(
+    ("dx", "dy", "ratio"),
+    # The size of a pixel times 40 columns or 50 rows, in panchromatic pixels: up to a thousandth is rounding.
+    [
+        (0.9e-3 / 40, 0, 4), (1.1e-3 / 40, 0, 0), (0, 0.9e-3 / 50, 4), (0, 1.1e-3 / 50, 0), (-1.1e-3 / 40, 0, 0),
+        (0, 4, 0),
+    ],
+)  # fmt: skip
+def test_grids_nest_if_their_edges_agree_at_both_ends(dx: float, dy: float, ratio: int) -> None:
+    pan = Grid(UTM, 1000.0, 5000.0, 1.0, 1.0, 170, 210)
+    colours = Grid(UTM, 1003.0, 4996.0, 4.0 + dx, 4.0 + dy, 40, 50)
+    found = CommonExtent.of(pan, colours)
+    assert found.ratio == ratio
+    assert found.whole is found.grid or ratio == 4
+
+
+@pytest.mark.parametrize("across", [True, False])
+@pytest.mark.parametrize(
+    ("off", "ratio", "first", "last"),
+    [(0.9e-3, 4, 3, 163), (-0.9e-3, 4, 3, 163), (1.1e-3, 0, 4, 163), (-1.1e-3, 0, 3, 162), (0.5, 0, 4, 163)],
+)
+def test_only_whole_panchromatic_pixels_are_common(across: bool, off: float, ratio: int, first: int, last: int) -> None:
+    """Colours begin three panchromatic pixels after the first, and a part of one."""
+    pan = Grid(UTM, 1000.0, 5000.0, 1.0, 1.0, 170, 170)
+    move = (off, 0.0) if across else (0.0, off)
+    found = CommonExtent.of(pan, Grid(UTM, 1003.0 + move[0], 4997.0 - move[1], 4.0, 4.0, 40, 40))
+    xmin, ymin, xmax, ymax = found.grid.extent
+    ends = ((xmin - 1000, xmax - 1000), (5000 - ymax, 5000 - ymin))
+    assert ends == (((first, last), (3, 163)) if across else ((3, 163), (first, last)))
+    assert found.ratio == ratio
+
+
+def test_orthos_side_by_side_have_nothing_in_common() -> None:
+    pan = Grid(UTM, 1000.0, 5000.0, 1.0, 1.0, 60, 40)
+    for left, top in ((60, 0), (-80, 0), (0, 40), (0, -80)):
+        with pytest.raises(InputError, match="do not overlap"):
+            CommonExtent.of(pan, Grid(UTM, 1000.0 + left, 5000.0 - top, 4.0, 4.0, 20, 20))
+        inwards = left - np.sign(left), top - np.sign(top)
+        found = CommonExtent.of(pan, Grid(UTM, 1000.0 + inwards[0], 5000.0 - inwards[1], 4.0, 4.0, 20, 20)).grid
+        assert (found.width, found.height) == (1 if left else 60, 1 if top else 40)
+
+
+def test_arrays_are_sharpened_by_the_weighted_sum_of_their_bands() -> None:
+    """The sum is 0.25 * 100 + 0.75 * 300 = 250: a panchromatic value of 500 doubles each band."""
+    pan = np.full((8, 12), 500.0, np.float32)
+    pan[3, 7], pan[6, 2] = 125.0, np.nan
+    colours = np.stack([np.full((2, 3), 100.0), np.full((2, 3), 300.0)]).astype(np.float32)
+    found = sharpened(pan, colours, (0.25, 0.75))
+    assert (found.shape, found.dtype) == ((2, 8, 12), np.float64)
+    np.testing.assert_allclose(found, np.stack([pan / 2.5, pan / 2.5 * 3]), rtol=1e-6)
+
+
+def test_a_plane_stays_a_plane_when_it_is_upsampled() -> None:
+    """Positions are those of the middles of pixels. The middle of a hole has no value, and no number comes from it."""
+    rows, columns = np.mgrid[0:10, 0:15] + 0.5
+    bands = np.stack([7 * columns - 3 * rows, 50 + rows]).astype(np.float32)
+    found = upsampled(bands, 40, 45)
+    fine_rows, fine_columns = (np.mgrid[0:40, 0:45] + 0.5) / np.array([4.0, 3.0])[:, None, None]
+    inside = (slice(None), slice(8, -8), slice(6, -6))
+    expected = np.stack([7 * fine_columns - 3 * fine_rows, 50 + fine_rows])
+    np.testing.assert_allclose(found[inside], expected[inside], atol=2e-4)
+    bands[:, 2:8, 4:11] = np.nan
+    holes = upsampled(bands, 40, 45)
+    assert np.isnan(holes[:, 18:22, 20:25]).all()
+    for far in (slice(0, 3), slice(42, 45)):
+        np.testing.assert_allclose(holes[..., far], found[..., far], atol=2e-4)
+
+
+@pytest.mark.parametrize("bits", [11, 12])
+def test_pixels_of_few_bits_keep_to_them(tmp_path: Path, bits: int) -> None:
+    """Another nodata value in each raster, so GDAL computes in floating point."""
+    sharp, wide = np.full((1, 64, 64), 60_000, np.uint16), np.full((2, 16, 16), 2000, np.uint16)
+    sharp[0, 30:], sharp[0, 0, 0] = 1200, 1
+    pan = write(tmp_path / "p.tif", place(0, 0, 64, 64), sharp, 1)
+    colours = tmp_path / "m.tif"
+    gdal.Translate(str(colours), str(write(tmp_path / "n.tif", place(0, 0, 16, 16, RATIO), wide, 2)),
+                   creationOptions=[f"NBITS={bits}"])  # fmt: skip
+    pixels, valid = opened(pan, colours).read(0, 0, 64, 64)
+    assert not valid[0, 0]
+    assert valid.sum() == 64 * 64 - 1
+    np.testing.assert_array_equal(pixels[:, 5:25], 2**bits - 1)
+    np.testing.assert_array_equal(pixels[:, 35:], 1200)

@@ -110,6 +110,38 @@ def test_the_kernel_is_as_wide_as_the_coarser_pixels(tmp_path: Path) -> None:
     np.testing.assert_allclose(pixels[0, 20], np.maximum(1 - apart, 0) / 4, atol=1e-6)
 
 
+def test_the_kernel_is_as_high_as_the_coarser_pixels(tmp_path: Path) -> None:
+    """A line of one row, in pixels three times as high; the columns are finer, and a kernel is never narrower."""
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 60, 60, 1, gdal.GDT_Float64)
+    dataset.SetProjection(GRID.crs.to_wkt())
+    dataset.SetGeoTransform((500_000.0, 10.0, 0.0, 4_000_000.0, 0.0, -20.0))
+    dataset.WriteArray(np.tile((np.arange(60) == 31)[:, None], (1, 60)) * 1.0)
+    del dataset
+    pixels, _ = Regridded(tmp_path / "a.tif", Grid(GRID.crs, 500_000.0, 4e6, 5.0, 60.0, 120, 20)).read(0, 0, 120, 20)
+    apart = np.abs(31.5 - 3 * (np.arange(20) + 0.5)) / 3
+    np.testing.assert_allclose(pixels[0, :, 50], np.maximum(1 - apart, 0) / 3, atol=1e-6)
+    np.testing.assert_allclose(pixels[0, :, 51], pixels[0, :, 50], atol=1e-9)
+
+
+@pytest.mark.parametrize("across", [True, False])
+@pytest.mark.parametrize(("off", "copied"), [(0.9e-3, True), (-0.9e-3, True), (1.1e-3, False), (-1.1e-3, False)])
+def test_pixels_within_a_thousandth_are_the_same(ortho: Path, across: bool, off: float, copied: bool) -> None:
+    """Coordinates that are resampled are those of the new middles."""
+    left, top = 500_100.0 + 10.0 * off * across, 3_999_900.0 + 20.0 * off * (not across)
+    pixels, valid = Regridded(ortho, Grid(GRID.crs, left, top, 10.0, 20.0, 20, 20)).read(3, 2, 10, 8)
+    assert valid.all()
+    moved = pixels[:, 0, 0] - (500_135.0, 3_999_850.0)
+    expected = (0.0, 0.0) if copied else (10.0 * off * across, 20.0 * off * (not across))
+    np.testing.assert_allclose(moved, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("relative", "copied"), [(0.9e-9, True), (1.2e-9, False)])
+@pytest.mark.parametrize("across", [True, False])
+def test_pixels_of_another_size_are_not_the_same(ortho: Path, across: bool, relative: float, copied: bool) -> None:
+    dx, dy = 10.0 * (1 + relative * across), 20.0 * (1 + relative * (not across))
+    assert (Regridded(ortho, Grid(GRID.crs, 500_000.0, 4e6, dx, dy, 20, 20))._offset == (0, 0)) is copied
+
+
 def test_an_ortho_of_another_place_is_refused(ortho: Path) -> None:
     for left, top in ((500_600.0, 4e6), (499_400.0, 4e6), (500_000.0, 3_999_200.0), (500_000.0, 4_000_800.0)):
         with pytest.raises(InputError, match="does not overlap"):

@@ -1,0 +1,71 @@
+"""Creation options of an ortho: defaults, what replaces them, and values at their limits."""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster.verified_writing import _fits, checked_options
+
+TILES = {"TILED": "YES", "BLOCKXSIZE": "384", "BLOCKYSIZE": "384"}
+PACKED = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "LEVEL": "6"}
+
+
+@pytest.mark.parametrize(
+    ("driver", "chosen", "expected"),
+    [
+        ("GTiff", {}, TILES), ("GTiff", {"TILED": "no"}, {"TILED": "no"}),
+        ("GTiff", {"compress": "LZW", "TILED": "YES"}, {**TILES, "COMPRESS": "LZW"}),
+        ("GTiff", {"BLOCKXSIZE": "128"}, {**TILES, "BLOCKXSIZE": "128"}),
+        ("COG", {}, {**PACKED, "NUM_THREADS": "3"}),
+        ("COG", {"LEVEL": "9"}, {**PACKED, "NUM_THREADS": "3", "LEVEL": "9"}),
+        ("COG", {"COMPRESS": "zstd"}, {**PACKED, "NUM_THREADS": "3", "COMPRESS": "zstd"}),
+        ("COG", {"COMPRESS": "LZW"}, {**PACKED, "NUM_THREADS": "3", "COMPRESS": "LZW"}),
+        # Others have neither a predictor nor this scale of effort.
+        ("COG", {"COMPRESS": "NONE"}, {"NUM_THREADS": "3", "COMPRESS": "NONE"}),
+    ],
+)  # fmt: skip
+def test_defaults_are_lossless_and_give_way(driver: str, chosen: dict[str, str], expected: dict[str, str]) -> None:
+    assert checked_options(driver, chosen, 3, 384) == {"BIGTIFF": "IF_SAFER", **expected}
+
+
+def test_there_is_always_a_thread() -> None:
+    assert [checked_options("COG", {}, threads)["NUM_THREADS"] for threads in (0, 1, 2)] == ["1", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "said"),
+    [
+        ({"TARGET_SRS": "EPSG:3857"}, "TARGET_SRS is not allowed"), ({"COMPRESSION": "LZW"}, "no creation option"),
+        ({"COMPRESS": "LZ77"}, "'LZ77' is not a value"), ({"LEVEL": "6;7"}, "'6;7' is not a value"),
+    ],
+)  # fmt: skip
+def test_what_changes_more_than_the_layout_is_refused(chosen: dict[str, str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        checked_options("COG", chosen, 1)
+
+
+@pytest.mark.parametrize(
+    ("option", "good", "bad"),
+    [
+        ('type="int" min="1" max="9"', ("1", "9", "+5"), ("0", "10", "1.5", "many")),
+        ('type="int" min="1"', ("1", "99999"), ("0", "-3")), ('type="unsigned int" max="7"', ("7",), ("8", "x")),
+        ('type="float" min="0" max="2.5"', ("0", "2.5", "1e-3"), ("-0.1", "2.6", "x")),
+        ('type="boolean"', ("YES", "no", "True", "off", "1", "0"), ("2", "maybe")), ("", ("anything",), ()),
+        ('type="string"', ("anything",), ()),
+    ],
+)  # fmt: skip
+def test_a_value_is_of_the_type_and_within_the_limits(option: str, good: Any, bad: Any) -> None:
+    element = ElementTree.fromstring(f"<Option name='X' {option}/>")
+    assert [_fits(element, value) for value in (*good, *bad)] == [True] * len(good) + [False] * len(bad)
+
+
+def test_a_choice_is_one_of_its_values_or_their_other_names() -> None:
+    element = ElementTree.fromstring(
+        "<Option name='X' type='string-select'><Value>YES</Value><Value alias='auto'>BEST</Value></Option>"
+    )
+    assert [_fits(element, value) for value in ("yes", "Best", "AUTO", "no")] == [True, True, True, False]
+    assert _fits(ElementTree.fromstring("<Option name='X' type='string-select'/>"), "free")
