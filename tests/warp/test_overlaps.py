@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from osgeo import gdal, osr
 from scipy.ndimage import gaussian_filter, shift
 
 from ortho_pipeline.imaging.registration import details
-from ortho_pipeline.warp.mosaic.overlaps import _all_valid, _ties, _windows
+from ortho_pipeline.warp.mosaic.layout import Ortho, lay_out
+from ortho_pipeline.warp.mosaic.overlaps import _all_valid, _ties, _windows, overlaps
 
 
 @pytest.mark.parametrize(
@@ -54,3 +58,24 @@ def test_patches_show_how_far_the_second_image_is_moved(moved) -> None:
     fewer = _ties(details(one), details(other), valid, 64)
     assert len(fewer) < len(ties)
     assert _ties(one[:65], other[:65], valid[:65], 64).shape == (0, 2)
+
+
+def oblong(path: Path, column: int, row: int, width: int, height: int) -> Ortho:
+    """Write an ortho of pixels of 2 x 3 m, all of which are valid."""
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), width, height, 1, gdal.GDT_Byte)
+    system = osr.SpatialReference()
+    system.ImportFromEPSG(32633)
+    dataset.SetSpatialRef(system)
+    dataset.SetGeoTransform((5e5 + 2 * column, 2.0, 0.0, 5e6 - 3 * row, 0.0, -3.0))
+    del dataset
+    return Ortho(path.stem, path)
+
+
+def test_orthos_overlap_in_a_pixel_or_more(tmp_path: Path) -> None:
+    """The third meets the first in one pixel and the second in a side only; the fourth is alone."""
+    orthos = [oblong(tmp_path / "a.tif", 0, 0, 40, 30), oblong(tmp_path / "b.tif", 33, 9, 20, 12),
+              oblong(tmp_path / "c.tif", 39, -20, 20, 21), oblong(tmp_path / "d.tif", 90, 0, 5, 5),
+              oblong(tmp_path / "e.tif", 53, 9, 9, 9)]  # fmt: skip
+    found = overlaps(lay_out(orthos, "first-on-top"))
+    assert [(pair.first.ortho.name, pair.second.ortho.name) for pair in found] == [("a", "b"), ("a", "c")]
+    assert [pair.pixels for pair in found] == pytest.approx([7 * 12, 1])
