@@ -107,8 +107,9 @@ def test_only_the_highest_terrain_bounds_lines_that_go_many_ways(monkeypatch, en
     assert captured(monkeypatch, ends) is None
 
 
-def test_the_terrain_has_all_that_a_line_can_meet_within_its_relief() -> None:
+def test_the_terrain_has_all_that_a_line_can_meet_until_it_is_above_all() -> None:
     made, ends = look(), (np.array([0.5, -0.25]), np.array([1.0, -0.5]))
+    assert 39.9 < made._relief <= 40.0
     places = np.array([[60.0, 100.0], [70.0, 110.0]])
     terrain = made._terrain(places, ends, math.inf)
     assert terrain is not None
@@ -116,23 +117,27 @@ def test_the_terrain_has_all_that_a_line_can_meet_within_its_relief() -> None:
     assert terrain.heights.shape == (bottom - top, right - left)
     np.testing.assert_array_equal(terrain.heights, HEIGHTS[top:bottom, left:right])
     assert (terrain.low, terrain.high) == (terrain.heights.min(), terrain.heights.max())
-    relief = terrain.high - terrain.low
-    assert made._range == relief
     assert left <= 60
     assert bottom - 1 >= 110
-    assert right - 1 >= 70 + relief * 1.0
-    assert top <= 100 - relief * 0.5
+    assert right - 1 >= 70 + made._relief * 1.0
+    assert top <= 100 - made._relief * 0.5
     assert right <= 70 + 41 * 1.0 + 8, "and hardly more"
     assert not terrain.void
-    # The next look begins with this range, and finds the same.
-    again = made._terrain(places, ends, math.inf)
-    assert again is not None
-    assert again.window == terrain.window
     size = (right - left) * (bottom - top)
-    assert look()._terrain(places, ends, size) is not None
-    assert look()._terrain(places, ends, size - 1) is None
+    assert made._terrain(places, ends, size) is not None
     assert made._terrain(places, ends, size - 1) is None
     assert made._terrain(places, (np.zeros(2), np.zeros(2)), size - 1) is not None
+
+
+def test_higher_terrain_beyond_the_ortho_counts_as_far_as_lines_below_it_go() -> None:
+    """Nodes end at sample 192, and lines go a sample in 4 m: 40 m, the range that is stated, lead to sample 202."""
+    heights = np.full((200, 220), 100.0)
+    heights[40:60, 214] = 290.0
+    assert look(heights, (0.5, 0.0))._relief == 0.0
+    # A wall of 90 m leads to sample 214.
+    heights[40:60, 199] = 190.0
+    assert look(heights, (0.5, 0.0))._relief == 190.0
+    assert look(np.full_like(heights, np.nan), (2.0, 0.0))._relief == 0.0
 
 
 def test_terrain_with_a_void_or_places_beyond_it_is_told() -> None:

@@ -92,3 +92,27 @@ def test_samples_that_are_nearly_as_dense_as_pixels_are_not_looked_at_twice(monk
     for samples, calm in ((terrain.heights.size + 0.5, True), (terrain.heights.size - 0.5, False)):
         monkeypatch.setattr(visibility, "_PIXELS_PER_SAMPLE", 256 * 48 / samples)
         assert look((1.5, 0.2))._is_calm(0, 2) == calm
+
+
+@pytest.mark.parametrize("way", [(2.0, 0.0), (-1.0, 0.0), (0.3, 2.0)])
+def test_a_tower_beyond_a_flat_tile_hides_as_much_in_any_order_of_tiles(way: tuple[float, float]) -> None:
+    """A tower of 80 m on flat ground: tiles from which only flat ground is near come first, last, or all at once."""
+    heights = np.full((160, 190), 100.0)
+    heights[20 + 50 : 20 + 60, 30 + 70 : 30 + 76] = 180.0
+    surface = dem_of(Memory(heights, (5e5 - 300, 6.28e6 + 200)), "ellipsoid", False, "error", 10**8)
+    sight = Sight.__new__(Sight)
+    sight.grid = GRID
+    shares = []
+    for side, back in ((256, False), (256, True), (1024, False)):
+        made = Visibility(
+            sight, surface, (100.0, 180.0), 10**9, way=lambda columns, rows, heights: np.tile(way, (len(columns), 1))
+        )
+        out = np.zeros((GRID.height, GRID.width), dtype=np.uint8)
+        places = [(left, top) for top in range(0, GRID.height, side) for left in range(0, GRID.width, side)]
+        for left, top in places[:: -1 if back else 1]:
+            size = min(side, GRID.width - left), min(side, GRID.height - top)
+            out[top : top + side, left : left + side] = made.look(left, top, *size)
+        shares.append(out)
+    assert (shares[0] == HIDDEN).sum() > 3000
+    np.testing.assert_array_equal(shares[0], shares[1])
+    np.testing.assert_array_equal(shares[0], shares[2])

@@ -60,8 +60,9 @@ def fill(lattice: Nodes, heights: PixelHeights, even: float, size: Any, radii: A
         for i in range((width - 1) // spacing + 1):
             first = i * spacing
             count = min(spacing, width - first)
-            _along(nodes[j, i], nodes[j, i + 1], nodes[j + 1, i], nodes[j + 1, i + 1], fy, begin, grow)
-            _along(samples[j, i], samples[j, i + 1], samples[j + 1, i], samples[j + 1, i + 1], fy, place, way)
+            _along(nodes[j, i], nodes[j, i + 1], nodes[j + 1, i], nodes[j + 1, i + 1], fy, spacing, begin, grow)
+            west, east = (samples[j, i], samples[j + 1, i]), (samples[j, i + 1], samples[j + 1, i + 1])
+            _along(west[0], east[0], west[1], east[1], fy, spacing, place, way)
             # Simple loops over pixels, one after the other, are faster than all at once.
             _scaled_heights(lattice, heights.dem, place, way, ticks, scaled, count)
             for f in range(_FIELDS):
@@ -77,7 +78,7 @@ def fill(lattice: Nodes, heights: PixelHeights, even: float, size: Any, radii: A
 
 
 @inlined
-def _along(northwest, northeast, southwest, southeast, fy, begin, grow):
+def _along(northwest, northeast, southwest, southeast, fy, spacing, begin, grow):
     """Fill the values at the west of a cell and how much they grow to its east; a node without weight may be NaN."""
     for k in range(begin.shape[0]):
         for f in range(begin.shape[1]):
@@ -85,7 +86,8 @@ def _along(northwest, northeast, southwest, southeast, fy, begin, grow):
             if fy > 0.0:
                 west += (southwest[k, f] - west) * fy
                 east += (southeast[k, f] - east) * fy
-            begin[k, f], grow[k, f] = west, east - west
+            # With one pixel, its first node, a cell does not need what lies east: it may be NaN.
+            begin[k, f], grow[k, f] = west, east - west if spacing > 1 else 0.0
 
 
 @inlined

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.base import Surface, Window
 from ortho_pipeline.surface.dem import DemSurface
@@ -34,7 +35,7 @@ _RISE = 100.0
 _EARTH = 6_371_000.0
 #: Least side of a piece of a tile whose heights are too many for the memory.
 _PIECE = 64
-#: So often the window of a piece grows, because higher terrain was found in it.
+#: So often the area whose heights are looked at grows, because higher terrain was found in it.
 _WIDER = 12
 #: Memory (B) per sample of the terrain that is looked over.
 _CELL_BYTES = 48
@@ -75,7 +76,7 @@ class Visibility:
         low, high = heights
         self._middle, self._half = (low + high) / 2, max((high - low) / 2, 1.0)
         self._sampler = surface.sampler(sight.grid.crs)
-        self._range = 0.0
+        self._relief = self._range_of_heights() if isinstance(surface, DemSurface) else 0.0
         self._calm: dict[tuple[int, int], bool] = {}
 
     def look(self, left: int, top: int, width: int, height: int) -> Classes:
@@ -177,34 +178,43 @@ class Visibility:
             _look(rays, terrain, ends, row, column, out)
 
     def _terrain(self, places: Array, ends: tuple[Array, Array], most: float) -> _Terrain | None:
-        """Return the terrain that lines from samples ``(n, 2)`` may meet; None if that is more samples than `most`.
-
-        It begins with the range of heights that was found last: the result is the same, but heights are mostly read
-        once.
-        """
-        rise, window, heights = self._range, None, np.empty((0, 0))
-        low, high, void = math.inf, -math.inf, 0
-        for _ in range(_WIDER):
-            wanted = self._surface.window_under(np.concatenate([places, *(places + rise * end for end in ends)]))
-            if wanted is None:
-                return _Terrain(heights, (0, 0, 0, 0), math.inf, -math.inf, True)
-            if wanted != window:
-                left, top, right, bottom = wanted
-                if (right - left) * (bottom - top) > most:
-                    if rise == 0.0 or window is not None:
-                        return None
-                    rise = self._range = 0.0
-                    continue
-                window = wanted
-                heights = self._surface.window(left, top, right - left, bottom - top)
-                low, high, void = kernel.extremes(heights)
-            if high - low <= rise:
-                break
-            rise = high - low
-        assert window is not None
-        self._range = max(high - low, 0.0)
+        """Return the terrain that lines from samples ``(n, 2)`` may meet; None if that is more samples than `most`."""
+        window = self._window_of(places, ends, self._relief)
+        if window is None:
+            return _Terrain(np.empty((0, 0)), (0, 0, 0, 0), math.inf, -math.inf, True)
+        left, top, right, bottom = window
+        if (right - left) * (bottom - top) > most:
+            return None
+        heights = self._surface.window(left, top, right - left, bottom - top)
+        low, high, void = kernel.extremes(heights)
         inside = (places >= window[:2]).all() and (places <= np.subtract(window[2:], 1)).all()
         return _Terrain(heights, window, low, high, void > 0 or not inside)
+
+    def _window_of(self, places: Array, ends: tuple[Array, Array], rise: float) -> Window | None:
+        """Return the samples under lines from places until they have risen so far (m)."""
+        return self._surface.window_under(np.concatenate([places, *(places + rise * end for end in ends)]))
+
+    def _range_of_heights(self) -> float:
+        """Return how far (m) the highest terrain that lines from the ortho may meet is above the lowest.
+
+        A line that has risen so far is above all of it, whichever tile it comes from. The area grows with the range
+        that is found in it. A summit beyond it that is higher than all ground before it is not found.
+        """
+        rays = self._rays(0, 0, self._sight.grid.width, self._sight.grid.height)
+        places, ends, rise = rays.samples.reshape(-1, 2), _extremes(rays.slopes), 2 * self._half
+        for _ in range(_WIDER):
+            window = self._window_of(places, ends, rise)
+            if window is None:
+                return 0.0
+            left, top, right, bottom = window
+            try:
+                low, high = self._surface.range_within(left, top, right - left, bottom - top)
+            except InputError:
+                return 0.0  # no height at all
+            if high - low <= rise:
+                return high - low
+            rise = high - low
+        return rise
 
 
 class _Terrain(NamedTuple):
