@@ -93,21 +93,26 @@ def kept_rows(made: Drawn, k: int, without: int | None) -> np.ndarray:
     return np.setdiff1d(np.arange(2 * rays + 3 * made.chunk.ground), gone)
 
 
+@pytest.mark.parametrize("unknown", [0.8, np.inf])
 @pytest.mark.parametrize(("rays", "ground"), [(1, True), (2, False), (2, True), (3, False), (4, True)])
-def test_contradictions_are_the_squares_that_generalised_least_squares_leave(rays: int, ground: bool) -> None:
-    made = drawn(rays, ground, sigmas=np.where(np.isfinite(SIGMAS), SIGMAS, 0.8))
+def test_contradictions_are_the_squares_that_generalised_least_squares_leave(
+    rays: int, ground: bool, unknown: float
+) -> None:
+    """Rows of an unknown coordinate count as none."""
+    made = drawn(rays, ground, sigmas=np.where(np.isfinite(SIGMAS), SIGMAS, unknown))
     suspects = made.suspects
     assert list(suspects.parts) == [*range(rays), *([_GROUND] if ground else [])]
     for without in (None, *suspects.parts):
         squares, freedom = suspects.contradictions(without)
         for k in range(3):
+            design, misfit, spread = made.rows(k)
             keep = kept_rows(made, k, without)
+            keep = keep[design[keep].any(axis=1)]
             if len(keep) <= 3:
                 assert squares[k] == math.inf
-                assert freedom == 0
+                assert freedom[k] == 0
                 continue
-            assert freedom == len(keep) - 3
-            design, misfit, spread = made.rows(k)
+            assert freedom[k] == len(keep) - 3
             weights = np.linalg.inv(spread[np.ix_(keep, keep)])
             a, r = design[keep], misfit[keep]
             place = np.linalg.solve(a.T @ weights @ a, a.T @ weights @ r)
@@ -191,7 +196,7 @@ def suspect(squares: dict[int | None, tuple[float, int]], placed: Any = None) ->
     """Return one suspect point with known ground, whose parts contradict by these squares and freedoms."""
     parts = {part: None for part in squares if part is not None}
     return SimpleNamespace(
-        parts=parts, contradictions=lambda part: (np.array([squares[part][0]]), squares[part][1]),
+        parts=parts, contradictions=lambda part: tuple(np.array([value]) for value in squares[part]),
         ground_apart=lambda k: placed,
     )  # fmt: skip
 
@@ -235,7 +240,9 @@ def test_stated_and_estimated_ground_side_by_side_have_limits_of_their_own() -> 
     for square, wanted in ((edge(2, 0.004, 5.0), [True, True]), (edge(2, 1e-5, 20.0), [False, True])):
         parts = SimpleNamespace(
             parts={0: None, _GROUND: None}, ground_apart=lambda k: None,
-            contradictions=lambda part, s=square: (np.full(2, 0.99 * s), 2) if part is None else (np.ones(2), 0),
+            contradictions=lambda part, s=square: (
+                (np.full(2, 0.99 * s), np.full(2, 2)) if part is None else (np.ones(2), np.zeros(2))
+            ),
         )  # fmt: skip
         whole, _ = LIMITS.verdicts(parts, np.array([True, False]))  # type: ignore[arg-type]
         assert whole.tolist() == wanted

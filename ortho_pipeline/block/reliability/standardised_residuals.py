@@ -75,7 +75,10 @@ def _of_ground(solved: Solved, hats: Array) -> tuple[Array, Index]:
     """
     used = solved.linear.ordering.grounded
     squares, rank = np.zeros(len(hats)), np.zeros(len(hats), dtype=np.int64)
-    found = left_out(np.eye(3) - hats[used], solved.linear.misfits.ground[used], known=TESTABLE)
+    # A row of an unknown coordinate is empty, and has no redundancy.
+    observed = (solved.linear.ground_by_point[used] != 0.0).any(axis=2)
+    redundancy = observed[:, :, None] * np.eye(3) - hats[used]
+    found = left_out(redundancy, solved.linear.misfits.ground[used], known=TESTABLE)
     squares[used] = found.squares
     # Heights of a surface are weighed by their squares too, but tested in `block.heights`.
     control = solved.problem.placed[used]

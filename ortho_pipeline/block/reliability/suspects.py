@@ -107,9 +107,9 @@ class _Limits:
             return agree, agree_without
         of_rays = found[_GROUND][1]
         for k in np.flatnonzero(estimated):
-            placed = suspect.ground_apart(int(k)) if of_rays > 0 else None
+            placed = suspect.ground_apart(int(k)) if of_rays[k] > 0 else None
             if placed is None:
-                agree[k] = self.passes_ground(whole[k], redundancy)
+                agree[k] = self.passes_ground(whole[k], redundancy[k])
                 continue
             apart, spread, axes = placed
             likely = self.variances.chance_of(apart, spread, axes) >= self.ground_risk
@@ -119,19 +119,19 @@ class _Limits:
                 agree_without[part] = np.where(estimated, self.passes_ground(squares, freedom), agree_without[part])
         return agree, agree_without
 
-    def passes(self, squares: Array, redundancy: int) -> Mask:
+    def passes(self, squares: Array, redundancy: Index) -> Mask:
         """Return whether squares are small enough for measurements and ground of stated sigmas."""
         return self._passes(squares, redundancy, self.freedom, self.risk)
 
-    def passes_ground(self, squares: Array, redundancy: int) -> Mask:
+    def passes_ground(self, squares: Array, redundancy: Index) -> Mask:
         """Return whether squares are small enough for ground of an estimated sigma."""
         return self._passes(squares, redundancy, min(self.freedom, self.variances.freedom), self.ground_risk)
 
-    def _passes(self, squares: Array, redundancy: int, freedom: float, risk: float) -> Mask:
+    def _passes(self, squares: Array, redundancy: Index, freedom: float, risk: float) -> Mask:
         from scipy.special import fdtri
 
-        limit = redundancy * fdtri(redundancy, freedom, 1 - risk) if redundancy > 0 else -1.0
-        return np.asarray(squares <= limit)
+        limit = redundancy * fdtri(np.maximum(redundancy, 1), freedom, 1 - risk)
+        return np.asarray((redundancy > 0) & (squares <= limit))
 
 
 class _Suspects:
@@ -157,17 +157,18 @@ class _Suspects:
                 if b > a:
                     self.spread[:, self.parts[b][:, None], self.parts[a]] += part.swapaxes(1, 2)
 
-    def contradictions(self, without: int | None) -> tuple[Array, int]:
+    def contradictions(self, without: int | None) -> tuple[Array, Index]:
         """Return the squares ``(n,)`` by which all parts but one miss each other and the block, and their freedom."""
         keep = self._all_but(without)
-        redundancy = len(keep) - 3
-        if redundancy < 1:
-            return np.full(len(self.misfit), math.inf), 0
+        # A row of an unknown coordinate is empty.
+        redundancy = np.maximum((self.design[:, keep] != 0.0).any(axis=2).sum(axis=1) - 3, 0)
+        if not redundancy.any():
+            return np.full(len(self.misfit), math.inf), redundancy
         half = np.linalg.cholesky(self.spread[:, keep[:, None], keep])
         q, _ = np.linalg.qr(np.linalg.solve(half, self.design[:, keep]))
         misfit = np.linalg.solve(half, self.misfit[:, keep, None])
         left = misfit - q @ (q.swapaxes(1, 2) @ misfit)
-        return (left**2).sum(axis=(1, 2)), redundancy
+        return np.where(redundancy > 0, (left**2).sum(axis=(1, 2)), math.inf), redundancy
 
     def ground_apart(self, k: int) -> tuple[Array, Array, tuple[int, ...]] | None:
         """Return how far known ground is from where its rays and the block put it: metres, covariance, known axes.
