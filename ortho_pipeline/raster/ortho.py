@@ -82,9 +82,15 @@ class Profile:
             nodata=empty,
             descriptions=source.descriptions,
             interpretations=tuple(band.GetColorInterpretation() for band in bands),
-            color_table=bands[0].GetColorTable() if kind in (np.uint8, np.uint16) else None,
+            color_table=_palette(bands[0]) if kind in (np.uint8, np.uint16) else None,
             scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
         )
+
+
+def _palette(band: gdal.Band) -> gdal.ColorTable | None:
+    # A copy: what GDAL returns ends with the dataset.
+    table = band.GetColorTable()
+    return None if table is None else table.Clone()
 
 
 def _given_nodata(value: float, dtype: np.dtype[Any], source: RasterSource) -> float:

@@ -251,7 +251,10 @@ def sharpened(pan: NDArray[np.float32], colours: NDArray[np.float32], weights: S
 
 
 def upsampled(colours: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
-    """Return bands ``(n, rows, columns)`` upsampled as GDAL's pan-sharpening does it; NaN without a value."""
+    """Return bands ``(n, rows, columns)`` upsampled as GDAL's pan-sharpening does it.
+
+    NaN without a value; holes of one pixel get values from their neighbours.
+    """
     dataset = _in_memory(colours, 1.0)
     return _marked(dataset.ReadAsArray(buf_xsize=columns, buf_ysize=rows, resample_alg=gdal.GRIORA_Cubic))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from pathlib import Path
 from typing import Any
@@ -98,8 +99,9 @@ def test_a_palette_is_for_small_numbers_from_zero(tmp_path: Path, kind: int, dty
     table.SetColorEntry(5, (10, 20, 30, 255))
     dataset.GetRasterBand(1).SetColorTable(table)
     del dataset
-    raster = RasterSource(path)  # which has the palette
-    colours = Profile.of(raster, dtype).color_table
+    # The palette stays when the raster is gone.
+    colours = Profile.of(RasterSource(path), dtype).color_table
+    gc.collect()
     assert (colours is not None and colours.GetColorEntry(5) == (10, 20, 30, 255)) is kept
 
 

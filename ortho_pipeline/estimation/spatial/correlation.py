@@ -481,10 +481,8 @@ def _sentences(analysis: Covariance) -> list[str]:
         ]
         if sizes:
             sentences.append(f"The systematic errors have a standard deviation of about {' and '.join(sizes)}.")
-        sentences.append(
-            "The RMSE includes them, so nothing is to be done if it is small enough. They can come from the DEM, the "
-            "model, the points, or the reference of matches."
-        )
+        sentences.append("The RMSE includes them, so nothing is to be done if it is small enough.")
+        sentences.append("They can come from the DEM, the model, the points, or the reference of matches.")
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")
     if analysis.relative is not None:
