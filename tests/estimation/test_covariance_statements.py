@@ -22,14 +22,14 @@ def said(**changes: object) -> list[str]:
 
 
 def test_systematic_errors_have_the_sizes_of_significant_axes() -> None:
-    first, sizes, causes, near = said()
+    first, sizes, included, _, near = said()
     assert first == (
         "Systematic errors remain. The residuals of neighbours (the 4 nearest points) have a correlation of +0.31 in x "
         "and −0.12 in y. Without systematic errors, the larger one (with its sign) is below +0.17 in 19 scenes of 20. "
         "Here it is above that."
     )
     assert sizes == "The systematic errors have a standard deviation of about 0.87 m in x."
-    assert causes.startswith("The RMSE includes them")
+    assert included.startswith("The RMSE includes them")
     assert near == (
         "Between points closer than 250 m (17 pairs) the relative error is 0.75 m in x and 1.50 m in y. "
         "The error of a single point is 1.25 m in x and 2.50 m in y."
