@@ -104,6 +104,6 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
             corner, points = significant(factor * sigma), significant(inside * sigma)
-            text = f"its absolute position has a sigma of {corner} px at a corner, of {points} px at its points"
+            text = f"positions have a sigma of {corner} px at a corner, and of {points} px where its points are"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found
