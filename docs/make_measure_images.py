@@ -80,20 +80,7 @@ def main(reference: Path, folder: Path, *images: Path) -> None:
         page = opened(browser, address, viewport={"width": 1400, "height": 860})
         measured(page, 4 if images else 6)
         taken(page, "measure-block.jpg" if images else "measure.jpg")
-        # The address worked once; other windows have the cookie.
-        cookies = page.context.storage_state()
         page.close()
-        if not images:
-            page = opened(
-                browser, address, viewport={"width": 1400, "height": 860}, color_scheme="dark", storage_state=cookies
-            )
-            page.locator("#swipe").fill("50")
-            taken(page, "measure-dark.jpg")
-            page.close()
-            page = opened(
-                browser, address, viewport={"width": 820, "height": 1180}, has_touch=True, storage_state=cookies
-            )
-            taken(page, "measure-tablet.jpg")
         browser.close()
     server.send_signal(signal.SIGINT)
     server.wait(30)

@@ -99,7 +99,7 @@ class BlockOptions:
             "Standard deviation of the error that all heights of the DEM have in common.",
             "M",
             kind="number",
-            unset="standard deviation of a single height",
+            unset="as --dem-sigma; 10 m without one",
         ),
     ] = None
     dem_correlation: Annotated[
