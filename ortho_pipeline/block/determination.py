@@ -104,7 +104,7 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
             corner, points = significant(factor * sigma), significant(inside * sigma)
-            text = f"its ortho has a displacement of {corner} px (sigma) at a corner, of {points} px where its points are"
+            text = f"its ortho has a displacement of {corner} px (sigma) at a corner, of {points} px at its points"
             if problem.heights is not None:
                 text += ". Errors that all heights of the DEM share come on top"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
