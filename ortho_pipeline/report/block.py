@@ -307,7 +307,8 @@ def sigma_lines(report: BlockReport) -> list[str]:
     if (pairs := report.relative) is not None:
         found.append(
             f"Expected relative position of {counted(pairs.pairs, 'pair')} of images: "
-            f"sigma {significant(pairs.median_px)} px (median), {significant(pairs.worst_px)} px (worst)"
+            f"sigma {significant(pairs.median_px)} px or {significant(pairs.median_m)} m (median), "
+            f"{significant(pairs.worst_px)} px (worst)"
         )
     return found
 

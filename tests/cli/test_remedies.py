@@ -47,6 +47,7 @@ WITHOUT = {
     ("errors", "pip install"): "needs the network",
     ("ortho_measure", "pip install"): "needs the network",
     ("points", "pip install"): "needs the network",
+    ("report", "ortho measure"): "serves a page until somebody stops it",
     ("points", "ortho measure"): "serves a page until somebody stops it",
     ("commands", "ortho doctor --fetch-grids"): "needs the network",
     ("geodesy", "pyproj sync"): "needs the network",

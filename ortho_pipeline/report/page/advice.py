@@ -88,7 +88,7 @@ _LOOK: dict[str, str] = {
     "points-cover-part": "Add points in the empty parts: ties where images overlap, control elsewhere.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
     "crowded-ties": "Small images need few ties. More do not make the result more accurate.",
-    "few-ties": "Measure some ties between these images: with few, a wrong one is hard to detect.",
+    "few-ties": "Measure some ties between these images (ortho measure): with few, a wrong one is hard to detect.",
     "no-matches": "Give this image control points or a more similar reference.",
     "dem-datum-by-name": Text("State the height datum of the DEM with ", Setting("surface.vertical"), "."),
     "dem-items-overlap": "To use other items, list them in a file.",
