@@ -11,7 +11,6 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
-from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
@@ -103,9 +102,9 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            corner, points = significant(factor * sigma), significant(inside * sigma)
-            text = f"its ortho has a displacement of {corner} px (sigma) at a corner, of {points} px at its points"
-            if problem.heights is not None:
-                text += ". Errors that all heights of the DEM share come on top"
+            text = (
+                f"at a corner, its ortho is {factor / max(inside, 1e-6):.0f} times less accurate than at its points (errors that "
+                "both share are not counted)"
+            )
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

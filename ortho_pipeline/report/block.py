@@ -325,9 +325,13 @@ def _relative(network: NetworkRecord) -> RelativeAccuracy | None:
     known = [(one.sigma_px, one.sigma_m) for one in network.pairs if one.sigma_px is not None]
     if not known:
         return None
-    sizes, lengths = (sorted(values) for values in zip(*known, strict=True))
-    middle = len(known) // 2
-    return RelativeAccuracy(pairs=len(known), median_px=sizes[middle], median_m=lengths[middle], worst_px=sizes[-1])
+    sizes, lengths = np.array(known, dtype=float).T
+    return RelativeAccuracy(
+        pairs=len(known),
+        median_px=float(np.median(sizes)),
+        median_m=float(np.median(lengths)),
+        worst_px=float(sizes.max()),
+    )
 
 
 def variance_lines(variances: VariancesRecord) -> list[str]:
