@@ -103,8 +103,8 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
             text = (
-                f"at a corner, its ortho is {factor / max(inside, 1e-6):.0f} times less accurate than at its points (errors that "
-                "both share are not counted)"
+                f"at a corner, its ortho is {factor / max(inside, 1e-6):.0f} times less accurate than at its points "
+                "(errors that both share are not counted)"
             )
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found
