@@ -11,6 +11,7 @@ from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import Solved
 from ortho_pipeline.block.points import BlockPoints
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
@@ -103,8 +104,9 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
             text = (
-                f"at a corner, its ortho is {factor / max(inside, 1e-6):.0f} times less accurate than at its points "
-                "(errors that both share are not counted)"
+                f"at a corner, its ortho is {factor / max(inside, 1e-6):.0f} times less accurate than at its points: "
+                f"sigma {significant(factor * sigma)} px instead of {significant(inside * sigma)} px, not counting "
+                "errors that both share"
             )
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

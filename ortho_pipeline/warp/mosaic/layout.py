@@ -103,8 +103,8 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
     if grid.crs != first.crs or not same_pixels:
         remedy = (
-            f"make its ortho again with the CRS and the pixel size of {one.name!r}, or resample it (documentation: 'How "
-            "do I combine orthos?')"
+            f"make its ortho again with the CRS and the pixel size of {one.name!r}, or resample it (documentation: "
+            "'How do I combine orthos?')"
         )
         if grid.crs.is_compound and not first.crs.is_compound:
             remedy = "its CRS has heights, so this is probably a DEM: leave it out"
