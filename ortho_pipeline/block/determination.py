@@ -103,10 +103,14 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            text = (
-                f"at a corner, its ortho is {factor / max(inside, 1e-6):.0f} times less accurate than at its points: "
-                f"sigma {significant(factor * sigma)} px instead of {significant(inside * sigma)} px, not counting "
-                "errors that both share"
-            )
+            at_points = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2), axis=0).max()))
+            at_points *= measured / sigma
+            size, ratio = significant(factor * sigma), factor / max(at_points, 1e-6)
+            text = f"its position has a sigma of {size} px, {factor:.0f} times that of a measurement"
+            if ratio >= 2.0:
+                text = f"at a corner, its ortho is {ratio:.0f} times less accurate than at its points: sigma {size} px "
+                text += f"instead of {significant(at_points * sigma)} px"
+            if problem.heights is not None:
+                text += ", not counting an error of the whole DEM"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found

@@ -99,7 +99,7 @@ class BlockOptions:
             "Standard deviation of the error that all heights of the DEM have in common.",
             "M",
             kind="number",
-            unset="as --dem-sigma; 10 m without one",
+            unset="as --dem-sigma; 10 m without one; 100 m with spot heights",
         ),
     ] = None
     dem_correlation: Annotated[

@@ -133,6 +133,7 @@ def test_the_area_is_that_of_the_rectangle_that_places_fill() -> None:
 def test_heights_and_the_longitude_do_not_change_the_area() -> None:
     ground = filled(300.0, 80.0)
     ground[:, 2] = np.linspace(0.0, 400.0, len(ground))
-    for longitude in (10.0, 170.0):
-        ground[:, 0] += longitude - ground[:, 0].mean()
+    east = ground[:, 0] - ground[:, 0].mean()
+    for longitude in (10.0, 170.0, 180.0):
+        ground[:, 0] = (longitude + east + 180.0) % 360.0 - 180.0
         assert _area(ground) == pytest.approx(300.0 * 80.0, rel=1e-2)

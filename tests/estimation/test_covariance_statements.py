@@ -29,13 +29,13 @@ def test_systematic_errors_have_the_sizes_of_significant_axes() -> None:
         "Here it is above that."
     )
     assert sizes == "The systematic errors have a standard deviation of about 0.87 m in x."
-    assert included.startswith("The RMSE includes them")
+    assert included.startswith("The accuracy at check points includes them")
     assert near == (
         "Between points closer than 250 m (17 pairs) the relative error is 0.75 m in x and 1.50 m in y. "
         "The error of a single point is 1.25 m in x and 2.50 m in y."
     )
     assert "about 0.87 m in x and 1.61 m in y." in said(p=(0.01, 0.049))[1]
-    assert said(p=(0.051, 0.2))[1].startswith("The RMSE includes them")
+    assert said(p=(0.051, 0.2))[1].startswith("The accuracy at check points includes them")
     assert "about 1.61 px in y." in said(unit="px", functions=(None, AXES[1]), p=(0.01, 0.01))[1]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from samples import CRS, Memory
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.dem import dem_of
 from ortho_pipeline.warp.quality import visibility
@@ -109,8 +110,9 @@ def test_only_the_highest_terrain_bounds_lines_that_go_many_ways(monkeypatch, en
 
 def test_the_terrain_has_all_that_a_line_can_meet_until_it_is_above_all() -> None:
     made, ends = look(), (np.array([0.5, -0.25]), np.array([1.0, -0.5]))
-    assert 39.9 < made._relief <= 40.0
+    assert made._highest == HEIGHTS.max()
     places = np.array([[60.0, 100.0], [70.0, 110.0]])
+    rise = HEIGHTS.max() - HEIGHTS[100:111, 60:71].min()
     terrain = made._terrain(places, ends, math.inf)
     assert terrain is not None
     left, top, right, bottom = terrain.window
@@ -119,8 +121,8 @@ def test_the_terrain_has_all_that_a_line_can_meet_until_it_is_above_all() -> Non
     assert (terrain.low, terrain.high) == (terrain.heights.min(), terrain.heights.max())
     assert left <= 60
     assert bottom - 1 >= 110
-    assert right - 1 >= 70 + made._relief * 1.0
-    assert top <= 100 - made._relief * 0.5
+    assert right - 1 >= 70 + rise * 1.0
+    assert top <= 100 - rise * 0.5
     assert right <= 70 + 41 * 1.0 + 8, "and hardly more"
     assert not terrain.void
     size = (right - left) * (bottom - top)
@@ -129,15 +131,37 @@ def test_the_terrain_has_all_that_a_line_can_meet_until_it_is_above_all() -> Non
     assert made._terrain(places, (np.zeros(2), np.zeros(2)), size - 1) is not None
 
 
-def test_higher_terrain_beyond_the_ortho_counts_as_far_as_lines_below_it_go() -> None:
+def test_higher_terrain_beyond_the_ortho_counts_as_far_as_lines_below_it_go(monkeypatch) -> None:
     """Nodes end at sample 192, and lines go a sample in 4 m: 40 m, the range that is stated, lead to sample 202."""
     heights = np.full((200, 220), 100.0)
     heights[40:60, 214] = 290.0
-    assert look(heights, (0.5, 0.0))._relief == 0.0
+    assert look(heights, (0.5, 0.0))._highest == 290.0, "a small DEM is looked at as a whole"
+    monkeypatch.setattr(visibility, "_SMALL", 40_000)
+    assert look(heights, (0.5, 0.0))._highest == 100.0
     # A wall of 90 m leads to sample 214.
     heights[40:60, 199] = 190.0
-    assert look(heights, (0.5, 0.0))._relief == 190.0
-    assert look(np.full_like(heights, np.nan), (2.0, 0.0))._relief == 0.0
+    assert look(heights, (0.5, 0.0))._highest == 290.0
+    assert look(np.full_like(heights, np.nan), (2.0, 0.0))._highest == -np.inf
+
+
+def test_a_pit_and_a_height_for_voids_do_not_make_other_parts_look_farther() -> None:
+    """What lines can meet begins at the lowest ground of their own places."""
+    heights = HEIGHTS.copy()
+    heights[5, 5] = -2000.0
+    flat, places = (np.array([0.5, -0.25]), np.array([1.0, -0.5])), np.array([[60.0, 100.0], [70.0, 110.0]])
+    one, other = (look(each)._terrain(places, flat, math.inf) for each in (HEIGHTS, heights))
+    assert one is not None
+    assert other is not None
+    assert one.window == other.window
+
+
+def test_a_dem_that_cannot_be_read_is_no_flat_ground(monkeypatch) -> None:
+    def damaged(*where: int) -> None:
+        raise InputError("the heights cannot be read")
+
+    monkeypatch.setattr("ortho_pipeline.surface.dem.DemSurface.range_within", damaged)
+    with pytest.raises(InputError, match="cannot be read"):
+        look()
 
 
 def test_terrain_with_a_void_or_places_beyond_it_is_told() -> None:

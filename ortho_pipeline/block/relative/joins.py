@@ -145,7 +145,8 @@ def _of_heights(fit: BlockFit, dem: AdjustedDem, points: Index, one: _Moves, oth
 
 def _area(ground: Array) -> float:
     """Return the area, m², of a rectangle over which places, lon, lat, h ``(n, 3)``, are spread."""
-    metres = ground[:, :2] * metres_per_degree(ground.mean(axis=0, keepdims=True))
+    degrees = (ground[:, :2] - ground[:1, :2] + 180.0) % 360.0 - 180.0
+    metres = degrees * metres_per_degree(ground[:1])
     return float(12.0 * np.sqrt(max(np.linalg.det(np.cov(metres.T)), 0.0))) if len(ground) > 1 else 0.0
 
 

@@ -481,7 +481,7 @@ def _sentences(analysis: Covariance) -> list[str]:
         ]
         if sizes:
             sentences.append(f"The systematic errors have a standard deviation of about {' and '.join(sizes)}.")
-        sentences.append("The RMSE includes them, so nothing is to be done if it is small enough.")
+        sentences.append("The accuracy at check points includes them: if it suffices, nothing is to be done.")
         sentences.append("They can come from the DEM, the model, the points, or the reference of matches.")
     if analysis.verdict != "systematic" and analysis.n < _SHARP:
         sentences.append(f"With {analysis.n} points, only a strong systematic error would show.")

@@ -106,8 +106,8 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
             f"make its ortho again with the CRS and the pixel size of {one.name!r}, or resample it (documentation: "
             "'How do I combine orthos?')"
         )
-        if grid.crs.is_compound and not first.crs.is_compound:
-            remedy = "its CRS has heights, so this is probably a DEM: leave it out"
+        if len(grid.crs.axis_info) > 2:
+            remedy = f"if this is a DEM (its CRS has heights), leave it out; if not, {remedy}"
         raise InputError(
             f"this raster has pixels of {grid.dx:g} x {grid.dy:g} in {grid.crs.name}, "
             f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import CoverageError
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.surface.base import Surface, Window
 from ortho_pipeline.surface.dem import DemSurface
@@ -35,8 +35,9 @@ _RISE = 100.0
 _EARTH = 6_371_000.0
 #: Least side of a piece of a tile whose heights are too many for the memory.
 _PIECE = 64
-#: So often the area whose heights are looked at grows, because higher terrain was found in it.
-_WIDER = 12
+#: Samples of a DEM that is looked at as a whole. Larger ones are looked at around the ortho: that area grows so often,
+#: because higher terrain was found in it, and has a node of every `NEAR` pixels for so many pixels of its longer side.
+_SMALL, _WIDER, _FEWER = 16_000_000, 12, 16_384
 #: Memory (B) per sample of the terrain that is looked over.
 _CELL_BYTES = 48
 #: Side (px) of the regions of an ortho that are first asked whether anything in them is steep, if so many pixels or
@@ -76,7 +77,7 @@ class Visibility:
         low, high = heights
         self._middle, self._half = (low + high) / 2, max((high - low) / 2, 1.0)
         self._sampler = surface.sampler(sight.grid.crs)
-        self._relief = self._range_of_heights() if isinstance(surface, DemSurface) else 0.0
+        self._highest = self._highest_ground(surface) if isinstance(surface, DemSurface) else -math.inf
         self._calm: dict[tuple[int, int], bool] = {}
 
     def look(self, left: int, top: int, width: int, height: int) -> Classes:
@@ -110,8 +111,8 @@ class Visibility:
 
     # -- lines of sight ----------------------------------------------------------------------------------------------
 
-    def _rays(self, left: int, top: int, width: int, height: int) -> kernel.Rays:
-        near, far = self._nodes(left, top, width, height, NEAR), self._nodes(left, top, width, height, FAR)
+    def _rays(self, left: int, top: int, width: int, height: int, sparse: int = 1) -> kernel.Rays:
+        near, far = (self._nodes(left, top, width, height, sparse * spacing) for spacing in (NEAR, FAR))
         shape = near[0].shape
         samples = self._samples(near[0].ravel(), near[1].ravel()).reshape(*shape, 2)
         shape = far[0].shape
@@ -178,15 +179,24 @@ class Visibility:
             _look(rays, terrain, ends, row, column, out)
 
     def _terrain(self, places: Array, ends: tuple[Array, Array], most: float) -> _Terrain | None:
-        """Return the terrain that lines from samples ``(n, 2)`` may meet; None if that is more samples than `most`."""
-        window = self._window_of(places, ends, self._relief)
-        if window is None:
-            return _Terrain(np.empty((0, 0)), (0, 0, 0, 0), math.inf, -math.inf, True)
-        left, top, right, bottom = window
-        if (right - left) * (bottom - top) > most:
-            return None
-        heights = self._surface.window(left, top, right - left, bottom - top)
-        low, high, void = kernel.extremes(heights)
+        """Return the terrain that lines from samples ``(n, 2)`` may meet; None if that is more samples than `most`.
+
+        Lines begin no lower than the lowest ground under the places, and end above the highest ground of all.
+        """
+        low, high, rise = math.inf, -math.inf, 0.0
+        window, heights, void = None, np.empty((0, 0)), 0
+        for _ in range(2):
+            wanted = self._window_of(places, ends, rise)
+            if wanted is None:
+                return _Terrain(heights, (0, 0, 0, 0), math.inf, -math.inf, True)
+            if wanted != window:
+                left, top, right, bottom = window = wanted
+                if (right - left) * (bottom - top) > most:
+                    return None
+                heights = self._surface.window(left, top, right - left, bottom - top)
+                low, high, void = kernel.extremes(heights)
+            rise = max(self._highest - low, 0.0) if low <= high else 0.0
+        assert window is not None
         inside = (places >= window[:2]).all() and (places <= np.subtract(window[2:], 1)).all()
         return _Terrain(heights, window, low, high, void > 0 or not inside)
 
@@ -194,27 +204,31 @@ class Visibility:
         """Return the samples under lines from places until they have risen so far (m)."""
         return self._surface.window_under(np.concatenate([places, *(places + rise * end for end in ends)]))
 
-    def _range_of_heights(self) -> float:
-        """Return how far (m) the highest terrain that lines from the ortho may meet is above the lowest.
+    def _highest_ground(self, surface: DemSurface) -> float:
+        """Return the height (m) of the highest terrain that lines from the ortho may meet, the same for all tiles.
 
-        A line that has risen so far is above all of it, whichever tile it comes from. The area grows with the range
-        that is found in it. A summit beyond it that is higher than all ground before it is not found.
+        Of a DEM that is not large that is its highest sample. Of others the area is looked at that lines cross while
+        they rise by its range of heights: a summit beyond flat ground may be missed.
         """
-        rays = self._rays(0, 0, self._sight.grid.width, self._sight.grid.height)
+        grid = self._sight.grid
+        rays = self._rays(0, 0, grid.width, grid.height, max(1, max(grid.width, grid.height) // _FEWER))
         places, ends, rise = rays.samples.reshape(-1, 2), _extremes(rays.slopes), 2 * self._half
+        highest, (rows, columns) = -math.inf, surface.shape
         for _ in range(_WIDER):
             window = self._window_of(places, ends, rise)
             if window is None:
-                return 0.0
+                break
             left, top, right, bottom = window
+            if rows * columns <= _SMALL:
+                left, top, right, bottom = 0, 0, columns, rows
             try:
-                low, high = self._surface.range_within(left, top, right - left, bottom - top)
-            except InputError:
-                return 0.0  # no height at all
-            if high - low <= rise:
-                return high - low
-            rise = high - low
-        return rise
+                low, highest = surface.range_within(left, top, right - left, bottom - top)
+            except CoverageError:
+                break  # no height at all
+            if highest - low <= rise or (right - left, bottom - top) == (columns, rows):
+                break
+            rise = highest - low
+        return highest
 
 
 class _Terrain(NamedTuple):
