@@ -1,7 +1,7 @@
 r"""Interior orientation of a frame camera: from directions in the camera to pixels, and back.
 
 A direction is :math:`(u, v)`, the tangents (right, down) of the angle between ray and optical axis. The lens distorts
-it (Brown's model as in OpenCV, OpenSfM and Metashape, dimensionless, :math:`r^2 = u^2 + v^2`)
+it (Brown's model as in OpenCV and OpenSfM, dimensionless, :math:`r^2 = u^2 + v^2`)
 
 .. math::
     u' &= u (1 + k_1 r^2 + k_2 r^4 + k_3 r^6) + 2 p_1 u v + p_2 (r^2 + 2 u^2) \\
