@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from ortho_pipeline.block.equations.cofactors import Cofactors
 from ortho_pipeline.block.equations.elimination import weakest
 from ortho_pipeline.block.equations.problem import BlockProblem, Selection
 from ortho_pipeline.block.equations.solver import Solved
@@ -16,6 +17,7 @@ from ortho_pipeline.errors import DegeneratePoints, TooFewPoints
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.determinacy import EXTRAPOLATION_LIMIT, EXTRAPOLATION_WARNING
 from ortho_pipeline.estimation.problem import CONDITION_LIMIT
+from ortho_pipeline.models.base import Array
 
 
 def refuse_too_few(problem: BlockProblem, selection: Selection) -> None:
@@ -72,11 +74,12 @@ def _weakest(solved: Solved) -> str:
     return f"{shown}; and those of {counted(len(parts) - 4, 'more image')}" if len(parts) > 4 else shown
 
 
-def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
+def uncertain_images(solved: Solved, stated: BlockPoints, whole: Cofactors | None = None) -> list[Notice]:
     """Refuse images that are far less certain where their own points are than these, and warn of uncertain corners.
 
     Points count as measured as they were `stated` even where they turned out better: constraints of the models are
-    stated too, and bound what is known of the images.
+    stated too, and bound what is known of the images. The warning has sigmas of the `whole` covariance, which contains
+    errors that all points share.
     """
     problem = solved.problem
     found, held = [], any(one.held for one in problem.pseudo)
@@ -103,14 +106,19 @@ def uncertain_images(solved: Solved, stated: BlockPoints) -> list[Notice]:
         spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
-            at_points = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2), axis=0).max()))
-            at_points *= measured / sigma
-            size, ratio = significant(factor * sigma), factor / max(at_points, 1e-6)
-            text = f"its position has a sigma of {size} px, {factor:.0f} times that of a measurement"
-            if ratio >= 2.0:
-                text = f"at a corner, its ortho is {ratio:.0f} times less accurate than at its points: sigma {size} px "
-                text += f"instead of {significant(at_points * sigma)} px"
-            if problem.heights is not None:
-                text += ", not counting an error of the whole DEM"
+            own, absolute = (
+                _sigmas(at_corners, partials * measured, each.of_image(image))
+                for each in (solved.cofactors, whole or solved.cofactors)
+            )
+            text = f"its position has a sigma of {significant(own[0])} px, {factor:.0f} times that of a measurement"
+            if own[0] > 2.0 * own[1]:
+                corner, points = map(significant, absolute)
+                text = f"its absolute position has a sigma of {corner} px at a corner, but of {points} px at its points"
             found.append(Notice("uncertain-at-edge", text, factor=factor).in_image(name))
     return found
+
+
+def _sigmas(at_corners: Array, at_points: Array, covariance: Array) -> tuple[float, float]:
+    """Return the sigma (px) of the position at the worst corner, and the median one at points, of the worse axis."""
+    corners, points = (((partials @ covariance) * partials).sum(axis=2) for partials in (at_corners, at_points))
+    return float(np.sqrt(corners.max())), float(np.sqrt(np.median(points, axis=0).max()))

@@ -163,10 +163,14 @@ def test_the_uncertainty_is_that_of_the_worst_corner_and_of_the_middle_of_the_ra
     roots = {0: scale[:, None] * random.normal(size=(6, 6)), 2: random.normal(size=(4, 4)) * scale[[0, 2, 3, 5], None]}
     medians = {image: float(np.median(sigmas[problem.points.image == image])) for image in roots}
 
-    def found(times: float) -> Any:
-        cofactors = SimpleNamespace(of_image=lambda image: times**2 * roots[image] @ roots[image].T)
-        solved: Any = SimpleNamespace(problem=problem, linear=linear, state=state, cofactors=cofactors)
-        return uncertain_images(solved, problem.points.with_image_sigmas(0.1 * sigmas))
+    def found(times: float, shared: float = 1.0) -> Any:
+        own, whole = (
+            SimpleNamespace(of_image=lambda image, size=size: size**2 * roots[image] @ roots[image].T)
+            for size in (times, shared * times)
+        )
+        solved: Any = SimpleNamespace(problem=problem, linear=linear, state=state, cofactors=own)
+        whole_or_none: Any = None if shared == 1.0 else whole
+        return uncertain_images(solved, problem.points.with_image_sigmas(0.1 * sigmas), whole_or_none)
 
     wanted = {
         image: corner_spread(state.models[image], root @ root.T) / medians[image] for image, root in roots.items()
@@ -179,6 +183,10 @@ def test_the_uncertainty_is_that_of_the_worst_corner_and_of_the_middle_of_the_ra
             pytest.approx(factor * wanted[image], rel=1e-6) for image in named
         ])  # fmt: skip
         assert all(f"i{other}" in str(one) for one in notices)
+    # Errors that all points share are in what is told, and do not decide.
+    assert not found(9.99 / wanted[other], shared=3.0)
+    for one in found(10.01 / wanted[other], shared=3.0):
+        assert "10 times that of a measurement" in str(one)
     # At the rays themselves: the median over all coordinates, in their own sigmas.
     inside = {}
     for image, root in roots.items():
@@ -192,3 +200,39 @@ def test_the_uncertainty_is_that_of_the_worst_corner_and_of_the_middle_of_the_ra
         return
     with pytest.raises(DegeneratePoints, match="101 times less"):
         found(101.0 / worst)
+
+
+def test_sigmas_are_those_of_the_worst_corner_and_of_the_worse_axis_of_the_middle_point() -> None:
+    covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
+    corners = np.array([[[1.0, 0.0], [0.0, 1.0]], [[2.0, 0.0], [1.0, -1.0]]])
+    points = np.array([[[0.1, 0.0], [0.0, 0.1]], [[0.3, 0.0], [0.0, 0.2]], [[0.5, 0.0], [0.0, 0.9]]])
+    # Variances at the corners: 4 and 9, 16 and 11; of the middle point: 0.36 and 0.36.
+    assert determination._sigmas(corners, points, covariance) == pytest.approx((4.0, 0.6))
+    points[1, 1] = 0.0, 0.3
+    assert determination._sigmas(corners, points, covariance) == pytest.approx((4.0, 0.9))
+
+
+def test_a_corner_that_is_twice_as_uncertain_as_the_points_is_told_beside_them(
+    prepared: Prepared, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sigmas that are told contain errors that all points share."""
+    problem, state, selection = prepared
+    problem = replace(problem, pseudo=(Pseudo(1, 0.0, 1.0),))
+    linear = Linear.at(problem, state, selection)
+    scale = np.array([1.0, 4e-3, 4e-3, 1.0, 4e-3, 4e-3])
+    roots = {0: np.diag(scale), 2: np.diag(scale[[0, 2, 3, 5]])}
+    own, whole = (SimpleNamespace(of_image=lambda image, size=size: size * roots[image] ** 2) for size in (4.0, 8.0))
+    solved: Any = SimpleNamespace(problem=problem, linear=linear, state=state, cofactors=own)
+    beside, alone = (
+        "its absolute position has a sigma of 5.8 px at a corner, but of 2.1 px at its points",
+        "sigma of 4 px",
+    )
+    for at_points, text in ((1.9, beside), (2.1, alone)):
+
+        def told(corners: Any, points: Any, covariance: Any, at: float = at_points) -> tuple[float, float]:
+            return (4.0, at) if covariance[0, 0] == 4.0 else (5.8, 2.1)
+
+        monkeypatch.setattr(determination, "_sigmas", told)
+        found = uncertain_images(solved, problem.points.with_image_sigmas(np.full(problem.points.rays, 0.01)), whole)  # type: ignore[arg-type]
+        assert len(found) == 2
+        assert all(text in str(one) for one in found)
