@@ -78,7 +78,7 @@ _LOOK: dict[str, str] = {
         Setting("surface.dem"),
         "), or a more accurate one. The report of a mosaic shows how well the orthos fit at the seams.",
     ),
-    "uncertain-at-edge": "Add control points near the corners, or use a simpler correction.",
+    "uncertain-at-edge": "Add control points near the corners. With an RPC, a simpler correction helps, too.",
     "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
     "unsuited-model": "Use a model that the sensor suggests.",
     "points-cover-part": "Add points in the empty parts: ties where images overlap, control elsewhere.",
