@@ -92,7 +92,7 @@ def uncertain_images(solved: Solved, stated: BlockPoints, whole: Cofactors | Non
         of_image = problem.points.rays_of_images[image]
         measured = float(np.median(problem.points.sigma_image[of_image]))
         sigma = max(measured, float(np.median(stated.sigma_image[of_image])))
-        inside = float(np.sqrt(np.median(((partials @ cofactors) * partials).sum(axis=2)))) * measured / sigma
+        inside = float(np.sqrt(np.median(_variances(partials, cofactors)))) * measured / sigma
         name = problem.points.images[image]
         if inside > EXTRAPOLATION_LIMIT and not held:
             raise DegeneratePoints(
@@ -103,7 +103,7 @@ def uncertain_images(solved: Solved, stated: BlockPoints, whole: Cofactors | Non
             )
         at_corners = model.param_partials(model.corners)
         at_corners = at_corners[np.isfinite(at_corners).all(axis=(1, 2))]
-        spread = np.sqrt(((at_corners @ cofactors) * at_corners).sum(axis=2))
+        spread = np.sqrt(_variances(at_corners, cofactors))
         factor = float(spread.max(initial=0.0)) / sigma
         if factor > EXTRAPOLATION_WARNING and not held:
             own, absolute = (
@@ -120,5 +120,10 @@ def uncertain_images(solved: Solved, stated: BlockPoints, whole: Cofactors | Non
 
 def _sigmas(at_corners: Array, at_points: Array, covariance: Array) -> tuple[float, float]:
     """Return the sigma (px) of the position at the worst corner, and the median one at points, of the worse axis."""
-    corners, points = (((partials @ covariance) * partials).sum(axis=2) for partials in (at_corners, at_points))
+    corners, points = _variances(at_corners, covariance), _variances(at_points, covariance)
     return float(np.sqrt(corners.max())), float(np.sqrt(np.median(points, axis=0).max()))
+
+
+def _variances(partials: Array, covariance: Array) -> Array:
+    """Return the variances ``(N, 2)`` of columns and rows with partials ``(N, 2, P)``."""
+    return np.asarray(((partials @ covariance) * partials).sum(axis=2))

@@ -102,7 +102,7 @@ def test_an_accuracy_of_all_images_is_that_of_the_metadata(ties: Prepared, monke
     gauge = held(ties, None, {"i0": 6.0, "i1": 3.0, "i2": 4.0})[1]
     assert "the metadata state 3 to 6 m" in gauge
     assert "sigma 3 to 6 px in the image (3 to 6 m on the ground)" in gauge
-    # An image without points says nothing of metres on the ground.
+    # How many metres a pixel has is not known of an image without points.
     given(monkeypatch, 1.0, (math.nan, 2.0, 4.0))
     assert "sigma 10 px in the image (2.5 to 5 m on the ground)" in held(ties)[1]
 

@@ -1,4 +1,4 @@
-"""Known points that a block contradicts: how far is too far, and what is said of many of them."""
+"""Known points that a block contradicts: from which distance on, and the notices of few and of many."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_ground_that_partly_states_no_sigma_is_compared_with_what_is_known_of_it
     assert [one.metres for one in found] == pytest.approx([3.0, 7.0])
 
 
-# -- what is said ------------------------------------------------------------------------------------------------------
+# -- notices -----------------------------------------------------------------------------------------------------------
 
 
 def doubt(number: int, sigmas: float, role: str = "check", what: str = "plan") -> ContradictedPoint:

@@ -30,15 +30,6 @@ SIGMA = 0.25
 DIRECTION = np.array([0.6, -0.8])
 
 
-@pytest.fixture(scope="module")
-def level() -> RPC:
-    """A hundredth of a degree a thousand pixels, straight down."""
-    one, zero = np.eye(20)[0], np.zeros(20)
-    col, row = zero.copy(), zero.copy()
-    col[1], row[2] = 1.0, 1.0
-    return RPC(1000.0, 1000.0, 20.0, -30.0, 500.0, 1000.0, 1000.0, 0.01, 0.01, 500.0, col, one, row, one)
-
-
 def points_of(level: RPC, misses: np.ndarray, checks: int = 0, **more: Any) -> Points:
     """Return points whose measurements are off by `misses` px; the last ones are check points."""
     count = len(misses)

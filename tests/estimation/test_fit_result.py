@@ -22,13 +22,6 @@ from ortho_pipeline.points import Points
 ORIGIN = (800.0, 1100.0)
 
 
-@pytest.fixture(scope="module")
-def level() -> RPC:
-    """A hundredth of a degree a thousand pixels, straight down."""
-    one = np.eye(20)
-    return RPC(1000.0, 1000.0, 20.0, -30.0, 500.0, 1000.0, 1000.0, 0.01, 0.01, 500.0, one[1], one[0], one[2], one[0])
-
-
 def fitted(level: RPC, kind: str = "affine", seed: int = 6, slope: float = 0.0) -> Fit:
     """Return a fit of nine control and five check points; two check points are matches."""
     random = np.random.default_rng(seed)

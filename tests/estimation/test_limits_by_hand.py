@@ -27,15 +27,6 @@ from ortho_pipeline.models import RPC, ImageCorrection, start_model
 from ortho_pipeline.points import Points
 
 
-@pytest.fixture(scope="module")
-def level() -> RPC:
-    """A hundredth of a degree a thousand pixels, straight down."""
-    one, zero = np.eye(20)[0], np.zeros(20)
-    col, row = zero.copy(), zero.copy()
-    col[1], row[2] = 1.0, 1.0
-    return RPC(1000.0, 1000.0, 20.0, -30.0, 500.0, 1000.0, 1000.0, 0.01, 0.01, 500.0, col, one, row, one)
-
-
 def swapped(model: RPC, apart: float, off: float) -> Points:
     """Return points whose column and row are swapped, `apart` px from right; they are `off` px off besides."""
     places = np.array([(600.0, 600.0), (1000.0, 1000.0), (1400.0, 1400.0), (700.0, 700.0), (1200.0, 1200.0)])

@@ -37,7 +37,7 @@ def hidden(*layers: ResolutionLayer) -> list[str]:
         # Of 10 columns and 8 rows from (20, 30): half of them and a little more.
         (25, 30, 10, 8, False), (24, 30, 10, 8, True), (15, 30, 10, 8, False), (16, 30, 10, 8, True),
         (20, 34, 10, 8, False), (20, 33, 10, 8, True), (20, 26, 10, 8, False), (20, 27, 10, 8, True),
-        # The smaller one counts: 3 x 4 samples at a corner, and beside it.
+        # More than half of a smaller item, 3 x 4 samples, at a corner and beside a side.
         (28, 35, 3, 4, False), (27, 35, 3, 4, True), (28, 34, 3, 4, True), (30, 30, 3, 4, False), (17, 30, 3, 4, False),
         (22, 38, 3, 4, False), (22, 26, 3, 4, False),
         # A long one that a wide one crosses: 30 of 60 samples, and 30 of 54.

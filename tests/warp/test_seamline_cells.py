@@ -303,7 +303,7 @@ def test_a_thing_that_joins_two_orthos_stays_cut(turned: int) -> None:
 def test_what_is_at_the_other_end_of_the_mosaic_is_no_neighbour() -> None:
     labels = [[1, 2, 0, 0, 2]]
     assert mended(labels, [[0, 0, 0, 0, 2]], [[5, 5, 0, 0, 0]]) == [[1, 1, 0, 0, 2]]
-    # 1 is left and right of the thing by way of the edges, 2 beside it.
+    # Ortho 1 would touch the thing only around the ends of the row; ortho 2 is next to it.
     assert mended([[1, 2, 2, 2, 1]], [[0, 0, 0, 2, 1]], [[5, 5, 5, 0, 0]]) == [[2, 2, 2, 2, 1]]
 
 

@@ -210,24 +210,23 @@ class Visibility:
         Of a DEM that is not large that is its highest sample. Of others the area is looked at that lines cross while
         they rise by its range of heights: a summit beyond flat ground may be missed.
         """
-        grid = self._sight.grid
-        rays = self._rays(0, 0, grid.width, grid.height, max(1, max(grid.width, grid.height) // _FEWER))
-        places, ends, rise = rays.samples.reshape(-1, 2), _extremes(rays.slopes), 2 * self._half
-        highest, (rows, columns) = -math.inf, surface.shape
-        for _ in range(_WIDER):
-            window = self._window_of(places, ends, rise)
-            if window is None:
-                break
-            left, top, right, bottom = window
+        (rows, columns), grid, highest = surface.shape, self._sight.grid, -math.inf
+        try:
             if rows * columns <= _SMALL:
-                left, top, right, bottom = 0, 0, columns, rows
-            try:
+                return surface.height_range[1]
+            rays = self._rays(0, 0, grid.width, grid.height, max(1, max(grid.width, grid.height) // _FEWER))
+            places, ends, rise = rays.samples.reshape(-1, 2), _extremes(rays.slopes), 2 * self._half
+            for _ in range(_WIDER):
+                window = self._window_of(places, ends, rise)
+                if window is None:
+                    break
+                left, top, right, bottom = window
                 low, highest = surface.range_within(left, top, right - left, bottom - top)
-            except CoverageError:
-                break  # no height at all
-            if highest - low <= rise or (right - left, bottom - top) == (columns, rows):
-                break
-            rise = highest - low
+                if highest - low <= rise:
+                    break
+                rise = highest - low
+        except CoverageError:
+            pass  # no height at all
         return highest
 
 
