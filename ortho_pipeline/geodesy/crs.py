@@ -227,6 +227,17 @@ class Vertical:
             return f"{pyproj.CRS.from_user_input(self.name).name} ({self.name})"
         return f"geoid grid {Path(self.name).name}"
 
+    @property
+    def metres_per_unit(self) -> float:
+        """Length of the unit of its heights: that of the vertical CRS; 1 for the ellipsoid and for geoid grids.
+
+        >>> Vertical.parse("EPSG:8228").metres_per_unit  # NAVD88 height (ft)
+        0.3048
+        """
+        if not self.name.startswith("EPSG:"):
+            return 1.0
+        return float(pyproj.CRS.from_user_input(self.name).axis_info[0].unit_conversion_factor)
+
     def undulation(self, lon: ArrayLike, lat: ArrayLike) -> Array:
         """Return the height (m) of the datum's zero above the WGS84 ellipsoid: ``h = H + undulation``.
 

@@ -83,18 +83,20 @@ def dem_vertical(
     return option, [warning]
 
 
-def dem_unit(text: str, declared: DeclaredVertical | None) -> float:
+def dem_unit(text: str, declared: DeclaredVertical | None, option: Vertical | None = None) -> float:
     """Return the length in metres of the unit of a DEM's heights.
 
     Parameters
     ----------
     text : str
         Unit type of the band, as GDAL gives it; may be empty.
+    option : Vertical, optional
+        Datum that the user gives. Its unit counts if the file states none.
 
     Raises
     ------
     DatumError
-        If the unit is unknown, or the band and the CRS state different ones.
+        If the unit is unknown, or if two of the band, the CRS and a datum in feet contradict each other.
     """
     stated = UNITS.get("".join(c for c in text.lower() if c.isalpha())) if text else None
     if text and stated is None:
@@ -107,4 +109,16 @@ def dem_unit(text: str, declared: DeclaredVertical | None) -> float:
             field="unit",
             remedy="correct the unit of the band (`gdal_edit.py -units m FILE`), or assign another CRS",
         )
-    return axis or stated or 1.0
+    unit, given = axis or stated, 1.0 if option is None else option.metres_per_unit
+    # People give a datum in metres, such as egm96, for a DEM whose band states feet.
+    if option is not None and given != 1.0 and unit is not None and abs(unit - given) > 1e-3:
+        raise DatumError(
+            Text(
+                f"the units of the heights differ: {unit:.6g} m in the file, {given:.6g} m in {option.label} (",
+                Setting("surface.vertical"),
+                ")",
+            ),
+            field="surface.vertical",
+            remedy="give the vertical CRS of this datum that has the unit of the file",
+        )
+    return unit or given

@@ -137,7 +137,6 @@ def _vertical_of(
         declared = None
     wanted = None if option is None else Vertical.parse(option)
     stated = None if table.vertical is None else Vertical.stated(table.vertical)
-    unit = declared.metres_per_unit if declared else 1.0
     of_crs = _certain(declared)
     if stated is not None and of_crs is not None and stated != of_crs:
         raise DatumError(
@@ -159,6 +158,7 @@ def _vertical_of(
             remedy="leave the option out",
         )
     datum = wanted or stated or (declared.vertical if declared else None)
+    unit = declared.metres_per_unit if declared else datum.metres_per_unit if datum else 1.0
     if datum is None and table.assumed_vertical is not None:
         datum = Vertical.parse(table.assumed_vertical)
     if datum is None and not needed:

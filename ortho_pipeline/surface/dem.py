@@ -99,7 +99,7 @@ def dem_of(
     option = None if vertical is None else Vertical.parse(vertical)
     with completed(path):
         used, warnings = dem_vertical(declared, option, override)
-        unit = dem_unit(file.unit, declared)
+        unit = dem_unit(file.unit, declared, option)
         _check_geoid(grid, used)
     record = {
         "path": path,

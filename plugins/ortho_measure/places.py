@@ -185,5 +185,5 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
     else:
         datum = Vertical.parse(vertical or "ellipsoid")
         undulation = 0.0 if datum.is_ellipsoid else float(datum.undulation(lonlat[:1], lonlat[1:])[0])
-        height = values[2] + undulation
+        height = values[2] * datum.metres_per_unit + undulation
     return np.array([lonlat[0], lonlat[1], height])

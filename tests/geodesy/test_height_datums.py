@@ -121,6 +121,26 @@ def test_units_that_differ_or_are_unknown_are_refused(text: str, axis: float | N
         dem_unit(text, None if axis is None else declares(EGM96, unit=axis))
 
 
+@pytest.mark.parametrize(
+    ("text", "axis", "code", "unit"),
+    [
+        ("", None, "EPSG:6360", 1200 / 3937), ("", None, "EPSG:8228", 0.3048), ("", None, "EPSG:5703", 1.0),
+        ("ftUS", None, "EPSG:6360", 1200 / 3937), ("ft", None, "EPSG:5703", 0.3048), ("", 0.3048, "EPSG:8228", 0.3048),
+    ],
+)  # fmt: skip
+def test_a_datum_in_feet_gives_the_unit_that_the_file_does_not_state(
+    text: str, axis: float | None, code: str, unit: float
+) -> None:
+    stated = None if axis is None else declares(Vertical("EPSG:8228"), unit=axis)
+    assert dem_unit(text, stated, Vertical(code)) == pytest.approx(unit, rel=1e-12)
+
+
+@pytest.mark.parametrize(("text", "axis"), [("m", None), ("", 1.0), ("cm", None)])
+def test_a_datum_in_feet_and_a_file_in_metres_are_refused(text: str, axis: float | None) -> None:
+    with pytest.raises(DatumError, match="units of the heights differ"):
+        dem_unit(text, None if axis is None else declares(EGM96, unit=axis), Vertical("EPSG:6360"))
+
+
 def test_the_datum_of_a_dem_is_that_of_the_file_unless_the_user_is_allowed_another() -> None:
     grid = Vertical("local.gtx")
     for declared, option, override, used, notices in (

@@ -13,6 +13,7 @@ from ortho_measure.session import Session, open_session
 
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -163,13 +164,17 @@ def test_reopening_goes_on_where_it_ended(opens: Opens, tmp_path: Path) -> None:
         opens("old.geojson")
 
 
-def test_typed_ground_is_understood(opens: Opens) -> None:
+def test_typed_ground_is_understood(opens: Opens, monkeypatch: pytest.MonkeyPatch) -> None:
     session = opens()
     lon, lat, height = 33.35, 37.25, 800.0
     assert session.typed([lon, lat, height], "", None) == pytest.approx([lon, lat, height])
     above = session.typed([lon, lat, height], "EPSG:4326", "egm96")
     # sample_data/README.md: the geoid lies 33.6 m above the ellipsoid there.
     assert above[2] == pytest.approx(height + 33.6, abs=0.5)
+    with monkeypatch.context() as patched:
+        patched.setattr(Vertical, "undulation", lambda self, lon, lat: np.full(np.shape(lon), 30.0))
+        in_feet = session.typed([lon, lat, 1000.0], "EPSG:4326", "EPSG:8228")
+    assert in_feet == pytest.approx([lon, lat, 304.8 + 30.0])
     from_dem = session.typed([531000.0, 4122700.0, None], "EPSG:32636", None)
     assert from_dem[:2] == pytest.approx([33.35, 37.25], abs=0.01)
     assert 690 < from_dem[2] < 1100

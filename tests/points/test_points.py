@@ -204,6 +204,20 @@ def test_heights_in_feet(tmp_path: Path) -> None:
     assert read_points(path, crs=crs).ground[0, 2] == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.parametrize(("code", "metres"), [("EPSG:6360", 1200 / 3937), ("EPSG:8228", 0.3048), ("EPSG:5703", 1.0)])
+@pytest.mark.parametrize("stated", [True, False])
+def test_heights_have_the_unit_of_the_datum(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, metres: float, stated: bool
+) -> None:
+    # The geoid is not installed everywhere; its undulation is in metres for each of these codes.
+    monkeypatch.setattr(Vertical, "undulation", lambda self, lon, lat: np.full(np.shape(lon), -26.5))
+    path = write(
+        tmp_path / "p.csv", (f"#vertical: {code}\n" if stated else "") + HEADER + "a,1,2,3120000,10070000,500\n"
+    )
+    points = read_points(path, crs="EPSG:2277", vertical=None if stated else code)
+    assert points.ground[0, 2] == pytest.approx(500 * metres - 26.5, abs=1e-9)
+
+
 def test_latitude_first_is_found_where_it_can_be(tmp_path: Path) -> None:
     path = write(tmp_path / "p.csv", HEADER + "a,1,2,-33.65,151.2,100\n")
     with pytest.raises(InputError, match=r"line 2.*not on Earth"):

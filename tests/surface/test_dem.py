@@ -151,6 +151,12 @@ def test_feet_of_the_crs_and_units_that_contradict(tmp_path: Path) -> None:
         dem_unit("furlong", None)
 
 
+def test_feet_of_the_datum_that_the_user_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Vertical, "undulation", lambda self, lon, lat: np.full(np.shape(lon), 30.0))
+    surface = open_dem(write_dem(tmp_path / "d.tif", hills()), "EPSG:8228")
+    assert surface.window(3, 4, 1, 1)[0, 0] == pytest.approx(hills()[4, 3] * 0.3048 + 30.0)
+
+
 @pytest.mark.parametrize(
     ("text", "name"),
     [("m", "metre"), ("Meters", "metre"), ("cm", "centimetre"), ("centimeter", "centimetre"), ("feet", "foot"),
