@@ -35,8 +35,9 @@ from ortho_pipeline.commands.sharpening.sharpen import sharpen
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.raster.opening import gate
-from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.raster.regridded import grid_of, warped_bounds
 from ortho_pipeline.raster.source import RasterSource, open_dataset, open_pixels
+from ortho_pipeline.warp.mosaic.layout import Mosaic, Ortho, lay_out
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "sample_data"
@@ -497,6 +498,48 @@ def _displaced(printed: Printed, folder: Path) -> None:
     notice = displaced(Agreement((0.7, 0.0), (0.02, 0.02), 0.7, 90, 100), "pan.tif", "ms.tif")
     printed.paste(notice)
     assert (folder / "aligned" / "ms_aligned.tif").is_file()
+
+
+def _combined(*paths: Path) -> Mosaic:
+    return lay_out([Ortho(path.stem, path) for path in paths], "first-on-top")
+
+
+@case("warp", "gdalwarp -t_srs")
+def _other_grid(printed: Printed, folder: Path) -> None:
+    first = folder / "first.tif"
+    gdal.Translate(str(first), str(SAMPLE / "reference.tif"), srcWin=[100, 100, 200, 200], noData=0)
+    for name, changes in {
+        "zone": {"dstSRS": "EPSG:32635"}, "coarse": {"xRes": 12.5, "yRes": 12.5},
+        "moved": {"outputBounds": (531001.3, 4121002.7, 532001.3, 4122002.7)},
+    }.items():  # fmt: skip
+        other = folder / f"{name}.tif"
+        gdal.Warp(str(other), str(SAMPLE / "reference.tif"), dstNodata=0, **changes)
+        printed.paste(refused(_combined, first, other))
+        regridded = folder / f"{name}_regridded.tif"
+        assert len(_combined(first, regridded).layers) == 2
+        # All that the other ortho shows is in it.
+        before, after = (grid_of(path) for path in (other, regridded))
+        xmin, ymin, xmax, ymax = warped_bounds(before, after.crs)
+        grown = np.subtract((xmin, ymin, -xmax, -ymax), (*after.extent[:2], -after.extent[2], -after.extent[3]))
+        assert (grown > -1e-6).all()
+
+
+@case("warp", "gdalwarp -dstnodata")
+def _other_nodata(printed: Printed, folder: Path) -> None:
+    values = gdal.Open(str(SAMPLE / "reference.tif")).ReadAsArray()
+    void = folder / "void.tif"
+    gdal.Translate(str(void), str(SAMPLE / "reference.tif"), noData=7)
+    plain, zero = folder / "plain.tif", folder / "zero.tif"
+    gdal.Translate(str(plain), str(SAMPLE / "reference.tif"), noData="none")
+    gdal.Translate(str(zero), str(SAMPLE / "reference.tif"), noData=0)
+    for first, other in ((void, plain), (plain, void), (void, zero)):
+        printed.paste(refused(_combined, first, other))
+        changed, kept = (first, other) if first == plain else (other, first)
+        made = folder / f"{changed.stem}_nodata.tif"
+        assert len(_combined(kept, made).layers) == 2
+        # Valid pixels that had the value are changed to the next one, not lost.
+        assert np.abs(gdal.Open(str(made)).ReadAsArray().astype(int) - values).max() <= 1
+        made.unlink()
 
 
 @case("commands", "gdal_edit.py -a_srs")

@@ -354,7 +354,9 @@ def test_an_image_without_a_map_grid_is_no_part_of_a_mosaic(tmp_path):
     assert "rectify the image" in done.output
 
 
-@pytest.mark.parametrize(("crs", "remedy"), [("EPSG:32636+5773", "if this is a DEM"), ("EPSG:32637", "make its ortho")])
+@pytest.mark.parametrize(
+    ("crs", "remedy"), [("EPSG:32636+5773", "if this is a DEM"), ("EPSG:32637", "rectify its scene again")]
+)
 def test_a_raster_in_another_crs_is_refused_with_what_it_probably_is(tmp_path, crs, remedy):
     for name, its in (("a", "EPSG:32636"), ("b", crs)):
         raster = gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"{name}.tif"), 8, 8)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.raster.regridded import grid_of
+from ortho_pipeline.files.shell import converted
+from ortho_pipeline.raster.regridded import grid_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource
 
 #: Part of a pixel by which grids may differ: rounding of coordinates, no more.
@@ -102,10 +103,7 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
     same_pixels = math.isclose(grid.dx, first.dx, rel_tol=1e-9) and math.isclose(grid.dy, first.dy, rel_tol=1e-9)
     off = max(abs(columns - round(columns)), abs(rows - round(rows)))
     if grid.crs != first.crs or not same_pixels:
-        remedy = (
-            f"make its ortho again with the CRS and the pixel size of {one.name!r}, or resample it (documentation: "
-            "'How do I combine orthos?')"
-        )
+        remedy = _regridded(one, first, other, grid)
         if len(grid.crs.axis_info) > 2:
             remedy = f"if this is a DEM (its CRS has heights), leave it out; if not, {remedy}"
         raise InputError(
@@ -120,8 +118,31 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
             f"the ortho {other.name!r} is off the grid of {one.name!r} by {off:.3f} px",
             file=other.path,
             field="orthos",
-            remedy="make it again without an extent, or with one on multiples of the pixel size",
+            remedy=_regridded(one, first, other, grid),
         )
+
+
+def _regridded(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> str:
+    """Return how to bring an ortho to the grid of the first one."""
+    again = f"rectify its scene again with the CRS, pixel size and grid of {one.name!r}"
+    bounds, authority = warped_bounds(grid, first.crs), first.crs.to_authority()
+    if authority is None or not np.isfinite(bounds).all():
+        return again
+    step, corner = np.array([first.dx, first.dy] * 2), np.array([first.left, first.top] * 2)
+    pixels = (np.array(bounds) - corner) / step
+    extent = corner + np.concatenate([np.floor(pixels[:2]), np.ceil(pixels[2:])]) * step
+    box = " ".join(f"{value:.12g}" for value in extent)
+    pixel, empty = f"{first.dx:.12g} {first.dy:.12g}", _nodata_of(one, other)
+    return (
+        f"{again}, or resample it: `gdalwarp -t_srs {':'.join(authority)} -tr {pixel} -te {box} -r cubic "
+        f"-dstnodata {empty} {converted(other.path, 'regridded')}`"
+    )
+
+
+def _nodata_of(*orthos: Ortho) -> str:
+    """Return the first nodata value of some orthos; 0 if they have none."""
+    values = (value for ortho in orthos for value in RasterSource(ortho.path).nodata)
+    return next((f"{value:.12g}" for value in values if value is not None), "0")
 
 
 def _check_bands(orthos: Sequence[Ortho]) -> None:
@@ -132,10 +153,18 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
         kind = f"{counted(source.count, 'band')} of {source.dtype}", source.validity, nodata
         first = first or kind
         if kind != first:
+            remedy = "combine only scenes of one kind"
+            if kind[0] == first[0]:
+                changed, kept = (orthos[0], ortho) if kind[1] == "nodata" != first[1] else (ortho, orthos[0])
+                empty = _nodata_of(kept, changed)
+                remedy = (
+                    f"give both the same nodata value: `gdalwarp -dstnodata {empty} "
+                    f"{converted(changed.path, 'nodata')}`. If {empty} is a valid value, choose another one"
+                )
             raise InputError(
                 f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
                 file=ortho.path,
-                remedy="combine only scenes of one kind",
+                remedy=remedy,
             )
 
 
