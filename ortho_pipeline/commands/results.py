@@ -87,7 +87,8 @@ class FitResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho fit --json`` (docs/engineering/formats.md)."""
-        document = self.fit.to_json() | to_document(self.warnings)
+        covariance = analyse_fit(self.fit, near=self.near)
+        document = self.fit.to_json() | to_document([*self.warnings, *report.patterns(covariance)])
         pixels = viewing(self.fit.model, self.scene.width, self.scene.height)["ground_pixel_m"]
         scale = None if refuted(document["notices"]) else map_scale(self.fit, max(pixels) if pixels else None)
         return {
@@ -99,7 +100,7 @@ class FitResult:
             "removed": json_value(self.removed),
             **({} if self.matching is None else {"matching": self.matching.to_json()}),
             "map_scale": None if scale is None else scale.to_json(),
-            "covariance": analyse_fit(self.fit, near=self.near).to_json(),
+            "covariance": covariance.to_json(),
         }
 
 

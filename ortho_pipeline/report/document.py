@@ -25,7 +25,7 @@ from ortho_pipeline.estimation.choice.comparison import ComparisonRecord
 from ortho_pipeline.estimation.fit import Fit
 from ortho_pipeline.estimation.ground_residuals import along_view, in_metres, rmse_metres, viewing
 from ortho_pipeline.estimation.records import Adjustment, Point, Rmse, RmseOfView, RmsesOfView, is_known
-from ortho_pipeline.estimation.spatial.correlation import analyse_fit
+from ortho_pipeline.estimation.spatial.correlation import Covariances, analyse_fit
 from ortho_pipeline.files import read_json, whole_or_nothing, write_json, write_text
 from ortho_pipeline.files.json.records import DocumentError
 from ortho_pipeline.files.json.values import json_position, json_value
@@ -127,18 +127,20 @@ def build_report(
     near : float, optional
         Distance (m) below which points are neighbours; as `spatial_correlation.analyse` chooses it without one.
     warnings : iterable of Notice
-        What the reader ought to know; a suspicious difference between control and DEM heights is added to them.
+        What the reader ought to know. Systematic errors, and a suspicious difference between control and DEM heights,
+        are added to them.
     """
     seen = viewing(fit.model, scene.width, scene.height)
     heights, doubts = (None, []) if surface is None else _heights_of_points(fit, surface, seen)
-    noted = to_document([*warnings, *doubts])
+    covariance = analyse_fit(fit, near=near)
+    noted = to_document([*warnings, *doubts, *patterns(covariance)])
     adjustment, rmse_m = _adjustment(fit, noted), rmse_metres(fit)
     return SceneReport(
         scene=_scene(scene, seen),
         adjustment=adjustment,
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
-        covariance=analyse_fit(fit, near=near),
+        covariance=covariance,
         map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
         control_hull=control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
         comparison=comparison,
@@ -158,6 +160,16 @@ def build_report(
             noted["notices"],
         ),
     )
+
+
+def patterns(covariance: Covariances) -> list[Notice]:
+    """Return a notice if neighbouring points have similar residuals."""
+    tested = {"control": covariance.control, "check": covariance.check}
+    roles = [role for role, found in tested.items() if found is not None and found.verdict == "systematic"]
+    if not roles:
+        return []
+    text = f"systematic errors remain: neighbouring {' and '.join(roles)} points have similar residuals"
+    return [Notice("systematic-errors", text, roles=roles)]
 
 
 def _scene(scene: Scene, seen: Mapping[str, Any]) -> SceneRecord:

@@ -310,9 +310,6 @@ def _detail_rows(report: SceneReport) -> list[tuple[str, str]]:
     rows += [("left out", f"{one.id}: {one.reason}") for one in adjustment.rejected if one.id not in named]
     if report.matching:
         rows.append(("matching", report.matching.text()))
-    for role, found in (("control", report.covariance.control), ("check", report.covariance.check)):
-        if found and found.verdict == "systematic":
-            rows.append(("pattern", f"{role} points: {found.statement}"))
     if report.surface:
         rows.append(("heights", _surface_text(report.surface)))
     if ortho := report.ortho:

@@ -299,14 +299,20 @@ def test_report_holds_the_analysis_and_draws_it(tmp_path):
     made = report.build_report(scene=scene, fit=result, provenance=provenance)
     schema = json.loads((Path(__file__).parent.parent.parent / "docs" / "report.schema.json").read_text())
     jsonschema.validate(made.to_json(), schema, cls=jsonschema.Draft202012Validator)
-    # The check points were tested: their analysis is drawn, and the words are on page and terminal.
+    # The check points were tested: their analysis is drawn, and a notice names them.
     assert {"neighbours", "relative"} <= set(report.plots(made))
     report.write_report_html(made, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
     assert "Neighbouring points" in page
     assert "Systematic errors remain" in page
     assert 'data-plot="relative"' in page
-    assert "control points: Systematic errors remain" in report.summary_text(made)
+    (notice,) = [one for one in made.notices if one["code"] == "systematic-errors"]
+    assert notice["roles"] == ["control"]
+    text = "systematic errors remain: neighbouring control points have similar residuals"
+    assert notice["text"] == text
+    assert text[1:] in page
+    noise = report.build_report(scene=scene, fit=adjusted(wave=0.0), provenance=provenance)
+    assert "systematic-errors" not in [one["code"] for one in noise.notices]
     files = report.write_plots(made, tmp_path, "r", "png")
     assert files["neighbours"].stat().st_size > 3000
 

@@ -273,7 +273,8 @@ def _made(planned: _Planned, crew: Crew) -> StackResult:
     writer = Writer(aligned, placed, scene, planned.output, options.corrections_only)
     names = writer.write(dates, solved, crew, lambda share: told("writing", share))
     outputs = {name: f"{_ALIGNED}/{file}" for name, file in names.items()}
-    record = record_of(dates, placed, pairs, solved, outputs, options.datum)
+    groups = {"stack": options, "match": planned.match, "surface": planned.surface, "output": planned.output}
+    record = record_of(dates, placed, pairs, solved, outputs, groups)
     files = _documents(planned, dates, record)
     said = summary(record, sum(pair.fresh for pair in pairs))
     return StackResult(files, record.to_json(), said, record=record, access=scene.access)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from ortho_pipeline.batch.stack.dates import Dated
 from ortho_pipeline.batch.stack.matching import DatePair
 from ortho_pipeline.batch.stack.placing import Placed
 from ortho_pipeline.block.stack.adjustment import AdjustedStack
+from ortho_pipeline.commands.resolved.ledger import as_asked, software
 from ortho_pipeline.commands.results import SCHEMA_VERSION
 from ortho_pipeline.display.notices import Notice, to_document
 from ortho_pipeline.errors.texts import counted
@@ -35,9 +37,9 @@ def record_of(
     pairs: Sequence[DatePair],
     stack: AdjustedStack,
     outputs: dict[str, str],
-    datum: str,
+    options: Mapping[str, Any],
 ) -> StackRecord:
-    """Return the record of a stack; `outputs` are the files of dates by name."""
+    """Return the record of a stack; `outputs` are the files of dates by name, `options` the groups by theirs."""
     metres = _metres(placed)
     matched = [pair for pair in pairs if pair.matches is not None]
     notices = _notices(dates, stack, matched, len(pairs))
@@ -45,7 +47,7 @@ def record_of(
     grid = placed.grid
     return StackRecord(
         schema_version=SCHEMA_VERSION,
-        datum=datum,
+        datum=options["stack"].datum,
         grid=GridRecord(
             crs=placed.model.crs, geotransform=grid.geotransform, size=(grid.width, grid.height),
             pixel_m=float(np.sqrt(abs(np.linalg.det(metres)))),
@@ -69,8 +71,23 @@ def record_of(
             StepRecord(date=dates[one.date].name, size_px=one.size, sigma_px=one.sigma, chance=one.chance)
             for one in stack.steps
         ),
+        provenance={"options": _chosen(options), "software": software()},
         **to_document(notices),
     )  # fmt: skip
+
+
+def _chosen(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that differ from their defaults, of each group that has one.
+
+    The command is no part of it: runs with other workers, or with the images in another order, write the same bytes.
+    """
+    found = {}
+    for group, values in options.items():
+        usual = as_asked(type(values)())
+        found[group] = {
+            name: value for name, value in as_asked(values).items() if value != usual.get(name) and name != "rebuild"
+        }
+    return {group: chosen for group, chosen in found.items() if chosen}
 
 
 def _metres(placed: Placed) -> Array:
@@ -93,7 +110,7 @@ def _date(
     shift, sigma = stack.network.value[number, 0], stack.sigma[number]
     low, size = stack.cells.low, stack.cells.side * np.array(stack.cells.shape)
     corners = low + size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-    largest = float(np.hypot(*stack.at(corners)[0][number].T).max())
+    there, spread = (values[number] for values in stack.at(corners))
     return DateRecord(
         name=one.name,
         path=str(one.image),
@@ -102,7 +119,8 @@ def _date(
         correction=("affine" if stack.sloped[number] else "shift") if known else None,
         shift_px=_pair(shift) if known else None,
         sigma_px=_pair(sigma) if known else None,
-        corner_px=largest if known else None,
+        corner_px=float(np.hypot(*there.T).max()) if known else None,
+        corner_sigma_px=float(spread.max()) if known else None,
         east_north_m=_pair(metres @ shift) if known else None,
         sigma_m=float(np.sqrt(np.trace(metres @ np.diag(sigma**2) @ metres.T) / 2)) if known else None,
         pairs=count,

@@ -288,9 +288,10 @@ def _of_shift(verified: Verified) -> list[Cause]:
         )
         return [Cause("datum", text, length**2)]
     azimuth = math.degrees(math.atan2(bias[0], bias[1])) % 360
-    shifted = f"ortho or reference is shifted: the ortho lies {size_m(length)} towards azimuth {azimuth:.0f}°"
-    doubt = "Surveyed points in the ortho show which"
-    text = f"{shifted}. {doubt}. If the reference is right, correct the ortho with ortho align"
+    text = (
+        f"ortho or reference is shifted: the ortho lies {size_m(length)} towards azimuth {azimuth:.0f}°. Surveyed "
+        "points, measured in the ortho, show which. Only if the ortho is wrong, correct it with ortho align"
+    )
     return [Cause("shift", text, length**2)]
 
 

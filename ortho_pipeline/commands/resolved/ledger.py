@@ -207,9 +207,9 @@ def provenance(
         "image": {"path": str(scene.path), "size": [scene.width, scene.height]},
         "sensor": scene.sensor,
         "model_source": scene.model_source,
-        "points": None if request.points.gcps is None else _as_asked(request.points),
+        "points": None if request.points.gcps is None else as_asked(request.points),
         "surface": None if surface is None else dict(surface.provenance),
-        "options": {name: _as_asked(value) for name, value in settings.items()},
+        "options": {name: as_asked(value) for name, value in settings.items()},
         "software": software(),
     }
 
@@ -220,8 +220,8 @@ def read_since(before: int) -> dict[str, Any]:
     return {"network_bytes": read} if read else {}
 
 
-def _as_asked(options: Any) -> dict[str, Any]:
-    """Return options as JSON values, without the budget of the machine, on which no result depends."""
+def as_asked(options: Any) -> dict[str, Any]:
+    """Return a group of options as JSON values, without the budget of the machine, on which no result depends."""
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     left_out = {"memory", "threads", *(key for key in _IF_GIVEN if values.get(key) is None)}
     return {key: _text_of(value) for key, value in values.items() if key not in left_out}

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from ortho_pipeline.block.fit import Ray
-from ortho_pipeline.display.numbers import px
+from ortho_pipeline.display.numbers import px, size_m
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.records import is_known
 from ortho_pipeline.points.rows import ROLES
@@ -28,6 +28,7 @@ class Card:
     #: Left, top, width and height of the picture within the plot, per cent.
     place: tuple[float, float, float, float]
     rays: str
+    pixel: str | None
     view: str | None
     covered: float
     worst: str | None
@@ -59,6 +60,7 @@ def card(
         plot=plot,
         place=place,
         rays=rays_text(rays, roles, wrong),
+        pixel=None if image.ground_pixel_m is None else " × ".join(map(size_m, image.ground_pixel_m)),
         view=view,
         covered=image.covered,
         worst=f"{max(sizes)[1]}, {px(max(sizes)[0])}" if sizes else None,

@@ -122,7 +122,7 @@ _KNOW: dict[str, str] = {
     "ortho-relative": Text(
         "State the accuracy of the reference with ",
         Setting("match.reference_sigma"),
-        ", or give surveyed points with ",
+        ", or measure surveyed points in the ortho (ortho measure --ortho) and give them with ",
         Setting("points.gcps"),
         ".",
     ),
@@ -134,6 +134,8 @@ _KNOW: dict[str, str] = {
     ),
     "dem-sigma-estimated": Text("If you know the accuracy of the DEM, state it with ", Setting("surface.sigma"), "."),
     "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
+    "systematic-errors": "If the accuracy at check points suffices, nothing. If not, try a model with more parameters, "
+    "another DEM, or better points.",
     "correction-by-matches": "Nothing to do, unless you know a better correction.",
     "dem-datum-overridden": "Check that your datum is right.",
     "no-rpc": "Nothing to do here. Give other programs the ortho or the model file.",

@@ -50,6 +50,9 @@ def write_page(record: StackRecord, path: str | os.PathLike[str]) -> None:
         map=None if drawn is None else drawn.svg(),
         arrow=arrow,
         pairs=pairs[:_ROWS],
+        sloped=any(one.correction == "affine" for one in record.dates),
+        # Each date has its file in its row of the record.
+        provenance={**document["provenance"], "inputs": []},
         signals=signals(document["warnings"], document["notices"]),
         levels=WORDS,
         day=lambda text: text[:10],
@@ -63,7 +66,12 @@ def headline(record: StackRecord) -> str:
     if not known:
         return "No date could be corrected."
     worst = max(_INTERVAL * max(one.sigma_px or (0.0, 0.0)) for one in known)
-    text = f"{counted(len(known), 'date')} agree with {_datum(record)} within {worst:.2f} px (95 % interval, per axis)."
+    where = ""
+    if any(one.correction == "affine" for one in known):
+        corner = _INTERVAL * max(one.corner_sigma_px or 0.0 for one in known)
+        where = f" at the middle and {corner:.2f} px at the corners"
+    text = f"{counted(len(known), 'date')} agree with {_datum(record)} within {worst:.2f} px{where}"
+    text = f"{text} (95 % interval, per axis)."
     return text if record.datum == "reference" else f"{text} Nothing here tests the absolute position."
 
 

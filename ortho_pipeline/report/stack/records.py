@@ -12,7 +12,8 @@ class DateRecord(Record):
     """A date: where its ortho shows ground, relative to the datum; null if no accepted pair connects it."""
 
     # `shift_px` is at the middle of the area, in pixels (columns, rows) of the stack's grid. `corner_px` is the largest
-    # correction at a corner. Sigmas are standard deviations per axis, relative to the datum.
+    # correction at a corner, `corner_sigma_px` the largest sigma there. Sigmas are standard deviations per axis,
+    # relative to the datum.
     name: str
     path: str
     time: str
@@ -27,6 +28,7 @@ class DateRecord(Record):
     output: str | None
     cloud_percent: float | None = None
     sun_elevation_deg: float | None = None
+    corner_sigma_px: float | None = None
 
 
 class PairRecord(Record):
@@ -114,3 +116,4 @@ class StackRecord(Record):
     steps: tuple[StepRecord, ...]
     warnings: tuple[Words, ...]
     notices: tuple[Mapping[str, Any], ...]
+    provenance: Mapping[str, Any] = {}
