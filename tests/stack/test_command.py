@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -25,6 +26,7 @@ from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.files import Outputs
 from ortho_pipeline.options import MatchOptions, OutputOptions, StackOptions
+from ortho_pipeline.report.stack.page import write_page
 from ortho_pipeline.report.stack.records import StackRecord
 
 gdal.UseExceptions()
@@ -83,6 +85,30 @@ def test_corrections_are_the_errors(made):
     assert "4 dates agree with the mean of all dates within" in page
     assert "Nothing here tests the absolute position." in page
     assert 'data-plot="timeline"' in page
+
+
+def test_the_page_tells_what_affine_corrections_are_at_the_corners(made, tmp_path):
+    record = StackRecord.read(json.loads((made[1] / "stack.json").read_text()))
+    one, *rest = record.dates
+    # Of shifts alone, a corner is like the middle.
+    assert [one.corner_sigma_px for one in record.dates] == pytest.approx([max(one.sigma_px) for one in record.dates])
+    write_page(record, tmp_path / "shifts.html")
+    assert "at a corner" not in (tmp_path / "shifts.html").read_text()
+    sloped = one.replaced(correction="affine", sigma_px=(0.01, 0.02), corner_px=1.234, corner_sigma_px=0.1)
+    write_page(record.replaced(dates=(sloped, *rest)), tmp_path / "affine.html")
+    page = (tmp_path / "affine.html").read_text()
+    assert re.search(
+        r"agree with the mean of all dates within 0\.\d\d px at the middle and 0\.20 px at the corners", page
+    )
+    assert '<td class="n">1.23</td><td class="n">0.10</td>' in page
+
+
+def test_the_record_names_the_options_that_differ_from_their_defaults(made):
+    record = StackRecord.read(json.loads((made[1] / "stack.json").read_text()))
+    options = {"match": {"points": 120}, "output": {"resampling": "cubic", "format": "GTiff"}}
+    assert record.provenance["options"] == options
+    assert record.provenance["software"]["gdal"] == gdal.VersionInfo("RELEASE_NAME")
+    assert "options · match · points" in (made[1] / "stack.html").read_text()
 
 
 def test_aligned_orthos_agree_in_their_pixels(made):
