@@ -93,14 +93,14 @@ def test_the_page_tells_what_affine_corrections_are_at_the_corners(made, tmp_pat
     # Of shifts alone, a corner is like the middle.
     assert [one.corner_sigma_px for one in record.dates] == pytest.approx([max(one.sigma_px) for one in record.dates])
     write_page(record, tmp_path / "shifts.html")
-    assert "at a corner" not in (tmp_path / "shifts.html").read_text()
+    assert "corner, px" not in (tmp_path / "shifts.html").read_text()
     sloped = one.replaced(correction="affine", sigma_px=(0.01, 0.02), corner_px=1.234, corner_sigma_px=0.1)
     write_page(record.replaced(dates=(sloped, *rest)), tmp_path / "affine.html")
     page = (tmp_path / "affine.html").read_text()
     assert re.search(
         r"agree with the mean of all dates within 0\.\d\d px at the middle and 0\.20 px at the corners", page
     )
-    assert '<td class="n">1.23</td><td class="n">0.10</td>' in page
+    assert '<td class="n">1.23 ± 0.10</td>' in page
 
 
 def test_the_record_names_the_options_that_differ_from_their_defaults(made):
