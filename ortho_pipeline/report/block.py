@@ -33,7 +33,7 @@ from ortho_pipeline.report.block_records import (
 from ortho_pipeline.report.matching import RELATIVE
 from ortho_pipeline.report.network.cards import PICTURES, card, rays_by_image
 from ortho_pipeline.report.network.drawing import plot_network
-from ortho_pipeline.report.network.facts import found_network, placed, suffices_for, thinly_covered
+from ortho_pipeline.report.network.facts import displaced_checks, found_network, placed, suffices_for, thinly_covered
 from ortho_pipeline.report.page.advice import WORDS, Signal, signal_lines, signals
 from ortho_pipeline.report.page.behaviour import policy, script
 from ortho_pipeline.report.page.locator import plot_locator
@@ -109,7 +109,8 @@ def build_report(
             rpc=None if found is None else RpcRecord(exact=found.exact, max_error_px=found.max_error_px),
             **places[label],
         )
-    adjustment, noted = fit.record, to_document([*warnings, *of_network, *thinly_covered(places)])
+    adjustment = fit.record
+    noted = to_document([*warnings, *of_network, *thinly_covered(places), *displaced_checks(fit)])
     return BlockReport(
         images=images,
         adjustment=adjustment,

@@ -181,10 +181,15 @@ def unsettled(report: SceneReport) -> str | None:
     for one in report.adjustment.notices:
         if one["code"] == "checks-apart":
             rest = one.get("rest")
-            without = f": {px(rest)} without {', '.join(one['points'][:3])}" if rest is not None else ""
+            without = f": {px(rest)}{_on_ground(report, rest)} without {', '.join(one['points'][:3])}" if rest else ""
             more = "" if len(one["points"]) <= 3 or rest is None else " and others"
             return f"Not settled{without}{more}"
     return None
+
+
+def _on_ground(report: SceneReport, pixels: float) -> str:
+    pixel = report.scene.ground_pixel_m
+    return "" if pixel is None else f" ({metres(pixels * math.sqrt(pixel[0] * pixel[1]))})"
 
 
 def option_of_choice(report: SceneReport) -> Text | None:
@@ -271,7 +276,7 @@ def scale_rules(found: MapScaleRecord) -> list[tuple[str, str, str, str]]:
     rows.append(
         (
             "ASPRS 2023, horizontal class",
-            "RMSE including the error of the check points, rounded up to whole centimetres",
+            "RMSE including the error of the check points, rounded up",
             f"{found.rmse:.2f} m{survey}",
             f"{class_size(found.class_cm)}{needs}",
         )

@@ -504,7 +504,7 @@ def _combined(*paths: Path) -> Mosaic:
     return lay_out([Ortho(path.stem, path) for path in paths], "first-on-top")
 
 
-@case("warp", "gdalwarp -t_srs")
+@case("warp", "ortho rectify")
 def _other_grid(printed: Printed, folder: Path) -> None:
     first = folder / "first.tif"
     gdal.Translate(str(first), str(SAMPLE / "reference.tif"), srcWin=[100, 100, 200, 200], noData=0)
@@ -515,7 +515,7 @@ def _other_grid(printed: Printed, folder: Path) -> None:
         other = folder / f"{name}.tif"
         gdal.Warp(str(other), str(SAMPLE / "reference.tif"), dstNodata=0, **changes)
         printed.paste(refused(_combined, first, other))
-        regridded = folder / f"{name}_regridded.tif"
+        regridded = folder / "regridded" / f"{name}_ortho.tif"
         assert len(_combined(first, regridded).layers) == 2
         # All that the other ortho shows is in it.
         before, after = (grid_of(path) for path in (other, regridded))

@@ -248,7 +248,7 @@ def test_verdict_leads_with_check_points_that_contradict_the_control(tmp_path, w
     assert "Map scales" not in page
     # Next to the figure, with what it is without them; in the picture in rings; what to do is of these points.
     assert said.adjustment.notices[0]["rest"] == pytest.approx(0.5, abs=0.5)
-    assert re.search(rf'class="unsettled">Not settled: 0\.\d+ px without {", ".join(names)}<', page)
+    assert re.search(rf'class="unsettled">Not settled: 0\.\d+ px \(0\.\d+ m\) without {", ".join(names)}<', page)
     assert page.count('class="doubted"') == wrong
     assert ("Their errors differ" if wrong == 3 else f"Measure {names[0]} again") in page
 

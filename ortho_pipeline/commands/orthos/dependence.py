@@ -290,7 +290,8 @@ def _of_shift(verified: Verified) -> list[Cause]:
     azimuth = math.degrees(math.atan2(bias[0], bias[1])) % 360
     text = (
         f"ortho or reference is shifted: the ortho lies {size_m(length)} towards azimuth {azimuth:.0f}°. Surveyed "
-        "points, measured in the ortho, show which. Only if the ortho is wrong, correct it with ortho align"
+        "points, measured in the ortho, show which. If the ortho is wrong, make it again with control points, or "
+        "correct it with ortho align"
     )
     return [Cause("shift", text, length**2)]
 

@@ -89,8 +89,8 @@ class MeasuredOrtho:
 
     @property
     def pixel(self) -> float:
-        """Size (m) of a pixel."""
-        return self.matched.pixel
+        """Size (m) of a pixel in the middle."""
+        return float(np.sqrt(abs(np.linalg.det(self.metres))))
 
     @property
     def size(self) -> tuple[int, int]:

@@ -14,12 +14,16 @@ from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import viewing
+from ortho_pipeline.estimation.statistics import student_of
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.points.control_hull import COVERED, empty_parts
 from ortho_pipeline.report.map_scale import MapScaleRecord, judge
 
 if TYPE_CHECKING:
     from ortho_pipeline.block.start import Start
+
+#: Fewest check points whose mean is tested, and the chance at which it is called systematic.
+_FEWEST, _CHANCE = 10, 0.001
 
 
 def found_network(fit: BlockFit, join_limit: float, dem_unused: bool) -> tuple[NetworkRecord, tuple[Notice, ...]]:
@@ -46,6 +50,21 @@ def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...
     said += "" if len(part) <= 6 else f" and less of {counted(len(part) - 6, 'more image')}"
     text = f"points cover {said}: the rest has no points"
     return (Notice("points-cover-part", text, share=part),)
+
+
+def displaced_checks(fit: BlockFit) -> tuple[Notice, ...]:
+    """Return a notice if the mean error of check points is more than chance explains, in an axis."""
+    errors = -fit.object_residuals[fit.points.check & np.isfinite(fit.object_residuals).all(axis=1)]
+    if len(errors) < _FEWEST:
+        return ()
+    mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1) / np.sqrt(len(errors))
+    _, chance = student_of(mean, np.diag(sigma**2), len(errors) - 1)
+    far = [f"{value:+.2f} m in {axis}" for value, axis, p in zip(mean, "xyz", chance, strict=True) if p < _CHANCE]
+    if not far:
+        return ()
+    said = " and ".join(far).replace("-", "−")
+    text = f"systematic errors remain: the mean error of {len(errors)} check points is {said}"
+    return (Notice("systematic-errors", text, roles=["check"], mean_m=mean.tolist()),)
 
 
 def placed(fit: BlockFit, starts: Mapping[str, Start]) -> dict[str, dict[str, Any]]:

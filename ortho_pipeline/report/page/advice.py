@@ -88,7 +88,7 @@ _LOOK: dict[str, str] = {
     "no-matches": "Give this image control points or a more similar reference.",
     "dem-datum-by-name": Text("State the height datum of the DEM with ", Setting("surface.vertical"), "."),
     "dem-items-overlap": "To use other items, list them in a file.",
-    "dem-covers-part": "Use a larger DEM. Outside the DEM the ortho has no value, or its height is a guess.",
+    "dem-covers-part": "Use a larger DEM, or do not use the ortho outside the DEM.",
     "accuracy-in-part": "State the missing accuracies, so that the figures include them.",
     "memory-exceeded": Text("Increase ", Setting("output.memory"), ", or use ", Setting("output.engine", "ortho"), "."),
     "rpc-approximate": "Use the model file or the ortho where this error matters.",

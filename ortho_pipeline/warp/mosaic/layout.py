@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.files.shell import converted
+from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.raster.regridded import grid_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -132,17 +132,18 @@ def _regridded(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> str:
     pixels = (np.array(bounds) - corner) / step
     extent = corner + np.concatenate([np.floor(pixels[:2]), np.ceil(pixels[2:])]) * step
     box = " ".join(f"{value:.12g}" for value in extent)
-    pixel, empty = f"{first.dx:.12g} {first.dy:.12g}", _nodata_of(one, other)
+    kept = _nodata_of(one)
+    empty = "" if kept is None else f" -dstnodata {kept}"
     return (
-        f"{again}, or resample it: `gdalwarp -t_srs {':'.join(authority)} -tr {pixel} -te {box} -r cubic "
-        f"-dstnodata {empty} {converted(other.path, 'regridded')}`"
+        f"{again}, or resample it: `ortho rectify {typed(other.path)} --ortho --height 0 -t_srs {':'.join(authority)} "
+        f"-tr {first.dx:.12g} {first.dy:.12g} -te {box} -r cubic{empty} -o regridded`"
     )
 
 
-def _nodata_of(*orthos: Ortho) -> str:
-    """Return the first nodata value of some orthos; 0 if they have none."""
+def _nodata_of(*orthos: Ortho) -> str | None:
+    """Return the first nodata value of some orthos."""
     values = (value for ortho in orthos for value in RasterSource(ortho.path).nodata)
-    return next((f"{value:.12g}" for value in values if value is not None), "0")
+    return next((f"{value:.12g}" for value in values if value is not None), None)
 
 
 def _check_bands(orthos: Sequence[Ortho]) -> None:
@@ -156,10 +157,11 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
             remedy = "combine only scenes of one kind"
             if kind[0] == first[0]:
                 changed, kept = (orthos[0], ortho) if kind[1] == "nodata" != first[1] else (ortho, orthos[0])
-                empty = _nodata_of(kept, changed)
+                empty = _nodata_of(kept, changed) or "0"
                 remedy = (
                     f"give both the same nodata value: `gdalwarp -dstnodata {empty} "
-                    f"{converted(changed.path, 'nodata')}`. If {empty} is a valid value, choose another one"
+                    f"{converted(changed.path, 'nodata')}`. If {empty} is valid in one of them, give both "
+                    "another one"
                 )
             raise InputError(
                 f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
