@@ -1,8 +1,9 @@
 """Resection in space: the exterior orientation of a frame camera from ground points, without start values.
 
 Three points and their directions give up to four positions (P3P, Grunert's quartic). Many well-spread triples are
-solved. The median miss over *all* points ranks the solutions, which excludes gross errors and false solutions. Damped
-least squares refines the best few. The result is a start for `estimation.fit`.
+solved. The median miss over *all* points ranks the solutions, which excludes gross errors and false solutions: with few
+points the fourth smallest, because each solution fits its own three. Damped least squares refines the best few. The
+result is a start for `estimation.fit`.
 
 With a known position (an ephemeris), three or more directions give the rotation in closed form.
 
@@ -83,7 +84,7 @@ def resect(
             remedy="spread the points over the image",
         )
     refined = [_refine(blank._replace(exterior=start), control) for start in starts]
-    misses = [_median_miss(camera, control) for camera in refined]
+    misses = [_miss(camera, control) for camera in refined]
     best = int(np.argmin(misses))
     if not math.isfinite(misses[best]) or misses[best] > 0.05 * math.hypot(interior.width, interior.height):
         raise NotConverged(
@@ -205,7 +206,7 @@ def _best(solutions: list[tuple[Array, Array]], place: Array, bearings: Array) -
     lines = place[None] - np.stack([position for _, position in solutions])[:, None]
     lines /= np.linalg.norm(lines, axis=2)[:, :, None]
     misses = np.linalg.norm(np.einsum("sij,snj->sni", rotations, lines) - bearings, axis=2)
-    order = np.argsort(np.nanmedian(misses, axis=1), kind="stable")[:_REFINED]
+    order = np.argsort(_typical(misses), kind="stable")[:_REFINED]
     return [np.array([*solutions[i][1], *angles_of_rotation(rotations[i])]) for i in order]
 
 
@@ -231,9 +232,15 @@ def _refine(camera: FrameCamera, control: Points) -> FrameCamera:
     return camera.with_params(solution.x)
 
 
-def _median_miss(camera: FrameCamera, control: Points) -> float:
-    miss = np.hypot(*(camera.ground_to_image(control.ground) - control.image).T)
-    return float(np.median(np.where(np.isfinite(miss), miss, np.inf)))
+def _miss(camera: FrameCamera, control: Points) -> float:
+    return float(_typical(np.hypot(*(camera.ground_to_image(control.ground) - control.image).T)))
+
+
+def _typical(misses: Array) -> Array:
+    """Return the upper median of misses ``(..., N)``, at least the fourth smallest; a point that is not seen is far."""
+    far = np.sort(np.where(np.isfinite(misses), misses, np.inf), axis=-1)
+    count = far.shape[-1]
+    return np.asarray(far[..., max(count // 2, min(3, count - 1))])
 
 
 def _heights(camera: FrameCamera, control: Points) -> tuple[float, float]:
