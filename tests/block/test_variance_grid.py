@@ -7,16 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chains import Chain, fly, to_image, with_control
+from chains import ORIGIN, Chain, dense, fly, to_image, with_control
+from scipy.optimize import minimize_scalar
 from scipy.special import polygamma
 
 from ortho_pipeline.block.adjustment import _prepared
+from ortho_pipeline.block.equations.problem import Pseudo
 from ortho_pipeline.block.equations.solver import Solved, attempt, solve
 from ortho_pipeline.block.reliability import blunders
 from ortho_pipeline.block.reliability.standardised_residuals import standardise
 from ortho_pipeline.block.variances.components import Variances
 from ortho_pipeline.block.variances.control_equations import ControlEquations
 from ortho_pipeline.block.variances.grid import estimate, posterior, reweighed
+from ortho_pipeline.models import ImageCorrection
 
 
 def block(plan: float, height: float, control: int = 6, noise: float = 0.1) -> Solved:
@@ -125,3 +128,52 @@ def test_ground_of_one_image_is_perfect_whatever_its_sigmas() -> None:
         found = estimate(attempt(problem.with_sigmas(points.sigma_image, (sigma, sigma)), state, selection))
         assert not found.separable
         assert found.image == pytest.approx(wanted, rel=1e-4)
+
+
+def likeliest(solved: Solved) -> float:
+    """Return the factor of measurements with the greatest restricted likelihood, all equations in one dense matrix."""
+    design, misfits = dense(solved.linear)
+    rays = np.arange(len(design)) < 2 * len(solved.linear.ordering.rays)
+
+    def unlikely(log: float) -> float:
+        sigmas = np.where(rays, math.exp(log), 1.0)
+        whitened, own = design / sigmas[:, None], misfits / sigmas
+        step = np.linalg.lstsq(whitened, own, rcond=None)[0]
+        _, logs = np.linalg.slogdet(whitened.T @ whitened)
+        return float(np.log(sigmas).sum() + 0.5 * logs + 0.5 * ((own - whitened @ step) ** 2).sum())
+
+    return math.exp(minimize_scalar(unlikely, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 1e-6}).x)
+
+
+@pytest.mark.parametrize(("stated", "off"), [(0.02, 0.3), (0.02, -1.0), (1.0, 0.3)])
+def test_the_factor_of_measurements_is_the_likeliest_where_knowledge_of_parameters_contradicts_them(
+    stated: float, off: float
+) -> None:
+    """Noise of 0.1 px; what is stated of two parameters is wrong by so many pixels of 0.2, and keeps its sigma."""
+    flown = fly(Chain(images=3, convergence_deg=25.0, ties=12, errors=2.0, pairwise=False), 5)
+    points = with_control(flown, "i1", 5, sigma=0.05)
+    points = replace(points, sigma_image=np.full(points.rays, stated))
+    problem, state, selection = _prepared(tuple(flown.start.values()), points, {}, ())
+    true = np.concatenate([model.params for model in flown.truth.values()])
+    problem = problem.with_pseudo([Pseudo(k, float(true[k] + off), 0.2) for k in (0, 3)])
+    solved = solve(problem, state, selection)
+    assert estimate(solved).image == pytest.approx(likeliest(solved), rel=0.01)
+
+
+@pytest.mark.parametrize("off", [-0.02, -0.1])
+def test_how_far_parameters_move_with_the_sigmas_that_are_found_is_in_sigmas_they_had(off: float) -> None:
+    """Two parameters: the larger of two numbers whose squares add up to that of the step over its cofactors."""
+    flown = fly(Chain(images=2, convergence_deg=25.0, ties=15, errors=0.0, pairwise=False), 5)
+    points = with_control(flown, "i1", 5, sigma=0.05)
+    points = replace(points, sigma_image=np.full(points.rays, 0.05))
+    models = ImageCorrection.identity(flown.start["i0"].model, "none", ORIGIN), flown.start["i1"]
+    problem, state, selection = _prepared(models, points, {}, ())
+    solved = solve(problem.with_pseudo([Pseudo(0, off, 0.02)]), state, selection)
+    found = posterior(solved)
+    design, misfits = dense(solved.linear)
+    before = np.linalg.inv(design.T @ design)[:2, :2]
+    sigmas = np.where(np.arange(len(design)) < 2 * len(solved.linear.ordering.rays), found.variances.image, 1.0)
+    step = np.linalg.lstsq(design / sigmas[:, None], misfits / sigmas, rcond=None)[0][:2]
+    length = math.sqrt(step @ np.linalg.solve(before, step))
+    assert 0.1 < length < 1.0
+    assert length / math.sqrt(2.0) <= found.moved <= 1.001 * length

@@ -251,3 +251,21 @@ def test_few_matches_count_once_a_group_and_have_a_constant_error_in_common(leve
     np.testing.assert_allclose(found.covariance[3:, 3:], whole, rtol=1e-6)
     np.testing.assert_allclose(found.covariance[:3, 3:], 0.0, atol=1e-12)
     assert found.effective_points == 3 + 6
+
+
+def test_points_that_a_model_cannot_project_are_named_by_their_role(level: RPC) -> None:
+    """Without a height a point has no place in the image; one that is left out by name needs no further word."""
+    points = fitted(level).points
+
+    def noted(without: list[int], **options: Any) -> dict[str, list[str]]:
+        ground = points.ground.copy()
+        ground[without, 2] = np.nan
+        found = fit(ImageCorrection.identity(level, "shift", ORIGIN), points.with_ground(ground), **options)
+        return {one.fields["role"]: one.fields["points"] for one in found.warnings if one.code == "no-projection"}
+
+    ids = points.ids
+    assert noted([]) == {}
+    assert noted([2, 5]) == {"control": [ids[2], ids[5]]}
+    assert noted([10]) == {"check": [ids[10]]}
+    assert noted([2, 10, 11]) == {"control": [ids[2]], "check": [ids[10], ids[11]]}
+    assert noted([2, 5, 10], exclude={ids[2]: "moved"}) == {"control": [ids[5]], "check": [ids[10]]}

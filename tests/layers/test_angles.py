@@ -14,6 +14,9 @@ from osgeo import gdal
 from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
+from ortho_pipeline.models import FrameCamera
+from ortho_pipeline.models.frame.camera import MAP
+from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.options import OutputOptions, SurfaceOptions
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.report.document import read_report
@@ -82,6 +85,43 @@ def test_angles_end_where_the_image_ends(tmp_path):
     assert made.view_zenith_deg == pytest.approx((np.degrees(np.arctan(0.5)),) * 2, abs=0.01)
     nothing = write_angles(sight, surface, (1, 1), path, heights=(FLOOR, FLOOR), step=8)
     assert np.isnan(nothing.view_zenith_deg).all()
+
+
+def test_angles_end_where_the_image_ends_on_steep_ground(tmp_path):
+    """An oblique camera 4 km above hills of 600 m: the curve of image points by height is worth several pixels."""
+    interior, heights = Interior(300, 240, 0.01, 5e-6, 5e-6), (FLOOR, FLOOR + 600.0)
+    exterior = [WEST, NORTH, FLOOR + 4300.0, np.radians(25.0), np.radians(-15.0), 0.0]
+    model = FrameCamera.from_map(interior, "EPSG:32636", exterior, frame=MAP, heights=heights)
+    x, y, _ = model.image_to_ground(np.array([[150.0, 120.0]]), FLOOR + 300.0)[0]
+    v, u = np.mgrid[:121, :121]
+    write_dem(
+        tmp_path / "dem.tif",
+        FLOOR + 300 + 300 * np.sin(u / 9) * np.cos(v / 7),
+        (x - 605.0, y + 605.0),
+        10.0,
+        "EPSG:32636",
+    )
+    surface = open_dem(tmp_path / "dem.tif", "ellipsoid")
+    grid = Grid(surface.grid.crs, x - 560.0, y + 560.0, 8.0, 8.0, 140, 140)
+    write_angles(Sight(model, grid), surface, (300, 240), tmp_path / "a.tif", heights=heights, step=1)
+    columns, rows = (part.ravel() + 0.5 for part in np.meshgrid(np.arange(140), np.arange(140)))
+    places = np.stack(grid.xy(columns, rows), axis=1)
+    image = model.ground_to_image(np.column_stack([places, surface.heights(places, grid.crs)]))
+    within = np.minimum(image, (300.0, 240.0) - image).min(axis=1)
+    shown = np.isfinite(read(tmp_path / "a.tif")[0]).ravel()
+    assert 0.2 < shown.mean() < 0.8
+    far = np.abs(within) > 0.2
+    np.testing.assert_array_equal(shown[far], within[far] > 0)
+
+
+def test_angles_are_stored_in_degrees_as_they_are(tmp_path):
+    """Neither scaled nor shifted, so that any program reads the same numbers."""
+    surface, sight = City(()).surface(tmp_path / "dem.tif"), Sight(Parallel(0.3, 0.4, 1.0, 256.0), City(()).grid(1.0))
+    write_angles(sight, surface, (256, 256), tmp_path / "a.tif", heights=(FLOOR, FLOOR), step=8, sun=SUN)
+    dataset = gdal.Open(str(tmp_path / "a.tif"))
+    bands = [dataset.GetRasterBand(k + 1) for k in range(3)]
+    assert [band.GetUnitType() for band in bands] == ["degree"] * 3
+    assert [(band.GetScale() or 1.0, band.GetOffset() or 0.0) for band in bands] == [(1.0, 0.0)] * 3
 
 
 @pytest.mark.parametrize("place", [(142.0, 0.0), (142.0, 90.5), (142.0, -3.0), (360.5, 40.0), (-360.5, 40.0)])

@@ -371,3 +371,24 @@ def test_a_model_never_changes() -> None:
     for array in (north().origin, north().path_line, north().camera.dx, north().path.coefficients):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 1.0
+
+
+# -- splines of two kinds --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("path", "attitude"), [(3, 1), (1, 3), (2, 1), (1, 5)])
+def test_path_and_attitude_may_be_splines_of_different_degrees(path: int, attitude: int) -> None:
+    """Ground on the rays of the image has the place in the image that it came from."""
+    random = np.random.default_rng(4)
+    knots, other = np.array([0.0, 0.5, 1.2]), np.array([-0.1, 0.3, 0.9, 1.4])
+    times = Spline(path, knots, np.zeros((2 + path, 3))).sites
+    along = np.column_stack([SPEED * times, *random.normal(0, 30.0, (2, len(times)))])
+    turns = random.normal(0, 1e-3, (3 + attitude, 3))
+    model = odd(
+        path=Spline(path, knots, along), attitude=Spline(attitude, other, turns),
+        attitude_line=np.array([[0.01, -0.02, 0.03], [1e-3, 2e-3, -3e-3]]),
+    )  # fmt: skip
+    image = np.array([[0.0, 0.0], [1000.0, 600.0], [123.4, 567.8], [500.0, 300.0], [700.0, 250.0], [20.0, 110.0]])
+    ground = model.image_to_ground(image, np.array([0.0, 900.0, 500.0, 300.0, 100.0, 800.0]))
+    assert np.isfinite(ground).all()
+    np.testing.assert_allclose(model.ground_to_image(ground), image, atol=1e-4)

@@ -13,7 +13,7 @@ from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.raster.verified_writing import check_written, close, raster_output
+from ortho_pipeline.raster.verified_writing import check_written, close, raster_output, require_whole
 
 GRID = Grid(parse_crs("EPSG:32633"), 500_000.0, 4_000_000.0, 1.0, 1.0, 700, 600)
 NOISE = np.random.default_rng(1).integers(0, 60_000, (1, 600, 700)).astype(np.uint16)
@@ -60,6 +60,40 @@ def test_a_block_of_zeros_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(InputError, match="cannot be read back"):
         check_written(path, path)
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_a_damaged_block_is_refused_wherever_it_is(tmp_path, column, row):
+    """Of nine blocks each is read."""
+    path = write(tmp_path / "o.tif", "GTiff", {"COMPRESS": "DEFLATE", "BLOCKXSIZE": "256", "BLOCKYSIZE": "256"})
+    check_written(path, path)
+    dataset, content = gdal.Open(str(path)), bytearray(path.read_bytes())
+    offset = int(dataset.GetRasterBand(1).GetMetadataItem(f"BLOCK_OFFSET_{column}_{row}", "TIFF"))
+    del dataset
+    content[offset : offset + 500] = bytes(500)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read back"):
+        check_written(path, path)
+
+
+@pytest.mark.parametrize(
+    ("size", "last"),
+    [((129, 193), (128, 192, 1, 1)), ((150, 140), (128, 128, 22, 12)), ((127, 128), (64, 64, 63, 64))],
+)
+def test_of_another_format_the_last_block_alone_is_read(tmp_path, monkeypatch, size, last):
+    """A NITF in blocks of 64 x 64 pixels that lacks the byte of its last pixel."""
+    path, asked = tmp_path / "a.ntf", []
+    memory = gdal.GetDriverByName("MEM").Create("", *size, 1)
+    memory.WriteArray(np.random.default_rng(2).integers(0, 255, size[::-1]).astype(np.uint8))
+    close(gdal.GetDriverByName("NITF").CreateCopy(str(path), memory, options=["BLOCKXSIZE=64", "BLOCKYSIZE=64"]))
+    read = gdal.Band.ReadRaster
+    monkeypatch.setattr(gdal.Band, "ReadRaster", lambda band, *window: asked.append(window) or read(band, *window))
+    require_whole(path)
+    assert asked == [last]
+    path.write_bytes(path.read_bytes()[: -64 * 64 + (last[3] - 1) * 64 + last[2] - 1])
+    with pytest.raises(InputError, match="its last pixels cannot be read"):
+        require_whole(path)
 
 
 LIMITED = """

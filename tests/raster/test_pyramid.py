@@ -95,3 +95,12 @@ def test_black_and_white_are_the_percentiles_one_and_ninety_nine(tmp_path: Path)
     copy = nearest(16)
     np.testing.assert_allclose(made.stretch(), np.percentile(copy[np.isfinite(copy)], (1, 99)), rtol=1e-6)
     assert Pyramid(of(tmp_path / "b.tif", np.full((40, 40), -9.0)), (1,)).stretch() == (0.0, 1.0)
+
+
+def test_a_window_beside_the_origin_ends_with_the_last_column_and_row_of_the_copy(tmp_path: Path) -> None:
+    """From column and row 16 on, 6 x 3 pixels of 32: the last are the means of columns 11 and 12, rows 5 and 6."""
+    made, copy = Pyramid(of(tmp_path / "a.tif"), (1,)), nearest(16)
+    found = made.read(16, 16, 6, 3, 32)
+    np.testing.assert_allclose(found[-1, -1], copy[5:7, 11:13].mean(), rtol=1e-6)
+    rows = made.read(0, 0, 6, 4, 32)
+    np.testing.assert_allclose(rows[-1, -1], copy[6:8, 10:12].mean(), rtol=1e-6)

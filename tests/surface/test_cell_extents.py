@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pyproj
 import pytest
+from dem_cells import ROWS, small_cells
 
 from ortho_pipeline.surface.cells.copernicus import Cell, Extent, cells_of_list, columns_at, extent_of
+from ortho_pipeline.surface.cells.sources import misplaced
+from ortho_pipeline.surface.dem_file import Affine
 
 
 @pytest.mark.parametrize(
@@ -106,3 +111,31 @@ def test_the_extent_of_a_ring_is_not_torn_at_the_antimeridian():
     lon = np.linspace(0, 360, 37)
     for lat, expected in ((80.0, (-180.0, 80.0, 180.0, 90.0)), (-75.0, (-180.0, -90.0, 180.0, -75.0))):
         assert extent_of(np.column_stack([lon, np.full(37, lat)])) == expected
+
+
+# -- files of cells --------------------------------------------------------------------------------------------------
+
+
+def of_edges(cell: Cell, parts: tuple[float, float, float, float]) -> Affine:
+    """Return the place of samples whose edges (west, north, east, south) are off by parts of a sample."""
+    x, dx, _, y, _, dy = cell.grid.crs_from_pixel
+    rows, columns = cell.grid.shape
+    west, north, east, south = np.array(parts) * dx
+    return x + west, dx + (east - west) / columns, 0.0, y + north, 0.0, dy + (south - north) / rows
+
+
+@pytest.mark.parametrize("cell", [Cell(20, -31), Cell(20, 62)])
+def test_a_file_of_a_cell_is_at_its_place_if_no_edge_is_off_by_a_hundredth_of_a_sample(
+    monkeypatch: pytest.MonkeyPatch, cell: Cell
+) -> None:
+    """Of a column, which far from the equator is as wide on the ground as a row is high."""
+    small_cells(monkeypatch)
+    shape = cell.grid.shape
+    for signs in itertools.product((-1.0, 1.0), repeat=4):
+        west, north, east, south = 0.0099 * np.array(signs)
+        assert misplaced(cell, shape, of_edges(cell, (west, north, east, south))) == ""
+    for edge, sign in itertools.product(range(4), (-1.0, 1.0)):
+        west, north, east, south = (0.0101 * sign * (k == edge) for k in range(4))
+        assert "another place" in misplaced(cell, shape, of_edges(cell, (west, north, east, south)))
+    wider = misplaced(cell, (shape[0], shape[1] + 1), cell.grid.crs_from_pixel)
+    assert f"it has {shape[1] + 1} x {ROWS} samples instead of {shape[1]} x {ROWS}" in wider

@@ -17,6 +17,7 @@ from ortho_pipeline.models import RPC, FrameCamera, ImageCorrection
 from ortho_pipeline.models.frame.camera import MAP
 from ortho_pipeline.models.lens import Interior
 from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.surface import footprint
 from ortho_pipeline.surface.base import Surface
 from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.flat import FlatSurface
@@ -120,6 +121,19 @@ def test_voids_count_whatever_fills_them(tmp_path, fill):
     assert found.voids == 75
     # Of 4 m2 each, in 120 x 80.16 m, whose border cuts through samples.
     assert 1 - found.coverage == pytest.approx(300 / (120 * 80.16), rel=0.04)
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, 5, 40, 41, 42, 43, 1024])
+def test_voids_are_counted_up_to_the_last_row_and_column_whatever_the_blocks(tmp_path, monkeypatch, block):
+    """Posts every 2 m: 60 x 41 are in 120 x 80.16 m, the last ones 59 m east and 40 m south of the camera."""
+    monkeypatch.setattr(footprint, "_BLOCK", block)
+    heights = np.full((451, 450), GROUND)
+    heights[244:, 220:230] = -32768.0
+    heights[215:225, 253:] = -32768.0
+    found = laid(drone(), surface(tmp_path, heights, west=-449.0, fill="mask"))
+    # Two rows of ten posts, two columns of ten.
+    assert found.voids == 40
+    assert found.coverage == pytest.approx(1 - 40 / (60 * 41))
 
 
 def on_the_ground(model: FrameCamera, height: float) -> Any:
