@@ -120,19 +120,21 @@ def dem_of(
 def _check_geoid(grid: SampleGrid, vertical: Vertical) -> None:
     """Fail now if the geoid grid is missing or does not reach any part of the DEM."""
     rows, columns = grid.shape
-    v, u = (axis.ravel() for axis in np.meshgrid(np.linspace(0, rows - 1, 5), np.linspace(0, columns - 1, 5)))
     try:
-        undulation = vertical.undulation(*grid.lonlat(u, v))
+        # The geoid of a country can be a small part of a DEM of the world.
+        for count in (5, 200):
+            v, u = (
+                axis.ravel() for axis in np.meshgrid(*(np.linspace(0, side - 1, count) for side in (rows, columns)))
+            )
+            if np.isfinite(vertical.undulation(*grid.lonlat(u, v))).any():
+                return
     except DatumError as error:
         raise DatumError(
             error.message, field="surface.vertical", remedy=dem_vertical_remedy(error.remedy or "")
         ) from error
-    if not np.isfinite(undulation).any():
-        raise DatumError(
-            f"{vertical.label} does not cover this DEM",
-            field="surface.vertical",
-            remedy=dem_vertical_remedy(),
-        )
+    raise DatumError(
+        f"{vertical.label} does not cover this DEM", field="surface.vertical", remedy=dem_vertical_remedy()
+    )
 
 
 def moved(surface: DemSurface, metres: tuple[float, float, float], place: Array) -> DemSurface:

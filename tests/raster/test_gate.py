@@ -206,3 +206,20 @@ def test_sidecars_of_a_compressed_file_are_asked_for_by_name(tmp_path: Path) -> 
         for name in ("d/b.tif", "d/b.tfw", "d/other.tfw"):
             archive.writestr(name, "x")
     assert sorted(_beside(VsiPath(f"/vsizip/{tmp_path}/c.zip/d/b.tif"))) == ["b.tfw", "b.tif"]
+
+
+@pytest.mark.parametrize(("driver", "ending"), [("ENVI", "bil"), ("PCIDSK", "pix"), ("PCRaster", "map")])
+@pytest.mark.parametrize("cut", [1, 600, 20_000])
+def test_a_truncated_file_whose_missing_pixels_gdal_reads_as_zeros_is_refused(
+    tmp_path: Path, driver: str, ending: str, cut: int
+) -> None:
+    if gdal.GetDriverByName(driver) is None:
+        pytest.skip(f"this GDAL has no driver {driver}")
+    path = tmp_path / f"a.{ending}"
+    source = gdal.Open(str(tiff(tmp_path / "a.tif", kind=gdal.GDT_Float32)))
+    gdal.GetDriverByName(driver).CreateCopy(str(path), source).FlushCache()
+    whole, _ = open_seen(path, (), DRIVERS, siblings=True)
+    np.testing.assert_array_equal(whole.ReadAsArray(), source.ReadAsArray())
+    path.write_bytes(path.read_bytes()[:-cut])
+    with pytest.raises(InputError, match="the file is truncated"):
+        open_seen(path, (), DRIVERS, siblings=True)

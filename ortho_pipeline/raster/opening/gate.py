@@ -343,11 +343,37 @@ class _Gate:
                 remedy=f"set the right one: `gdal_edit.py -a_ullr WEST NORTH EAST SOUTH {typed(path)}`",
             )
         kind = dataset.GetDriver().ShortName
+        _require_whole(dataset, path, kind)
         for name in _listed(dataset):
             file = place(name)
             if str(file) != str(path):
                 self._must_be_inside(file, path, kind, name)
         self.block = max(self.block, DecodedUnit(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+
+
+def _require_whole(dataset: gdal.Dataset, path: Any, kind: str) -> None:
+    """Refuse a truncated file of a format whose missing pixels GDAL reads as zeros, without an error."""
+    if isinstance(path, VsiPath) or not path.is_file():
+        return
+    if kind == "PCIDSK":
+        with open(path, "rb") as file:
+            blocks = file.read(32)[16:].strip()
+        least = 512 * int(blocks) if blocks.isdigit() else 0
+    elif kind in ("ENVI", "PCRaster") and not (dataset.GetMetadata("ENVI") or {}).get("file_compression", "0").strip(
+        "0"
+    ):
+        types = (dataset.GetRasterBand(number + 1).DataType for number in range(dataset.RasterCount))
+        least = dataset.RasterXSize * dataset.RasterYSize * sum(gdal.GetDataTypeSize(one) // 8 for one in types)
+        least += 256 if kind == "PCRaster" else 0  # its header
+    else:
+        return
+    size = path.stat().st_size
+    if size < least:
+        raise InputError(
+            f"the file is truncated: it has {size:,} bytes, but by its header at least {least:,}",
+            file=path,
+            remedy="copy or download it again",
+        )
 
 
 def _beside(path: Any) -> list[str]:
