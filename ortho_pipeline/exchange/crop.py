@@ -28,8 +28,9 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 
-#: An image below this part of the size of its RPC's range is suspiciously small.
-_SMALL = 0.5
+#: An image below this part of the size of its RPC's range is suspiciously small, if the range begins so near to it, in
+#: parts of the range: ranges of vendors begin and end up to a tenth beyond the image.
+_SMALL, _BEGINS = 0.75, 0.1
 #: Tolerance at both ends within which an RPC's range covers an image, in parts of the range.
 _COVERED = 0.05
 #: A hypothesis is right if its distance from the evidence is at most this part of the distance between the two.
@@ -303,7 +304,7 @@ def _small(scene: Scene) -> Notice | None:
         return None
     ranges = _ranges(scene.model)
     sizes = np.ptp(ranges, axis=1).tolist()
-    begins = all(abs(first) <= _COVERED * size for first, size in zip(ranges[:, 0], sizes, strict=True))
+    begins = all(abs(first) <= _BEGINS * size for first, size in zip(ranges[:, 0], sizes, strict=True))
     small = scene.width < _SMALL * sizes[0] or scene.height < _SMALL * sizes[1]
     if not (begins and small):
         return None

@@ -155,7 +155,8 @@ def _plain(name: str) -> str:
 def _ours(name: str, aliases: Mapping[str, str] = _ALIASES) -> str:
     """Return our name of a column; of an unknown one its own name."""
     lowered = name.strip().lower()
-    return lowered if lowered in ("id", "col", "row", "x", "y", "h", "role") else aliases.get(_plain(name), lowered)
+    own = _OWN_UNIT.sub("", lowered).strip()
+    return own if own in ("id", "col", "row", "x", "y", "h", "role") else aliases.get(_plain(name), lowered)
 
 
 def _header(path: str | os.PathLike[str], line: Line, expected: ColumnRules) -> Header:

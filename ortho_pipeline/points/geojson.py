@@ -115,13 +115,15 @@ def _named(
     ground: tuple[float, ...],
     expected: ColumnRules,
 ) -> tuple[dict[str, Any], tuple[float, float, float]]:
-    """Return properties by our names, and the ground with a height that is one of them."""
+    """Return properties by our names, and the ground with a height that is one of them, else that of the geometry."""
     x, y, height = ground
-    for alias, ours in expected.aliases.items():
+    of_heights = {"h": "h", **expected.aliases} if expected.aliases else {}
+    # The name that comes first counts most.
+    for alias, ours in reversed(of_heights.items()):
         value = next((value for key, value in properties.items() if key.lower().replace("_", "") == alias), None)
         if value is not None and ours != "h":
             properties = {ours: value, **properties}
-        elif value is not None and math.isnan(height):
+        elif value is not None:
             height = number(value, path, f"{where}.properties, {alias}")
     return properties, (x, y, height)
 

@@ -265,7 +265,8 @@ def _triple(path: str | PathLike[str], field: str, value: Any) -> tuple[float, f
 
 
 def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    lines = [(n, line) for n, line in enumerate(_text(path).splitlines(), start=1) if line.strip() and line[0] != "#"]
+    text = [(n, line) for n, line in enumerate(_text(path).splitlines(), start=1) if line.strip()]
+    lines = [(n, line) for n, line in text if line[0] != "#"]
     if not lines:
         raise InputError("the table is empty", file=path)
     first = lines[0][1]
@@ -279,6 +280,11 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
             raise InputError(f"this row cannot be read ({error})", file=path, field=f"line {at}") from error
         rows.append((at, [cell.strip() for cell in cells]))
     if len(rows[0][1]) >= 7 and all(map(_is_number, rows[0][1][1:7])):
+        for n, comment in reversed(text):
+            named = [cell.strip().lower() for cell in comment.lstrip("# ").split(delimiter)]
+            if n < rows[0][0] and len(named) == len(rows[0][1]) and not any(map(_is_number, named)):
+                # The header is a comment, as Metashape writes it.
+                return named, rows
         # Without a header, as in the tables of many programs.
         return ["filename", *(names[0] for names in MAP_COLUMNS)], rows
     return [cell.lower() for cell in rows[0][1]], rows[1:]

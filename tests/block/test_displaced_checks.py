@@ -15,7 +15,9 @@ from ortho_pipeline.report.network.facts import displaced_checks
 def block(errors: Any, check: Any = True) -> Any:
     """Return what the note reads of a block whose points have these errors (adjusted minus given)."""
     marked = np.broadcast_to(check, len(errors))
-    return SimpleNamespace(points=SimpleNamespace(check=marked), object_residuals=-np.asarray(errors, dtype=float))
+    residuals = -np.asarray(errors, dtype=float)
+    sigmas = np.broadcast_to([1.0, 1.0, 2.5], residuals.shape)
+    return SimpleNamespace(points=SimpleNamespace(check=marked), object_residuals=residuals, ground_sigmas=sigmas)
 
 
 def test_a_common_error_in_height_is_named_with_its_sign() -> None:
@@ -23,7 +25,7 @@ def test_a_common_error_in_height_is_named_with_its_sign() -> None:
     (notice,) = displaced_checks(block(errors))
     mean = errors.mean(axis=0)
     assert notice.code == "systematic-errors"
-    assert notice.endswith(f"the mean error of 30 check points is −{-mean[2]:.2f} m in z")
+    assert notice.endswith(f"the mean error of 30 check points is −{-mean[2]:.2f} m in z (sigma of a point: 2.5 m)")
     assert notice.fields["mean_m"] == pytest.approx(mean)
 
 

@@ -46,6 +46,7 @@ def read(tmp_path: Path, text: str, name: str = "p.csv", crs: str | None = "EPSG
         (",col,row,x,y,h", "A1,10.5,20.25,500100.5,6270000.25,123.5", "EPSG:32735"),
         ("Unnamed: 0,id,col,row,x,y,h", "7,A1,10.5,20.25,500100.5,6270000.25,123.5", "EPSG:32735"),
         ("gcp,x_pix,y_pix,East (m),North (m),Elevation [m],", "A1,10.5,20.25,500100.5,6270000.25,123.5,", "EPSG:32735"),
+        ("id,col [px],row [px],X [m],Y (m),h [m]", "A1,10.5,20.25,500100.5,6270000.25,123.5", "EPSG:32735"),
         ("Name,Pixel,Line,Lat,Lon,alt", "A1,10.5,20.25,-33.65,24.4,123.5", "EPSG:4326"),
         ("Name|Pixel X|Pixel Y|Latitude|Longitude|Altitude (m)", "A1|10.5|20.25|-33.65|24.4|123.5", "EPSG:4326"),
         ('"Name" "Pixel" "Line" "Lat" "Lon" "Z"', '"A1"  10.5 20.25\t-33.65 24.4  123.5', "EPSG:4326"),

@@ -67,6 +67,19 @@ def test_geojson(tmp_path: Path) -> None:
     assert spots.sigmas.tolist() == [0.3, 0.2]
 
 
+@pytest.mark.parametrize("name", ["h", "h_mean", "H_LI"])
+@pytest.mark.parametrize("place", [[33.5, 36.5], [33.5, 36.5, 0.0]])
+def test_a_height_among_the_properties_counts_more_than_that_of_the_geometry(
+    tmp_path: Path, name: str, place: list[float]
+) -> None:
+    properties = {name: 812.5, "sigma": 0.3, "sigma_xy": 5.0}
+    feature = {"type": "Feature", "geometry": {"type": "Point", "coordinates": place}, "properties": properties}
+    path = tmp_path / "spots.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    spots = read_spot_heights(path)
+    assert (spots.ground[0, 2], spots.sigmas[0], spots.plan[0]) == (812.5, 0.3, 5.0)
+
+
 @pytest.mark.parametrize(
     ("rows", "crs", "vertical", "kind", "field"),
     [
@@ -99,6 +112,10 @@ def test_geoparquet(tmp_path: Path) -> None:
     spots = read_spot_heights(path)
     np.testing.assert_allclose(spots.ground, [(33.5, 36.5, 1042.5), (33.6, 36.4, 1300.0)], atol=1e-5)
     assert spots.sigmas.tolist() == [0.2, 0.4]
+    assert spots.plan.tolist() == [0.0, 0.0]
+    stated = {"h": [1042.5, 1300.0], "sigma": [0.2, 0.4], "sigma_xy": [5.0, np.nan]}
+    geopandas.GeoDataFrame(stated, geometry=places, crs="EPSG:4979").to_parquet(path)
+    assert read_spot_heights(path).plan.tolist() == [5.0, 0.0]
     geopandas.GeoDataFrame({"h": [1.0]}, geometry=places[:1].buffer(1), crs="EPSG:4326").to_parquet(path)
     with pytest.raises(InputError, match="not all points"):
         read_spot_heights(path)

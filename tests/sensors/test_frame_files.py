@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from ortho_pipeline import commands
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.geodesy.crs import Vertical
 from ortho_pipeline.options import SceneOptions
 
 LENS = {"projection_type": "perspective", "width": 60, "height": 40, "focal": 0.8, "k1": 0.0, "k2": 0.0}
@@ -125,3 +126,39 @@ def test_info_says_what_is_missing(tmp_path):
     assert "not stated" in commands.info(path, options)["facts"]["ground_heights"]
     stated = SceneOptions(sensor_options={**options.sensor_options, "heights": "850,950"})
     assert "ground_heights" not in commands.info(path, stated)["facts"]
+
+
+CAMERA = {"width": 60, "height": 40, "focal_length_mm": 48.0, "sensor_mm": [60.0, 40.0]}
+ROW = "500100.0,6270000.0,2500.0"
+
+
+def framed(folder: Path, table: str, vertical: str = "ellipsoid") -> np.ndarray:
+    """Return the parameters of an image that a table orients: place, omega, phi and kappa."""
+    (folder / "camera.json").write_text(json.dumps(CAMERA))
+    (folder / "poses.csv").write_text(table)
+    given = {"camera": str(folder / "camera.json"), "exterior": str(folder / "poses.csv"), "crs": "EPSG:32735"}
+    options = {**given, "vertical": vertical, "frame": "map"}
+    return np.asarray(open_scene(image(folder), SceneOptions(sensor_options=options)).model.params)
+
+
+def test_a_header_may_be_a_comment(tmp_path):
+    plain = framed(tmp_path, f"filename,x,y,z,kappa,phi,omega\none.tif,{ROW},30,2,1\n")
+    np.testing.assert_allclose(np.degrees(plain[3:]), [1, 2, 30], atol=1e-9)
+    for header in ("#filename,x,y,z,kappa,phi,omega\n", "# Cameras (1)\n# Filename, X, Y, Z, Kappa, Phi, Omega\n"):
+        np.testing.assert_array_equal(framed(tmp_path, f"{header}one.tif,{ROW},30,2,1\n"), plain)
+    # Without one, angles are omega, phi and kappa; a comment in words is no header.
+    for first in ("", "# made by hand, with care, on a Monday, and checked\n", "#one,1,2,3,4,5,6\n"):
+        bare = framed(tmp_path, f"{first}one.tif,{ROW},1,2,30\n")
+        np.testing.assert_array_equal(bare, plain)
+
+
+def test_a_header_of_other_angles_is_refused_in_a_comment_too(tmp_path):
+    with pytest.raises(InputError, match="unexpected columns"):
+        framed(tmp_path, f"#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll\none.tif,{ROW},30,2,1\n")
+
+
+def test_heights_of_a_table_have_the_unit_of_their_datum(tmp_path, monkeypatch):
+    monkeypatch.setattr(Vertical, "undulation", lambda self, lon, lat: np.full(np.shape(lon), 30.0))
+    table = f"one.tif,{ROW},1,2,30\n"
+    for code, metres in (("EPSG:8228", 0.3048), ("EPSG:5703", 1.0)):
+        assert framed(tmp_path, table, code)[2] == pytest.approx(2500 * metres + 30.0)

@@ -50,20 +50,22 @@ def read_parquet(path: str | os.PathLike[str]) -> Table:
     columns: dict[str, Any] = {}
     for name in frame.columns:
         plain = str(name).lower().replace("_", "")
-        columns.setdefault({"h": "h", "id": "id", **OF_HEIGHTS.aliases}.get(plain, plain), frame[name])
+        ours = {"h": "h", "id": "id", "sigmaxy": "sigma_xy", **OF_HEIGHTS.aliases}.get(plain, plain)
+        columns.setdefault(ours, frame[name])
         if plain in ALTIMETRY:
             altimetry(table)
     if "h" not in columns and not geometry.has_z.all():
         raise InputError("no column h", file=path, field="h", remedy="name the heights h")
     if "h" not in columns:
         columns["h"] = geometry.z
-    sigmas = columns.get("sigma_h", [math.nan] * len(frame))
-    for count, values in enumerate(zip(geometry.x, geometry.y, columns["h"], sigmas, strict=True)):
+    unknown = [math.nan] * len(frame)
+    sigmas = [columns.get(name, unknown) for name in ("sigma_xy", "sigma_h")]
+    for count, values in enumerate(zip(geometry.x, geometry.y, columns["h"], *sigmas, strict=True)):
         where = f"row {count}"
-        x, y, h, sigma = (_float(value, path, where) for value in values)
+        x, y, h, *stated = (_float(value, path, where) for value in values)
         place = number(x, path, where), number(y, path, where), number(h, path, where)
-        known = None if math.isnan(sigma) else sigma_of(sigma, path, where, zero=True)
-        table.rows.append(PointRow(where, None, (math.nan, math.nan), place, "check", sigma_h=known))
+        plan, height = (None if math.isnan(one) else sigma_of(one, path, where, zero=True) for one in stated)
+        table.rows.append(PointRow(where, None, (math.nan, math.nan), place, "check", sigma_xy=plan, sigma_h=height))
     return table
 
 

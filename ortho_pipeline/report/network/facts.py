@@ -12,6 +12,7 @@ from ortho_pipeline.block.local_frame import GEODETIC
 from ortho_pipeline.block.network import NetworkRecord, network_of
 from ortho_pipeline.block.relative.joins import joins_of, weak_joins
 from ortho_pipeline.display.notices import Notice
+from ortho_pipeline.display.numbers import size_m
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import viewing
 from ortho_pipeline.estimation.statistics import student_of
@@ -54,12 +55,17 @@ def thinly_covered(places: Mapping[str, Mapping[str, Any]]) -> tuple[Notice, ...
 
 def displaced_checks(fit: BlockFit) -> tuple[Notice, ...]:
     """Return a notice if the mean error of check points is more than chance explains, in an axis."""
-    errors = -fit.object_residuals[fit.points.check & np.isfinite(fit.object_residuals).all(axis=1)]
+    tested = fit.points.check & np.isfinite(fit.object_residuals).all(axis=1)
+    errors, stated = -fit.object_residuals[tested], fit.ground_sigmas[tested]
     if len(errors) < _FEWEST:
         return ()
     mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1) / np.sqrt(len(errors))
     _, chance = student_of(mean, np.diag(sigma**2), len(errors) - 1)
-    far = [f"{value:+.2f} m in {axis}" for value, axis, p in zip(mean, "xyz", chance, strict=True) if p < _CHANCE]
+    far = [
+        f"{value:+.2f} m in {axis} (sigma of a point: {size_m(float(np.median(one)))})"
+        for value, axis, p, one in zip(mean, "xyz", chance, stated.T, strict=True)
+        if p < _CHANCE
+    ]
     if not far:
         return ()
     said = " and ".join(far).replace("-", "−")
