@@ -255,6 +255,16 @@ def test_points_alone_say_how_accurate_an_ortho_is(shifted, tmp_path):
     assert run("verify", shifted[0], "--gcps", few, *words).exit_code == 2
 
 
+def test_map_coordinates_in_place_of_pixels_are_an_error(shifted, tmp_path):
+    ground = CORNER + np.random.default_rng(1).uniform(20, 300, (5, 2)) * (1, -1)
+    points = tmp_path / "points.csv"
+    rows = [f"p{k},{x:.2f},{-y:.2f},{x:.2f},{y:.2f}" for k, (x, y) in enumerate(ground)]
+    points.write_text("id,col,row,x,y\n" + "\n".join(rows))
+    done = run("verify", shifted[0], "--gcps", points, "--points-crs", "EPSG:32735")
+    assert done.exit_code == 2
+    assert "give columns and rows of the ortho, not map coordinates" in " ".join(done.output.split())
+
+
 def test_nothing_to_compare_with_is_an_error(shifted):
     done = run("verify", shifted[0])
     assert done.exit_code == 2

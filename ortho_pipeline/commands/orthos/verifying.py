@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -166,8 +167,22 @@ class _Job:
         ground = with_reference_height(opened.model, points.ground)
         ground = ground_transform(points.crs, opened.model.crs)(ground)
         plan, _ = metre_partials(opened.model, ground)
-        errors = solve_2x2(plan, points.image - opened.model.ground_to_image(ground))
+        off = points.image - opened.model.ground_to_image(ground)
+        errors = solve_2x2(plan, off)
         good = np.isfinite(errors).all(axis=1)
+        typical = float(np.median(np.hypot(*off[good].T))) if good.any() else 0.0
+        if typical > math.hypot(opened.width, opened.height):
+            raise InputError(
+                f"half of the points are more than {typical:.0f} pixels from where the ortho shows them, which is more "
+                "than its size",
+                file=points.source or None,
+                field="points.gcps",
+                remedy=Text(
+                    "give columns and rows of the ortho, not map coordinates, and check the CRS of the points (",
+                    Setting("points.crs"),
+                    ")",
+                ),
+            )
         return PointErrors(tuple(np.array(points.ids)[good].tolist()), errors[good])
 
 
