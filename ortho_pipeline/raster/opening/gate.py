@@ -334,14 +334,7 @@ class _Gate:
                     if target.exists():
                         self._see(target, path, named.field, frozenset())
         _see_crs((dataset.GetProjection(), dataset.GetGCPProjection()), path)
-        transform = dataset.GetGeoTransform(can_return_null=True)
-        if transform is not None and not all(map(math.isfinite, transform)):
-            raise InputError(
-                "the geotransform of this raster is not finite",
-                file=path,
-                field="geotransform",
-                remedy=f"set the right one: `gdal_edit.py -a_ullr WEST NORTH EAST SOUTH {typed(path)}`",
-            )
+        _require_finite(dataset, path)
         kind = dataset.GetDriver().ShortName
         _require_whole(dataset, path, kind)
         for name in _listed(dataset):
@@ -349,6 +342,18 @@ class _Gate:
             if str(file) != str(path):
                 self._must_be_inside(file, path, kind, name)
         self.block = max(self.block, DecodedUnit(_decoded_at_once(dataset), str(path)), key=lambda block: block.size)
+
+
+def _require_finite(dataset: gdal.Dataset, path: Any) -> None:
+    """Refuse a geotransform that is not finite."""
+    transform = dataset.GetGeoTransform(can_return_null=True)
+    if transform is not None and not all(map(math.isfinite, transform)):
+        raise InputError(
+            "the geotransform of this raster is not finite",
+            file=path,
+            field="geotransform",
+            remedy=f"set the right one: `gdal_edit.py -a_ullr WEST NORTH EAST SOUTH {typed(path)}`",
+        )
 
 
 def _require_whole(dataset: gdal.Dataset, path: Any, kind: str) -> None:

@@ -69,7 +69,7 @@ def displaced_checks(fit: BlockFit) -> tuple[Notice, ...]:
     if not far:
         return ()
     said = " and ".join(far).replace("-", "−")
-    text = f"systematic errors remain: the mean error of {len(errors)} check points is {said}"
+    text = f"systematic errors remain: the mean error of {counted(len(errors), 'check point')} is {said}"
     return (Notice("systematic-errors", text, roles=["check"], mean_m=mean.tolist()),)
 
 
