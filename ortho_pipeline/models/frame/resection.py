@@ -206,6 +206,7 @@ def _best(solutions: list[tuple[Array, Array]], place: Array, bearings: Array) -
     lines = place[None] - np.stack([position for _, position in solutions])[:, None]
     lines /= np.linalg.norm(lines, axis=2)[:, :, None]
     misses = np.linalg.norm(np.einsum("sij,snj->sni", rotations, lines) - bearings, axis=2)
+    misses = misses[:, np.isfinite(bearings).all(axis=1)]
     order = np.argsort(_typical(misses), kind="stable")[:_REFINED]
     return [np.array([*solutions[i][1], *angles_of_rotation(rotations[i])]) for i in order]
 
