@@ -181,9 +181,10 @@ def unsettled(report: SceneReport) -> str | None:
     for one in report.adjustment.notices:
         if one["code"] == "checks-apart":
             rest = one.get("rest")
-            without = f": {px(rest)}{_on_ground(report, rest)} without {', '.join(one['points'][:3])}" if rest else ""
-            more = "" if len(one["points"]) <= 3 or rest is None else " and others"
-            return f"Not settled{without}{more}"
+            if rest is None:
+                return "Not settled"
+            more = "" if len(one["points"]) <= 3 else " and others"
+            return f"Not settled: {px(rest)}{_on_ground(report, rest)} without {', '.join(one['points'][:3])}{more}"
     return None
 
 

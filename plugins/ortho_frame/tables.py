@@ -280,9 +280,9 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
             raise InputError(f"this row cannot be read ({error})", file=path, field=f"line {at}") from error
         rows.append((at, [cell.strip() for cell in cells]))
     if len(rows[0][1]) >= 7 and all(map(_is_number, rows[0][1][1:7])):
-        for n, comment in reversed(text):
+        for _, comment in reversed(text[: text.index(lines[0])]):
             named = [cell.strip().lower() for cell in comment.lstrip("# ").split(delimiter)]
-            if n < rows[0][0] and len(named) == len(rows[0][1]) and not any(map(_is_number, named)):
+            if len(named) == len(rows[0][1]) and not any(map(_is_number, named)):
                 # The header is a comment, as Metashape writes it.
                 return named, rows
         # Without a header, as in the tables of many programs.

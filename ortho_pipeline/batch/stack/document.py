@@ -45,6 +45,8 @@ def record_of(
     notices = _notices(dates, stack, matched, len(pairs))
     shifts, usable = stack.trends.value[:, 0], stack.trends.good
     grid = placed.grid
+    low, size = stack.cells.low, stack.cells.side * np.array(stack.cells.shape)
+    at_corners = stack.at(low + size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]))
     return StackRecord(
         schema_version=SCHEMA_VERSION,
         datum=options["stack"].datum,
@@ -52,7 +54,7 @@ def record_of(
             crs=placed.model.crs, geotransform=grid.geotransform, size=(grid.width, grid.height),
             pixel_m=float(np.sqrt(abs(np.linalg.det(metres)))),
         ),
-        dates=tuple(_date(dates, number, stack, metres, outputs) for number in range(len(dates))),
+        dates=tuple(_date(dates, number, stack, metres, outputs, at_corners) for number in range(len(dates))),
         pairs=tuple(_pairs(dates, pairs, stack)),
         closure_before=closures(stack, shifts, usable),
         closure_after=closures(stack, shifts, stack.closures.accepted),
@@ -81,13 +83,13 @@ def _chosen(options: Mapping[str, Any]) -> dict[str, Any]:
 
     The command is no part of it: runs with other workers, or with the images in another order, write the same bytes.
     """
-    found = {}
+    found: dict[str, Any] = {}
     for group, values in options.items():
         usual = as_asked(type(values)())
-        found[group] = {
-            name: value for name, value in as_asked(values).items() if value != usual.get(name) and name != "rebuild"
-        }
-    return {group: chosen for group, chosen in found.items() if chosen}
+        for name, value in as_asked(values).items():
+            if value != usual.get(name) and name != "rebuild":
+                found.setdefault(group, {})[name] = value
+    return found
 
 
 def _metres(placed: Placed) -> Array:
@@ -102,15 +104,18 @@ def _pair(values: Array) -> tuple[float, float]:
 
 
 def _date(
-    dates: Sequence[Dated], number: int, stack: AdjustedStack, metres: Array, outputs: dict[str, str]
+    dates: Sequence[Dated],
+    number: int,
+    stack: AdjustedStack,
+    metres: Array,
+    outputs: dict[str, str],
+    at_corners: tuple[Array, Array],
 ) -> DateRecord:
     one, known = dates[number], bool(stack.determined[number])
     accepted, edges = stack.closures.accepted, stack.edges
     count = int((accepted & ((edges.first == number) | (edges.second == number))).sum())
     shift, sigma = stack.network.value[number, 0], stack.sigma[number]
-    low, size = stack.cells.low, stack.cells.side * np.array(stack.cells.shape)
-    corners = low + size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-    there, spread = (values[number] for values in stack.at(corners))
+    there, spread = (values[number] for values in at_corners)
     return DateRecord(
         name=one.name,
         path=str(one.image),

@@ -87,10 +87,10 @@ class MeasuredOrtho:
     opened: SceneOptions
     band: int | None = None
 
-    @property
+    @functools.cached_property
     def pixel(self) -> float:
         """Size (m) of a pixel in the middle."""
-        return float(np.sqrt(abs(np.linalg.det(self.metres))))
+        return pixel_of(self.scene)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -336,7 +336,7 @@ class _Gate:
         _see_crs((dataset.GetProjection(), dataset.GetGCPProjection()), path)
         _require_finite(dataset, path)
         kind = dataset.GetDriver().ShortName
-        _require_whole(dataset, path, kind)
+        _require_size(dataset, path, kind)
         for name in _listed(dataset):
             file = place(name)
             if str(file) != str(path):
@@ -356,29 +356,32 @@ def _require_finite(dataset: gdal.Dataset, path: Any) -> None:
         )
 
 
-def _require_whole(dataset: gdal.Dataset, path: Any, kind: str) -> None:
+def _require_size(dataset: gdal.Dataset, path: Any, kind: str) -> None:
     """Refuse a truncated file of a format whose missing pixels GDAL reads as zeros, without an error."""
     if isinstance(path, VsiPath) or not path.is_file():
         return
-    if kind == "PCIDSK":
-        with open(path, "rb") as file:
-            blocks = file.read(32)[16:].strip()
-        least = 512 * int(blocks) if blocks.isdigit() else 0
-    elif kind in ("ENVI", "PCRaster") and not (dataset.GetMetadata("ENVI") or {}).get("file_compression", "0").strip(
-        "0"
-    ):
-        types = (dataset.GetRasterBand(number + 1).DataType for number in range(dataset.RasterCount))
-        least = dataset.RasterXSize * dataset.RasterYSize * sum(gdal.GetDataTypeSize(one) // 8 for one in types)
-        least += 256 if kind == "PCRaster" else 0  # its header
-    else:
-        return
-    size = path.stat().st_size
+    size, least = path.stat().st_size, _least_size(dataset, path, kind)
     if size < least:
         raise InputError(
             f"the file is truncated: it has {size:,} bytes, but by its header at least {least:,}",
             file=path,
             remedy="copy or download it again",
         )
+
+
+def _least_size(dataset: gdal.Dataset, path: Any, kind: str) -> int:
+    """Return the bytes that a file has at least by its header; 0 if GDAL itself reports that some are missing."""
+    if kind == "PCIDSK":
+        with open(path, "rb") as file:
+            blocks = file.read(32)[16:].strip()
+        return 512 * int(blocks) if blocks.isdigit() else 0
+    compressed = (dataset.GetMetadata("ENVI") or {}).get("file_compression", "0").strip("0")
+    if kind not in ("ENVI", "PCRaster") or compressed:
+        return 0
+    types = (dataset.GetRasterBand(number + 1).DataType for number in range(dataset.RasterCount))
+    pixel = sum(gdal.GetDataTypeSize(one) // 8 for one in types)
+    header = 256 if kind == "PCRaster" else 0
+    return header + dataset.RasterXSize * dataset.RasterYSize * pixel
 
 
 def _beside(path: Any) -> list[str]:
