@@ -238,6 +238,14 @@ class Vertical:
             return 1.0
         return float(pyproj.CRS.from_user_input(self.name).axis_info[0].unit_conversion_factor)
 
+    def ellipsoidal(self, lon: ArrayLike, lat: ArrayLike, heights: ArrayLike) -> Array:
+        """Return ellipsoidal heights (m) ``(N,)`` of heights in the unit of this datum; NaN and errors as `undulation`.
+
+        >>> Vertical.parse("ellipsoid").ellipsoidal([33.0], [37.0], [800.0])
+        array([800.])
+        """
+        return np.asarray(np.asarray(heights, dtype=float) * self.metres_per_unit + self.undulation(lon, lat))
+
     def undulation(self, lon: ArrayLike, lat: ArrayLike) -> Array:
         """Return the height (m) of the datum's zero above the WGS84 ellipsoid: ``h = H + undulation``.
 

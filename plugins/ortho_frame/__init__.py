@@ -242,8 +242,7 @@ def _model(
             remedy="give the sensor option crs, such as crs=EPSG:32636",
         )
     on_earth = position if pose.geographic else ground_transform(str(crs), "EPSG:4979")([[*position[:2], 0.0]])[0]
-    position[2] *= vertical.metres_per_unit
-    position[2] += float(vertical.undulation(on_earth[:1], on_earth[1:2])[0])
+    position[2] = vertical.ellipsoidal(on_earth[:1], on_earth[1:2], position[2:])[0]
     if not np.isfinite(position).all():
         raise InputError("this position is outside the map projection", file=pose.source, field=pose.where)
     others = {"heights": _heights(heights, float(position[2])), "refraction": refraction}

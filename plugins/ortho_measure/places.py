@@ -183,7 +183,5 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
         if not np.isfinite(height):
             raise InputError("the DEM has no height here", field="ground", remedy="enter the height")
     else:
-        datum = Vertical.parse(vertical or "ellipsoid")
-        undulation = 0.0 if datum.is_ellipsoid else float(datum.undulation(lonlat[:1], lonlat[1:])[0])
-        height = values[2] * datum.metres_per_unit + undulation
+        height = float(Vertical.parse(vertical or "ellipsoid").ellipsoidal(lonlat[:1], lonlat[1:], [values[2]])[0])
     return np.array([lonlat[0], lonlat[1], height])
