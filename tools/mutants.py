@@ -217,7 +217,7 @@ def try_all(copy: Copy, words: argparse.Namespace, records: Path) -> None:
     every = [one for path in modules for one in mutants_of(str(path.relative_to(copy.root)), path.read_bytes())]
     done = {name for name, row in read(records).items() if row["caught"] or not words.again}
     entered = Entered(words.folder / "map", copy.root)
-    for mutant in random.Random(words.seed).sample(every, min(words.count, len(every))):
+    for mutant in random.Random(words.seed).sample(every, min(words.count, len(every)))[words.first :]:
         if mutant.id in done:
             continue
         began, tests = time.monotonic(), chosen(entered, mutant, words.limit)
@@ -251,6 +251,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=300, help="mutants, those of earlier runs included")
+    parser.add_argument("--first", type=int, default=0, help="with which one to begin; others are for another process")
     parser.add_argument("--limit", type=float, default=30, help="seconds of tests for a mutant")
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "mutants")
     parser.add_argument("--rooms", nargs="*", default=ROOMS)

@@ -203,15 +203,14 @@ def dem_height_at(heights, u, v, dem_left, dem_top, cubic_dem):
     rows, columns = heights.shape
     if not (dem_left <= u <= dem_left + columns - 1 and dem_top <= v <= dem_top + rows - 1):
         return np.nan
-    # The last sample itself is still covered.
-    i, j = min(int(np.floor(u)), dem_left + columns - 2), min(int(np.floor(v)), dem_top + rows - 2)
+    i, j = int(np.floor(u)), int(np.floor(v))
     return _dem_height(heights, i - dem_left, j - dem_top, u - i, v - j, cubic_dem)
 
 
 @inlined
 def _dem_height(heights, i, j, fu, fv, cubic_dem):
     """Interpolate the DEM at (i + fu, j + fv); NaN where a sample with weight is void."""
-    # A sample of weight zero must not spoil the result: 0 * NaN is NaN.
+    # A sample of weight zero must not spoil the result: 0 * NaN is NaN. After the last sample there is none.
     upper = heights[j, i] if fu == 0.0 else heights[j, i] + (heights[j, i + 1] - heights[j, i]) * fu
     if fv == 0.0:
         bilinear = upper

@@ -261,6 +261,11 @@ def test_heights_in_the_window():
         (2.5, 1.5, True),
     ):
         assert np.isnan(kernel._height(heights, x, y)) == void
+    heights[3, 4] = NAN  # before the last sample of its row and of its column
+    assert np.isnan(kernel._height(heights, 4.5, 3.0))
+    assert np.isnan(kernel._height(heights, 4.0, 3.5))
+    assert kernel._height(heights, 5.0, 3.0) == heights[3, 5]
+    assert kernel._height(heights, 4.0, 4.0) == heights[4, 4]
 
 
 @pytest.mark.parametrize(

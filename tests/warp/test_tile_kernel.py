@@ -66,6 +66,16 @@ def test_a_void_counts_only_where_it_has_weight():
         np.testing.assert_equal(found, np.nan if weight else 1.0)
 
 
+@pytest.mark.parametrize("cubic", [False, True])
+def test_a_void_before_the_last_sample_has_no_weight_there(cubic):
+    heights = HEIGHTS.copy()
+    heights[4, 5] = np.nan
+    for column, row in ((6.0, 4.0), (5.0, 5.0), (6.0, 5.0)):
+        found = tile_kernel.dem_height_at(heights, column + LEFT, row + TOP, LEFT, TOP, cubic)
+        assert found == heights[int(row), int(column)]
+    assert np.isnan(tile_kernel.dem_height_at(heights, 5.5 + LEFT, 4 + TOP, LEFT, TOP, cubic))
+
+
 @pytest.mark.parametrize("place", [(0, 0), (0, 3), (3, 0), (3, 3), (1, 3)])
 def test_cubic_heights_next_to_a_void_are_bilinear(place):
     heights = HEIGHTS[:4, :4].copy()

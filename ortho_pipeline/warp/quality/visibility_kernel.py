@@ -294,7 +294,7 @@ def _height(heights, x, y):
     rows, columns = heights.shape
     if not (0.0 <= x <= columns - 1 and 0.0 <= y <= rows - 1):
         return np.nan
-    i, j = min(int(x), columns - 2), min(int(y), rows - 2)
+    i, j = int(x), int(y)
     fx, fy = x - i, y - j
     upper = heights[j, i] if fx == 0.0 else heights[j, i] + (heights[j, i + 1] - heights[j, i]) * fx
     if fy == 0.0:
