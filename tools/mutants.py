@@ -5,7 +5,9 @@ Then the tests that enter the changed function run, those of its module and room
 them are used. An error is caught if one of them fails or takes too long.
 
 `--record` finds which test enters which function (`tools/entered.py`), again for files of tests that have changed.
-Both are kept in `--folder`, so that a run can be stopped and continued. `--report` prints the share that was caught.
+Tests of texts, servers and whole programs are left out, unless they are named.
+The records and results are kept in `--folder`, so that a run can be stopped and continued. `--report` prints the share
+that was caught.
 """
 
 from __future__ import annotations
@@ -188,10 +190,12 @@ class Copy:
 
     def record(self, folder: Path, places: list[str]) -> None:
         """Note which tests enter which functions, for files of tests without a record, or changed since."""
-        found = {file for place in places for file in (ROOT / place).parent.glob(f"{Path(place).name}/**/test_*.py")}
-        found |= {ROOT / place for place in places if place.endswith(".py")}
+        found = {ROOT / place for place in places if place.endswith(".py")}
+        for place in places or ["tests"]:
+            found.update((ROOT / place).glob("**/test_*.py"))
         for name in sorted(str(file.relative_to(ROOT)) for file in found):
-            if not _APART & set(Path(name).parts) and not is_recorded(folder, ROOT, name):
+            apart = not places and _APART & set(Path(name).parts)
+            if not apart and not is_recorded(folder, ROOT, name):
                 ended, said = self.pytest([name], 900, "-p", "entered", **{FOLDER: str(folder)})
                 print(f"{name}: {ended}, {''.join(said.strip().splitlines()[-1:])}", flush=True)
 
@@ -265,7 +269,7 @@ def main() -> None:
     if not words.report:
         with tempfile.TemporaryDirectory() as above:
             if words.record is not None:
-                Copy(above).record(words.folder / "map", words.record or ["tests"])
+                Copy(above).record(words.folder / "map", words.record)
                 return
             try_all(Copy(above), words, records)
     report(records)
