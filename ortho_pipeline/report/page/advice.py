@@ -148,7 +148,7 @@ _KNOW: dict[str, str] = {
     "radar-on-a-plane": Text("Give a DEM (", Setting("surface.dem"), ")."),
     "no-rpc-text": "Nothing to do.",
     "gcps-beside-rpc": "Nothing to do here. Other programs may use the GCPs instead of the RPC.",
-    "piece-left-out": "Nothing to do, if you want only the file that you opened.",
+    "piece-left-out": "Nothing to do, unless you have points in that file.",
 }
 _LEVELS: tuple[tuple[Level, dict[str, str]], ...] = (("stop", _STOP), ("look", _LOOK), ("know", _KNOW))
 _NOTHING = "Nothing to do"
