@@ -444,11 +444,11 @@ def _frame_in(size: Sequence[int]) -> tuple[float, float, float, float]:
 
 
 def plot_ground(report: BlockReport) -> Drawing | None:
-    """Draw known minus adjusted ground in plan, north up, at the points in degrees made even for their latitude."""
+    """Draw adjusted minus known ground in plan, north up, at the points in degrees made even for their latitude."""
     known = [point for point in report.adjustment.points if None not in (*point.residual, *point.ground)]
     if len(known) < 2:
         return None
-    places, residuals = np.array([point.ground[:2] for point in known]), [point.residual for point in known]
+    places, errors = np.array([point.ground[:2] for point in known]), -np.array([point.residual for point in known])
     places[:, 0] = np.unwrap(places[:, 0], period=360.0) * math.cos(math.radians(float(places[:, 1].mean())))
     places[:, 1] *= -1.0
     low = places.min(axis=0)
@@ -462,9 +462,9 @@ def plot_ground(report: BlockReport) -> Drawing | None:
             point.role if _takes_part(point) else "out",
             f"{point.id} ({point.role}): E {east:+.2f}, N {north:+.2f}, h {up:+.2f} m",
         )
-        for place, (east, north, up), point in zip(at, np.array(residuals).tolist(), known, strict=True)
+        for place, (east, north, up), point in zip(at, errors.tolist(), known, strict=True)
     ]
-    return _vectors("Known minus adjusted ground in plan", shown, extent.tolist(), "m")
+    return _vectors("Adjusted minus known ground in plan", shown, extent.tolist(), "m")
 
 
 def _takes_part(point: BlockPoint) -> bool:

@@ -25,7 +25,10 @@ def test_a_common_error_in_height_is_named_with_its_sign() -> None:
     (notice,) = displaced_checks(block(errors))
     mean = errors.mean(axis=0)
     assert notice.code == "systematic-errors"
-    assert notice.endswith(f"the mean error of 30 check points is −{-mean[2]:.2f} m in z (sigma of a point: 2.5 m)")
+    assert notice.endswith(
+        f"the mean error of 30 check points is −{-mean[2]:.2f} m in z "
+        "(sigma of one point: 2.5 m; points can share errors)"
+    )
     assert notice.fields["mean_m"] == pytest.approx(mean)
 
 

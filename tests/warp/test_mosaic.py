@@ -128,11 +128,11 @@ def test_few_of_many_orthos_are_open_at_a_time(tmp_path, landscape, monkeypatch)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"off": 0.5}, "off the grid of 'a' by 0.250 px"),
+        ({"off": 0.5}, "off the grid of 'a_ortho.tif' by 0.250 px"),
         ({"step": 2.5}, "2.5 x 2.5"),
         ({"crs": pyproj.CRS("EPSG:32636")}, "zone 36N"),
         ({"dtype": "uint8"}, "1 band of uint8"),
-        ({"validity": "nodata", "nodata": 0.0}, "valid by nodata"),
+        ({"validity": "nodata", "nodata": 0.0}, "nodata value"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, landscape, options, message):
@@ -311,7 +311,7 @@ def test_a_mosaic_says_what_is_missing_and_parts_make_none(block):
     )
     wrong = CliRunner().invoke(cli, ["run", str(block / "p.yaml"), "--executor", "sequential"])
     assert wrong.exit_code == 3
-    assert "'s2' has 4 x 4" in wrong.stdout
+    assert "'s2_ortho.tif' has 4 x 4" in wrong.stdout
     for field in ("crs", "resolution"):
         text = FILE.replace('crs: "EPSG:32734", ', "") if field == "crs" else FILE.replace(", resolution: 5", "")
         (block / "p.yaml").write_text(text.replace("FORMAT", "VRT"))

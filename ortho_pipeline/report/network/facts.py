@@ -62,7 +62,7 @@ def displaced_checks(fit: BlockFit) -> tuple[Notice, ...]:
     mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1) / np.sqrt(len(errors))
     _, chance = student_of(mean, np.diag(sigma**2), len(errors) - 1)
     far = [
-        f"{value:+.2f} m in {axis} (sigma of a point: {size_m(float(np.median(one)))})"
+        f"{value:+.2f} m in {axis} (sigma of one point: {size_m(float(np.median(one)))}; points can share errors)"
         for value, axis, p, one in zip(mean, "xyz", chance, stated.T, strict=True)
         if p < _CHANCE
     ]

@@ -88,7 +88,7 @@ _LOOK: dict[str, str] = {
     "no-matches": "Give this image control points or a more similar reference.",
     "dem-datum-by-name": Text("State the height datum of the DEM with ", Setting("surface.vertical"), "."),
     "dem-items-overlap": "To use other items, list them in a file.",
-    "dem-covers-part": "Use a larger DEM, or do not use the ortho outside the DEM.",
+    "dem-covers-part": "Use a larger DEM if you need the rest.",
     "accuracy-in-part": "State the missing accuracies, so that the figures include them.",
     "memory-exceeded": Text("Increase ", Setting("output.memory"), ", or use ", Setting("output.engine", "ortho"), "."),
     "rpc-approximate": "Use the model file or the ortho where this error matters.",
@@ -135,7 +135,7 @@ _KNOW: dict[str, str] = {
     "dem-sigma-estimated": Text("If you know the accuracy of the DEM, state it with ", Setting("surface.sigma"), "."),
     "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
     "systematic-errors": "If the accuracy at check points suffices, nothing. If not, use more or better control "
-    "points, a model with more parameters, or another DEM.",
+    "points, a model with more parameters, or a better DEM.",
     "correction-by-matches": "Nothing to do, unless you know a better correction.",
     "dem-datum-overridden": "Check that your datum is right.",
     "no-rpc": "Nothing to do here. Give other programs the ortho or the model file.",

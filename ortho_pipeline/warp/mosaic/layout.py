@@ -108,14 +108,14 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
             remedy = f"if this is a DEM (its CRS has heights), leave it out; if not, {remedy}"
         raise InputError(
             f"this raster has pixels of {grid.dx:g} x {grid.dy:g} in {grid.crs.name}, "
-            f"but {one.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
+            f"but {one.path.name!r} has {first.dx:g} x {first.dy:g} in {first.crs.name}",
             file=other.path,
             field="orthos",
             remedy=remedy,
         )
     if off > _SAME:
         raise InputError(
-            f"the ortho {other.name!r} is off the grid of {one.name!r} by {off:.3f} px",
+            f"the ortho {other.path.name!r} is off the grid of {one.path.name!r} by {off:.3f} px",
             file=other.path,
             field="orthos",
             remedy=_regridded(one, first, other, grid),
@@ -124,7 +124,7 @@ def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
 
 def _regridded(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> str:
     """Return how to bring an ortho to the grid of the first one."""
-    again = f"rectify its scene again with the CRS, pixel size and grid of {one.name!r}"
+    again = f"rectify its scene again with the CRS, pixel size and grid of {one.path.name!r}"
     bounds, authority = warped_bounds(grid, first.crs), first.crs.to_authority()
     if authority is None or not np.isfinite(bounds).all():
         return again
@@ -146,6 +146,11 @@ def _nodata_of(*orthos: Ortho) -> str | None:
     return next((f"{value:.12g}" for value in values if value is not None), None)
 
 
+def _mark_of(ortho: Ortho) -> str:
+    value, validity = _nodata_of(ortho), RasterSource(ortho.path).validity
+    return f"the nodata value {value}" if value is not None else {"all": "nothing"}.get(validity, f"its {validity}")
+
+
 def _check_bands(orthos: Sequence[Ortho]) -> None:
     first = None
     for ortho in orthos:
@@ -155,7 +160,12 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
         first = first or kind
         if kind != first:
             remedy = "combine only scenes of one kind"
+            what = f"{ortho.path.name} has {kind[0]}, but {orthos[0].path.name} has {first[0]}"
             if kind[0] == first[0]:
+                what = (
+                    f"{ortho.path.name} marks empty pixels by {_mark_of(ortho)}, but {orthos[0].path.name} by "
+                    f"{_mark_of(orthos[0])}"
+                )
                 changed, kept = (orthos[0], ortho) if kind[1] == "nodata" != first[1] else (ortho, orthos[0])
                 empty = _nodata_of(kept, changed) or "0"
                 remedy = (
@@ -163,11 +173,7 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
                     f"{converted(changed.path, 'nodata')}`. If {empty} is valid in one of them, give both "
                     "another one"
                 )
-            raise InputError(
-                f"{ortho.name} has {kind[0]} (valid by {kind[1]}), but {orthos[0].name} has {first[0]} (by {first[1]})",
-                file=ortho.path,
-                remedy=remedy,
-            )
+            raise InputError(what, file=ortho.path, remedy=remedy)
 
 
 # -- windows ---------------------------------------------------------------------------------------------------------
