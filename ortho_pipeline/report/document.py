@@ -245,10 +245,13 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
         difference = points.ground[:, 2] - surface.height
         return None, _not_the_ground(difference[np.isfinite(difference)], seen)
     # Matches have the heights of the DEM.
-    difference = surface.above(points.ground[points.groups < 0], points.crs)
-    difference = difference[np.isfinite(difference)]
+    measured = points.groups < 0
+    difference, ids = surface.above(points.ground[measured], points.crs), np.array(points.ids)[measured]
+    known = np.isfinite(difference)
+    difference, ids = difference[known], ids[known]
     if not len(difference):
         return None, []
+    largest = int(np.abs(difference).argmax())
     median = float(np.median(difference))
     spread = float(1.4826 * np.median(np.abs(difference - median)))
     doubts = []
@@ -265,7 +268,15 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
     elif surface.coverage(points.ground[:, :2], points.crs) < 1.0:
         doubts = _not_the_ground(difference, seen)
     warning = str(doubts[0]) if doubts else None
-    return PointHeights(median_m=median, spread_m=spread, n=len(difference), warning=warning), doubts
+    heights = PointHeights(
+        median_m=median,
+        spread_m=spread,
+        n=len(difference),
+        warning=warning,
+        largest_m=float(difference[largest]),
+        largest_at=str(ids[largest]),
+    )
+    return heights, doubts
 
 
 def _not_the_ground(difference: Array, seen: Mapping[str, Any]) -> list[Notice]:

@@ -113,12 +113,17 @@ class Headline(Record):
 
 
 class PointHeights(Record):
-    """Heights of the points minus those of the DEM."""
+    """Heights of the points minus those of the DEM: median, robust standard deviation, and the largest with its point.
+
+    Reports of version 0.6 have no largest one.
+    """
 
     median_m: float
     spread_m: float
     n: Count
     warning: str | None
+    largest_m: float | None = None
+    largest_at: str | None = None
 
 
 class FlatGround(Record):

@@ -113,6 +113,18 @@ def test_matches_are_not_compared_with_the_dem_that_gave_their_heights():
     assert build_report(scene=scene, fit=scene.fit(matched, "shift"), surface=dem).heights is None
 
 
+def test_the_point_whose_height_differs_most_from_the_dem_is_named():
+    scene, points = open_scene(SAMPLE / "scene.tif"), read_points(SAMPLE / "gcps.geojson")
+    ground = points.ground.copy()
+    ground[points.ids.index("C02"), 2] -= 100.0
+    fit = scene.fit(points.with_ground(ground), "shift")
+    report = build_report(scene=scene, fit=fit, surface=open_dem(SAMPLE / "dem.tif"))
+    assert report.heights is not None
+    assert report.heights.largest_at == "C02"
+    assert report.heights.largest_m == pytest.approx(-100.0, abs=1.0)  # the points and the DEM agree to 0.3 m
+    assert abs(report.heights.median_m) < 0.5
+
+
 def test_an_rpc_that_is_not_written_is_called_that_of_the_model():
     said = str(no_rpc(InputError("this RPC maps several places on the ground to one pixel")))
     assert said == "no RPC written: the RPC of this model maps several places on the ground to one pixel"

@@ -135,7 +135,7 @@ _KNOW: dict[str, str] = {
     "dem-sigma-estimated": Text("If you know the accuracy of the DEM, state it with ", Setting("surface.sigma"), "."),
     "heights-left-out": "Nothing to do: a DEM of the bare ground does not show roofs and trees.",
     "systematic-errors": "If the accuracy at check points suffices, nothing. If not, use more or better control "
-    "points, a model with more parameters, or a better DEM.",
+    "points, a model with more parameters, or a better DEM if you used one.",
     "correction-by-matches": "Nothing to do, unless you know a better correction.",
     "dem-datum-overridden": "Check that your datum is right.",
     "no-rpc": "Nothing to do here. Give other programs the ortho or the model file.",
