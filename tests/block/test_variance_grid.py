@@ -125,8 +125,10 @@ def test_ground_of_one_image_is_perfect_whatever_its_sigmas() -> None:
     wanted = math.sqrt(misses.var(axis=0).sum() * 8 / 14) / 0.1
     problem, state, selection = _prepared((start,), points, {}, ())
     for sigma in (1e-5, 0.1, 0.3):
-        found = estimate(attempt(problem.with_sigmas(points.sigma_image, (sigma, sigma)), state, selection))
+        solved = attempt(problem.with_sigmas(points.sigma_image, (sigma, sigma)), state, selection)
+        found = estimate(solved)
         assert not found.separable
+        assert found.redundancy == pytest.approx((solved.unit_weight()[1], 0.0, 0.0), rel=1e-6)
         assert found.image == pytest.approx(wanted, rel=1e-4)
 
 

@@ -17,7 +17,10 @@ from pairs import BENT, CORNER, SHIFTED, Look, Pair
 from scipy.ndimage import map_coordinates
 
 from ortho_pipeline.cli.program import cli
+from ortho_pipeline.commands.control.matching import match_scene
+from ortho_pipeline.commands.orthos import measuring
 from ortho_pipeline.commands.orthos.datums import datum_of
+from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import Accuracy
 from ortho_pipeline.commands.orthos.verifying import verify
@@ -148,6 +151,25 @@ def test_another_place_is_refused(tmp_path):
     done = run("verify", ortho, "--reference", reference, "--json")
     assert done.exit_code == 2
     assert "remedy" in json.loads(done.stdout)["error"]
+
+
+def test_a_bent_ortho_is_matched_again_unless_the_caller_wants_one_matching(bent, monkeypatch):
+    """A stack averages matches in cells: places that bend or move need no second matching."""
+    calls: list[float] = []
+
+    def counted(view: Any, again: MatchOptions, *more: Any, **named: Any) -> Any:
+        calls.append(again.search or 0.0)
+        return match_scene(view, again, *more, **named)
+
+    monkeypatch.setattr(measuring, "match_scene", counted)
+    match = MatchOptions(reference=(str(bent[1]),))
+    measured = measure_ortho(bent[0], match, again=False)
+    assert len(calls) == 1
+    assert measured.matched is measured.searched
+    calls.clear()
+    measure_ortho(bent[0], match)
+    assert len(calls) > 1
+    assert calls[1] < calls[0]
 
 
 def test_an_ortho_upside_down_is_refused_unless_it_is_searched(shifted, tmp_path):

@@ -384,9 +384,10 @@ def test_impossible_planes_are_refused(changes):
         plane(**changes)
 
 
-def test_a_satellite_at_the_horizon_is_refused():
+@pytest.mark.parametrize("elevation", [0.01, math.radians(90.1)])
+def test_a_satellite_at_the_horizon_or_beyond_the_zenith_is_refused(elevation):
     with pytest.raises(InputError, match="an elevation of"):
-        MapPlane.from_view(UTM, CORNER, (1.0, 1.0), SIZE, PLANE, 1.0, 0.01, HEIGHTS)
+        MapPlane.from_view(UTM, CORNER, (1.0, 1.0), SIZE, PLANE, 1.0, elevation, HEIGHTS)
 
 
 def measured(model: MapPlane, count: int, tmp_path: Path, noise: float = 0.0) -> Path:

@@ -130,6 +130,7 @@ def both(model: SensorModel, surface: Surface, folder: Path, **options) -> tuple
     for name in ("ours", "gdal"):
         dataset = gdal.Open(str(folder / f"{name}.tif"))
         found.append((dataset.ReadAsArray(), dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0))
+    assert 0.0 <= theirs.seconds < 3600.0  # a duration, not a time
     (one, valid), (other, their_valid) = found
     use = valid & their_valid
     assert use.mean() > 0.3

@@ -129,6 +129,13 @@ def test_gains_are_found_where_almost_half_of_an_overlap_has_changed(tmp_path, c
     assert found.outlying == pytest.approx(6 / 16, abs=1 / 32)
 
 
+def test_orthos_without_an_overlap_have_no_difference_of_brightness(tmp_path):
+    placed = lay_out([write(tmp_path, "a", GROUND[:50, :50], 0, 0), write(tmp_path, "b", GROUND[:50, :50], 60, 0)])
+    found = balanced(placed, overlaps(placed))
+    assert (found.before, found.after) == ([0.0], [0.0])
+    np.testing.assert_allclose(found.gains, 1.0)
+
+
 def test_an_offset_that_is_known_is_halved(tmp_path):
     """The second ortho is 50 brighter: 25 more for the first, 25 less for the second, and gains of 1."""
     first, second = GROUND[:240, :220], GROUND[:240, 100:320] + 50

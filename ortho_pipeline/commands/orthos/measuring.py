@@ -131,8 +131,14 @@ def measure_ortho(
     masks: Sequence[ClassMask] = (),
     band: int | None = None,
     output: OutputOptions = OutputOptions(),
+    again: bool = True,
 ) -> MeasuredOrtho:
     """Match an ortho with references.
+
+    Parameters
+    ----------
+    again : bool
+        Match again if many matches contradict the first correction: places that bend or move get better matches.
 
     Raises
     ------
@@ -147,7 +153,7 @@ def measure_ortho(
     first: InputError | None = None
     for one in bands:
         try:
-            found = _matched(opened, options, scene, masks, one, output)
+            found = _matched(opened, options, scene, masks, one, output, _AGAIN if again else 0)
         except InputError as error:
             # Of several bands, one may be more like the reference than their mean.
             first = first or error
@@ -182,9 +188,9 @@ def _matched(
     masks: Sequence[ClassMask],
     band: int | None,
     output: OutputOptions,
+    rounds: int,
 ) -> MeasuredOrtho:
     """Match with one band or all, again until the correction follows the displacement."""
-
     source = RasterSource(scene.path, **opened.access)
     intensity = _intensity(source, () if band is None else (band,), masks, opened)
 
@@ -196,7 +202,7 @@ def _matched(
 
     searched = matched = matching(scene.model, options)
     found = _measured(scene, matched, searched, opened)
-    for _ in range(_AGAIN):
+    for _ in range(rounds):
         model = following(found)
         if model is None:
             break
