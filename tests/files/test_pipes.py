@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster.source import open_dataset
+
 BESIDE = ["{stem}_RPC.TXT", "{stem}_rpc.txt", "{stem}.RPB", "{stem}.IMD", "{stem}.pvl", "{stem}_metadata.txt",
           "{stem}_survey.txt", "DIM_{stem}.XML", "RPC_{stem}.XML", "{stem}.tif.aux.xml", "{stem}.tif.ovr",
           "{stem}.tif.msk", "{stem}.tfw", "{stem}_MET.TXT", "{stem}_RPC_ORG.TXT", "product_met.txt"]  # fmt: skip
@@ -52,6 +55,16 @@ for words in json.loads(sys.argv[1]):
     assert "Remedy:" in done.stderr, (words, done.stderr)
     print(words[-2:], flush=True)
 """
+
+
+@pytest.mark.parametrize(("name", "refused"), [("{stem}.special", True), ("readme.special", False), ("a.prj", True)])
+def test_a_pipe_with_the_name_of_an_image_or_of_metadata_is_refused(tiny, name, refused):
+    os.mkfifo(tiny.folder / name.format(stem=tiny.image.stem))
+    if not refused:
+        open_dataset(tiny.image)
+        return
+    with pytest.raises(InputError, match="a pipe or a device is in the place of this image's metadata"):
+        open_dataset(tiny.image)
 
 
 def test_endless_files_are_refused(tiny, tmp_path):

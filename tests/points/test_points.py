@@ -144,6 +144,20 @@ def test_odm_list(tmp_path: Path, first: str, code: int) -> None:
         read_points(path, vertical="ellipsoid", image_name="three.tif")
 
 
+def test_points_that_all_name_another_image_count_only_in_geojson(tmp_path: Path) -> None:
+    """There the name is a note, and a renamed image keeps its points; other formats are of the image that they name."""
+    listed = write(tmp_path / "gcp_list.txt", "EPSG:32633\n500000.5 5300000.25 123.5 100.5 200.5 one.tif\n")
+    assert len(read_points(listed, vertical="ellipsoid", image_name="one.tif")) == 1
+    with pytest.raises(InputError, match="no point was measured in 'three.tif', only in one.tif"):
+        read_points(listed, vertical="ellipsoid", image_name="three.tif")
+    feature = {
+        "type": "Feature", "properties": {"id": "P", "ji": [1.0, 2.0], "filename": "one.tif"},
+        "geometry": {"type": "Point", "coordinates": [15.0, 48.0, 100.0]},
+    }  # fmt: skip
+    collection = write(tmp_path / "p.geojson", json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    assert read_points(collection, image_name="three.tif").ids == ("P",)
+
+
 def test_envi(tmp_path: Path) -> None:
     text = "; ENVI Image to Map GCP File\n; Map (x,y), Image (x,y)\n;\n 300000.5 6270000.0 11.5 21.25\n"
     points = read_points(write(tmp_path / "a.pts", text), crs="EPSG:32735")
