@@ -275,6 +275,7 @@ def _heights_of_points(fit: Fit, surface: Surface, seen: Mapping[str, Any]) -> t
         warning=warning,
         largest_m=float(difference[largest]),
         largest_at=str(ids[largest]),
+        without=int((~known).sum()),
     )
     return heights, doubts
 

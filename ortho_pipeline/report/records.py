@@ -115,7 +115,7 @@ class Headline(Record):
 class PointHeights(Record):
     """Heights of the points minus those of the DEM: median, robust standard deviation, and the largest with its point.
 
-    Reports of version 0.6 have no largest one.
+    `without` points are where the DEM has no height. Reports of version 0.6 have none of the last three.
     """
 
     median_m: float
@@ -124,6 +124,7 @@ class PointHeights(Record):
     warning: str | None
     largest_m: float | None = None
     largest_at: str | None = None
+    without: Count = 0
 
 
 class FlatGround(Record):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,12 @@ def test_the_point_whose_height_differs_most_from_the_dem_is_named():
     assert report.heights.largest_at == "C02"
     assert report.heights.largest_m == pytest.approx(-100.0, abs=1.0)  # the points and the DEM agree to 0.3 m
     assert abs(report.heights.median_m) < 0.5
+    assert (report.heights.n, report.heights.without) == (len(points), 0)
+    ground[:2, :2] += 1.0
+    fit = replace(fit, points=fit.points.with_ground(ground))
+    report = build_report(scene=scene, fit=fit, surface=open_dem(SAMPLE / "dem.tif"))
+    assert report.heights is not None
+    assert (report.heights.n, report.heights.without) == (len(points) - 2, 2)
 
 
 def test_an_rpc_that_is_not_written_is_called_that_of_the_model():

@@ -171,7 +171,7 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
                 remedy = (
                     f"give both the same nodata value: `gdalwarp -dstnodata {empty} "
                     f"{converted(changed.path, 'nodata')}`. If {empty} is valid in one of them, give both "
-                    "another one"
+                    "another one. The copy has no report, so the order best-view puts it last"
                 )
             raise InputError(what, file=ortho.path, remedy=remedy)
 
