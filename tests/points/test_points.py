@@ -226,9 +226,11 @@ def test_heights_have_the_unit_of_the_datum(
     # The geoid is not installed everywhere; its undulation is in metres for each of these codes.
     monkeypatch.setattr(Vertical, "undulation", lambda self, lon, lat: np.full(np.shape(lon), -26.5))
     path = write(
-        tmp_path / "p.csv", (f"#vertical: {code}\n" if stated else "") + HEADER + "a,1,2,3120000,10070000,500\n"
+        tmp_path / "p.csv", (f"#vertical: {code}\n" if stated else "") + HEADER + "a,1,2,1640000,10827000,500\n"
     )
-    points = read_points(path, crs="EPSG:2277", vertical=None if stated else code)
+    # On WGS84: newer databases need a grid for NAD83.
+    crs = "+proj=utm +zone=14 +datum=WGS84 +units=us-ft +type=crs"
+    points = read_points(path, crs=crs, vertical=None if stated else code)
     assert points.ground[0, 2] == pytest.approx(500 * metres - 26.5, abs=1e-9)
 
 
