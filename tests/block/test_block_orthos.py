@@ -111,6 +111,7 @@ def _averaged_dsm(folder: Path, path: Path) -> None:
     write_dem(path, means, (left, top), 30.0, "EPSG:32631")
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_pleiades_orthos_fit_by_a_coarse_dem(real: Path, tmp_path: Path) -> None:
     """Neighbours within 0.3 px; without the heights as observations they are 0.5 px apart."""

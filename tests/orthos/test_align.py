@@ -94,7 +94,7 @@ def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
     assert (values[:, 50, 40:300] != -9999).all()
 
 
-@pytest.mark.parametrize("form", ["COG", "GTiff"])
+@pytest.mark.parametrize("form", [pytest.param("COG", marks=pytest.mark.slow), "GTiff"])
 def test_without_resampling_no_pixel_is_touched(shifted, tmp_path, form):
     document = aligned(*shifted, tmp_path, "--shift-only", "--no-resample", "--format", form)
     path = tmp_path / f"ortho_aligned{'.vrt' if form == 'COG' else '.tif'}"

@@ -29,6 +29,7 @@ def homonim(real: Path) -> Path:
     return real / "homonim"
 
 
+@pytest.mark.slow
 def test_aerial_orthos_see_the_same_displacement_of_each_other(homonim):
     first, second = (homonim / name for name in AERIAL)
     there = verify(first, match=MatchOptions(reference=[str(second)])).document

@@ -294,6 +294,7 @@ def test_nothing_to_compare_with_is_an_error(shifted):
     assert "--gcps" in done.output
 
 
+@pytest.mark.slow
 def test_intervals_of_points_cover_the_truth():
     random = np.random.default_rng(7)
     covered = {"bias_east": 0, "rmse": 0, "ce90": 0}

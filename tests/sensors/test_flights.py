@@ -14,7 +14,7 @@ def flights(benchmark_module: Callable[[str], Any]) -> Any:
     return benchmark_module("flights")
 
 
-@pytest.mark.parametrize("kind", ["exif", "datum"])
+@pytest.mark.parametrize("kind", [pytest.param("exif", marks=pytest.mark.slow), "datum"])
 def test_a_flight_with_wrong_tags_comes_right(flights, kind):
     found = flights.trial(flights.KINDS[kind], 16, 1)
     assert found["naive"][1] > 20.0
