@@ -163,7 +163,7 @@ def test_a_bent_ortho_is_matched_again_unless_the_caller_wants_one_matching(bent
 
     monkeypatch.setattr(measuring, "match_scene", counted)
     match = MatchOptions(reference=(str(bent[1]),))
-    measured = measure_ortho(bent[0], match, again=False)
+    measured = measure_ortho(bent[0], match, rounds=0)
     assert len(calls) == 1
     assert measured.matched is measured.searched
     calls.clear()

@@ -72,7 +72,7 @@ def test_the_most_accurate_needs_the_accuracy_of_all(tmp_path: Path) -> None:
     [
         ({"left": 0.03}, "off the grid"), ({"top": 0.05}, "off the grid"), ({"step": (2.001, 3.0)}, "2.001 x 3"),
         ({"step": (2.0, 3.001)}, "2 x 3.001"), ({"crs": 32634}, "zone 34N"), ({"bands": 2}, "2 bands"),
-        ({"kind": gdal.GDT_UInt16}, "uint16"), ({"nodata": 0.0}, "nodata value"),
+        ({"kind": gdal.GDT_UInt16}, "uint16"), ({"nodata": 0.0}, "by the nodata value 0, but a.tif by"),
     ],
 )  # fmt: skip
 def test_orthos_that_do_not_fit_are_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -132,7 +132,10 @@ def test_few_of_many_orthos_are_open_at_a_time(tmp_path, landscape, monkeypatch)
         ({"step": 2.5}, "2.5 x 2.5"),
         ({"crs": pyproj.CRS("EPSG:32636")}, "zone 36N"),
         ({"dtype": "uint8"}, "1 band of uint8"),
-        ({"validity": "nodata", "nodata": 0.0}, "nodata value"),
+        (
+            {"validity": "nodata", "nodata": 0.0},
+            "b_ortho.tif marks empty pixels by the nodata value 0, but a_ortho.tif by its mask",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, landscape, options, message):

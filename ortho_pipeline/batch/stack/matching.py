@@ -111,7 +111,7 @@ class Matcher:
 
     def _matched(self, first: Dated, second: Dated) -> EdgeMatches:
         options = replace(self.match, reference=(str(second.path),))
-        measured = measure_ortho(first.scene, options, scene=self.scene, output=self.output, again=False)
+        measured = measure_ortho(first.scene, options, scene=self.scene, output=self.output, rounds=0)
         matches = measured.matched.matches
         # Matches on moving ground contradict the others, and they are measured like those.
         kept = np.isin(matches.reason, ("", "contradicts")) & np.isfinite(matches.ground).all(axis=1)

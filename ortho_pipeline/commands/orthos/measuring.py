@@ -131,14 +131,14 @@ def measure_ortho(
     masks: Sequence[ClassMask] = (),
     band: int | None = None,
     output: OutputOptions = OutputOptions(),
-    again: bool = True,
+    rounds: int = _AGAIN,
 ) -> MeasuredOrtho:
     """Match an ortho with references.
 
     Parameters
     ----------
-    again : bool
-        Match again if many matches contradict the first correction: places that bend or move get better matches.
+    rounds : int
+        Most matchings after the first, while many matches contradict it: places that bend or move get better ones.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def measure_ortho(
     first: InputError | None = None
     for one in bands:
         try:
-            found = _matched(opened, options, scene, masks, one, output, _AGAIN if again else 0)
+            found = _matched(opened, options, scene, masks, one, output, rounds)
         except InputError as error:
             # Of several bands, one may be more like the reference than their mean.
             first = first or error
