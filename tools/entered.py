@@ -20,6 +20,8 @@ HOST = "ortho_pipeline"
 #: Environment variable: the folder of the records.
 FOLDER = "ENTERED"
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+#: Decorators of compiled functions.
+COMPILED = "compiled", "inlined"
 
 
 class Recorder:
@@ -110,6 +112,7 @@ class Entered:
                 for function in {*functions, *file["setup"]}:
                     self._tests[function].add(test)
         self._imported: dict[str, set[str]] = {}
+        self._compiled: set[str] = set()
         for path in (root / HOST).rglob("*.py"):
             tree, name = ast.parse(path.read_bytes()), str(path.relative_to(root))
             self._imported[name] = _imported(tree)
@@ -119,21 +122,31 @@ class Entered:
         for child in ast.iter_child_nodes(node):
             if isinstance(child, (ast.Name, ast.Attribute)):
                 self._users[child.id if isinstance(child, ast.Name) else child.attr].add(f"{path}:{function}")
-            self._note_users(child, path, inside(node, child, function))
+            within = inside(node, child, function)
+            if isinstance(child, FUNCTIONS) and any(ast.unparse(mark) in COMPILED for mark in child.decorator_list):
+                self._compiled.add(f"{path}:{within}")
+            # What an assignment uses is used under the name that it assigns.
+            for name in assigned(node, child) or ("",):
+                self._note_users(child, path, f"{within}.{name}".strip("."))
 
     def by(self, function: str, names: Iterable[str]) -> set[str]:
-        """Return the tests that enter a function; if none does, those of what uses its name, or one of `names`.
+        """Return the tests that enter a function; if none does, or it is compiled, those of what uses its name too.
 
-        That is so of constants, and of functions that compiled ones call, or that are cached.
+        What a module or class assigns to `names` has the tests of what uses these. Compiled functions call each other,
+        and cached ones are not called, without a record.
         """
-        found, left = set(self._tests.get(function, ())), {(function.partition(":")[0], name) for name in names}
-        seen = set[tuple[str, str]]()
-        while not found and left:
+        found, seen = set(self._tests.get(function, ())), set[tuple[str, str]]()
+        left = {(function.partition(":")[0], name) for name in names} if self._goes_on(function) else set()
+        while left:
             seen |= left
             users = {user for path, name in left for user in self._users[name] if self._sees(user, path)}
-            found = {test for user in users for test in self._tests.get(user, ())}
+            found |= {test for user in users for test in self._tests.get(user, ())}
+            users = {user for user in users if self._goes_on(user)}
             left = {(user.partition(":")[0], user.rpartition(":")[2].rpartition(".")[2]) for user in users} - seen
         return found
+
+    def _goes_on(self, function: str) -> bool:
+        return function in self._compiled or not self._tests.get(function)
 
     def _sees(self, user: str, path: str) -> bool:
         """Return whether a function can mean a name of a module."""
@@ -159,3 +172,11 @@ def inside(node: ast.AST, child: ast.AST, name: str) -> str:
     if not isinstance(child, (*FUNCTIONS, ast.ClassDef)):
         return name
     return f"{name}.<locals>.{child.name}" if isinstance(node, FUNCTIONS) else f"{name}.{child.name}".lstrip(".")
+
+
+def assigned(node: ast.AST, child: ast.AST) -> tuple[str, ...]:
+    """Return the names that a module or class assigns in one of its statements."""
+    if not isinstance(node, (ast.Module, ast.ClassDef)) or not isinstance(child, (ast.Assign, ast.AnnAssign)):
+        return ()
+    targets = child.targets if isinstance(child, ast.Assign) else [child.target]
+    return tuple(name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name))

@@ -26,7 +26,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from entered import FOLDER, HOST, Entered, inside, is_recorded
+from entered import FOLDER, HOST, Entered, assigned, inside, is_recorded
 from real_data import data_folder
 
 ROOMS = ("geodesy", "models", "estimation", "block", "surface", "warp", "exchange", "raster", "points", "files")
@@ -90,12 +90,8 @@ def _changes(node: ast.AST, function: str, names: tuple[str, ...]) -> Iterator[t
         for child in (value if isinstance(value, list) else [value]) if field not in skipped else ():
             if not isinstance(child, ast.AST) or _is_no_result(child):
                 continue
-            within, named = inside(node, child, function), names
-            if within != function:
-                named = (within.rpartition(".")[2],)
-            elif isinstance(node, (ast.Module, ast.ClassDef)) and isinstance(child, (ast.Assign, ast.AnnAssign)):
-                targets = child.targets if isinstance(child, ast.Assign) else [child.target]
-                named = tuple(name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name))
+            within = inside(node, child, function)
+            named = assigned(node, child) or ((within.rpartition(".")[2],) if within != function else names)
             yield from ((child, changed, within, named) for changed in _changed(child))
             yield from _changes(child, within, named)
 
