@@ -151,3 +151,17 @@ def test_next_to_a_void_the_ray_is_above_its_own_cell() -> None:
     curve[0] = 4.0 + 2.5
     # In the void: 1 + 2 * 1.5 in the upper row of the cell before it, 2 + 6 * 1.5 in the lower one.
     assert ray_kernel._clearance(curve, terrain, 1, 1, 0.0) == pytest.approx(5 - 7.5)
+
+
+@pytest.mark.parametrize("place", [(2.25, 2.75), (3.0, 3.0), (3.0, 0.5), (0.5, 3.0), (3.5, -0.25)])
+def test_the_terrain_at_the_last_samples_and_beyond_is_that_of_the_nearest_cell(place: tuple[float, float]) -> None:
+    heights = np.random.default_rng(4).uniform(0, 9, (4, 4))
+    terrain = terrain_with(np.zeros((2, 2)))
+    terrain.heights[:] = heights
+    curve = np.zeros(10)
+    curve[[0, 5]] = 4.0 + place[0], -2.0 + place[1]
+    i, j = (min(max(int(at), 0), 2) for at in place)
+    x, y = place[0] - i, place[1] - j
+    cell = heights[j : j + 2, i : i + 2]
+    expected = np.array([1 - y, y]) @ cell @ np.array([1 - x, x])
+    assert ray_kernel._clearance(curve, terrain, 0, 0, 0.3) == pytest.approx(MIDDLE + HALF * 0.3 - expected)
