@@ -358,6 +358,10 @@ def test_a_datum_that_explains_a_shift_is_named():
     there = ground_transform("EPSG:4222", "EPSG:32735")([[27.0, -26.0, 0.0]])[0]
     here = ground_transform("EPSG:4326", "EPSG:32735")([[27.0, -26.0, 0.0]])[0]
     assert datum_of(parse_crs("EPSG:32735"), here, (here - there)[:2], 0.5) == "Cape"
+    # In the other direction it is WGS 84 itself, not one of its realisations.
+    there = ground_transform("EPSG:4326", "EPSG:22235")([[27.0, -26.0, 0.0]])[0]
+    here = ground_transform("EPSG:4222", "EPSG:22235")([[27.0, -26.0, 0.0]])[0]
+    assert datum_of(parse_crs("EPSG:22235"), here, (here - there)[:2], 0.5) == "WGS 84"
 
 
 def test_a_damaged_ortho_is_not_an_error_of_the_reference(bent, tmp_path):
