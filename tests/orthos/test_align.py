@@ -77,7 +77,7 @@ def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
         band.SetNoDataValue(-9999)
         band.SetDescription(name)
     made = None
-    aligned(three, shifted[1], tmp_path / "out")
+    aligned(three, shifted[1], tmp_path / "out", "--match-points", 100)
     found = gdal.Open(str(tmp_path / "out" / "three_aligned.tif"))
     assert found.GetGeoTransform() == source.GetGeoTransform()
     assert (found.RasterXSize, found.RasterYSize, found.RasterCount) == (320, 320, 3)
@@ -96,7 +96,7 @@ def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
 
 @pytest.mark.parametrize("form", [pytest.param("COG", marks=pytest.mark.slow), "GTiff"])
 def test_without_resampling_no_pixel_is_touched(shifted, tmp_path, form):
-    document = aligned(*shifted, tmp_path, "--shift-only", "--no-resample", "--format", form)
+    document = aligned(*shifted, tmp_path, "--shift-only", "--no-resample", "--format", form, "--match-points", 200)
     path = tmp_path / f"ortho_aligned{'.vrt' if form == 'COG' else '.tif'}"
     assert document["files"]["ortho"] == str(path)
     source, found = gdal.Open(str(shifted[0])), gdal.Open(str(path))
@@ -125,7 +125,7 @@ def test_a_local_change_does_not_move_the_whole(tmp_path):
 
 
 def test_only_a_shift_is_corrected_where_that_is_asked_for(bent, tmp_path):
-    document = aligned(*bent, tmp_path, "--shift-only")
+    document = aligned(*bent, tmp_path, "--shift-only", "--match-points", 200)
     assert document["correction"]["kind"] == "shift"
     # The mean displacement is gone; the bending is not.
     assert document["relative"]["bias_m"]["value"] < 0.1

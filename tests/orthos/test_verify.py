@@ -30,6 +30,8 @@ from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
 from ortho_pipeline.options import MatchOptions, SurfaceOptions
 
 gdal.UseExceptions()
+#: Where a test is not about the accuracy of many matches.
+FEW = "--match-points", "100"
 
 
 def run(*words: Any) -> Result:
@@ -112,7 +114,7 @@ def test_the_stac_fields_are_valid_and_say_what_the_accuracy_is_relative_to(veri
     schema = Path(__file__).parents[1] / "data" / "stac" / uri.removeprefix("https://stac-extensions.github.io/")
     item = {"type": "Feature", "stac_extensions": [uri], "properties": stac["properties"], "assets": {}}
     jsonschema.validate(item, json.loads(schema.read_text()))
-    done = run("verify", shifted[0], "--reference", shifted[1], "--json")
+    done = run("verify", shifted[0], "--reference", shifted[1], "--json", *FEW)
     document = json.loads(done.stdout)
     # A displacement between two orthos is no accuracy on the ground.
     assert document["stac"]["stac_extensions"] == []
@@ -121,7 +123,7 @@ def test_the_stac_fields_are_valid_and_say_what_the_accuracy_is_relative_to(veri
 
 
 def test_the_terminal_says_first_what_the_ortho_is_and_last_where_the_report_is(shifted, tmp_path):
-    done = run("verify", shifted[0], "--reference", shifted[1], "-o", tmp_path)
+    done = run("verify", shifted[0], "--reference", shifted[1], "-o", tmp_path, *FEW)
     lines = done.stdout.splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["ortho", "area", "accuracy"]
     assert lines[-1] == f"Report: {tmp_path / 'ortho_verify.html'}"
@@ -162,7 +164,7 @@ def test_a_bent_ortho_is_matched_again_unless_the_caller_wants_one_matching(bent
         return match_scene(view, again, *more, **named)
 
     monkeypatch.setattr(measuring, "match_scene", counted)
-    match = MatchOptions(reference=(str(bent[1]),))
+    match = MatchOptions(reference=(str(bent[1]),), points=150)
     measured = measure_ortho(bent[0], match, rounds=0)
     assert len(calls) == 1
     assert measured.matched is measured.searched
@@ -178,8 +180,8 @@ def test_an_ortho_upside_down_is_refused_unless_it_is_searched(shifted, tmp_path
     made = gdal.GetDriverByName("GTiff").CreateCopy(str(turned), source)
     made.GetRasterBand(1).WriteArray(source.ReadAsArray()[::-1, ::-1].copy())
     made = None
-    assert run("verify", turned, "--reference", shifted[1], "--json").exit_code == 2
-    done = run("verify", turned, "--reference", shifted[1], "--search-rotation", "180", "--json")
+    assert run("verify", turned, "--reference", shifted[1], "--json", *FEW).exit_code == 2
+    done = run("verify", turned, "--reference", shifted[1], "--search-rotation", "180", "--json", *FEW)
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["relative"]["rmse_px"]["value"] > 100
 
@@ -215,7 +217,7 @@ def test_a_folder_gives_one_table(shifted, tmp_path):
     folder.mkdir()
     shutil.copy(shifted[0], folder / "a.tif")
     (folder / "b.tif").write_bytes(b"no raster")
-    done = run("verify", folder, "--reference", shifted[1], "-o", tmp_path / "out", "--require", "ce90<4")
+    done = run("verify", folder, "--reference", shifted[1], "-o", tmp_path / "out", "--require", "ce90<4", *FEW)
     assert done.exit_code == 0, done.output
     table = json.loads((tmp_path / "out" / "verify.json").read_text())
     assert [Path(row["ortho"]).name for row in table["orthos"]] == ["a.tif", "b.tif"]
@@ -242,7 +244,7 @@ def test_a_folder_reads_what_its_orthos_have_in_common_once_for_checksums(shifte
         return sha256(path, stop)
 
     monkeypatch.setattr(reading, "sha256", counted)
-    table = verify(folder, match=MatchOptions(reference=[str(shifted[1])])).document
+    table = verify(folder, match=MatchOptions(reference=[str(shifted[1])], points=100)).document
     assert table["failed"] == 0
     assert sorted(read) == sorted([folder / "a.tif", folder / "b.tif", shifted[1]])
 

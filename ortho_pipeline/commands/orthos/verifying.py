@@ -93,7 +93,7 @@ def verify(
     Examples
     --------
     >>> displaced = op.rectify("sample_data/scene.tif", out, surface=op.SurfaceOptions(dem="sample_data/dem.tif"))
-    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"])
+    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"], points=150)
     >>> found = op.verify(displaced.files["ortho"], match=match).document
     >>> round(found["relative"]["bias_m"]["value"]), found["causes"][0]["code"]
     (17, 'shift')
