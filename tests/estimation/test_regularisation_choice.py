@@ -10,7 +10,7 @@ import pytest
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.problem import Problem
-from ortho_pipeline.estimation.regularisation import regularised
+from ortho_pipeline.estimation.regularisation import _corner, regularised
 from ortho_pipeline.models import RPC, ImageCorrection, start_model
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.points import Points
@@ -104,6 +104,13 @@ def test_the_l_curve_chooses_the_weight_at_its_corner() -> None:
     assert 3 < corner < 78
     _, found = regularised(problem, keep, "lcurve", linear=True)
     assert found == pytest.approx(weights[corner], rel=1e-6)
+
+
+def test_the_sharpest_turn_does_not_depend_on_how_densely_a_curve_is_sampled() -> None:
+    """An ellipse turns most sharply at the ends of its long axis; its samples are closer to each other elsewhere."""
+    share = np.linspace(-1.3, 1.7, 241)
+    angle = share + 0.45 * np.sin(2 * share)
+    assert abs(share[_corner(np.sin(angle), -3.0 * np.cos(angle))]) < 0.02
 
 
 def test_a_stable_choice_is_that_of_its_own_solution() -> None:

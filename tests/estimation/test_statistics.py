@@ -220,6 +220,7 @@ def test_small_figures_are_by_their_definitions():
     columns = random.normal(0, 1, (9, 3)) @ random.normal(0, 1, (3, 5))
     basis = basis_of(columns)
     assert basis.shape == basis_of(1e6 * columns).shape == basis_of(1e-6 * columns).shape == (9, 3)
+    assert basis_of(np.outer(columns[:, 0], (1.0, 2.0, -3.0))).shape == (9, 1)
     np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(basis @ (basis.T @ columns), columns, atol=1e-12)
     # A ridge that is as heavy as the observations halves what these determine.

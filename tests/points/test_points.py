@@ -285,6 +285,7 @@ def test_what_is_no_number_is_named_with_line_and_column(tmp_path: Path, cell: s
     assert shown in text
     assert "line 3, column row" in text
     assert str(path) in text
+    assert ("decimal point" in text) == ("," in cell)
 
 
 @pytest.mark.parametrize(
