@@ -181,6 +181,7 @@ def test_images_by_url_give_the_same(made: tuple[Path, dict[str, bytes]], tmp_pa
     assert {name: found[name] for name in same} == {name: made[1][name] for name in same}
 
 
+@pytest.mark.slow
 def test_a_folder_of_a_bucket_is_a_stack(made: tuple[Path, dict[str, bytes]], bucket: str) -> None:
     images = Objects("s3://stacks/in", allow_network=True)
     for path in (made[0] / "in").iterdir():
@@ -197,6 +198,7 @@ def test_a_folder_of_a_bucket_is_a_stack(made: tuple[Path, dict[str, bytes]], bu
         stack([made[0] / "in"], bucket, StackOptions(corrections_only=True), **FAR)
 
 
+@pytest.mark.slow
 def test_items_in_a_bucket_are_those_of_a_folder(made: tuple[Path, dict[str, bytes]], bucket: str) -> None:
     output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
     stack([made[0] / "in"], made[0] / "items", **{**SETTINGS, "output": output})
