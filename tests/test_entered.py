@@ -32,7 +32,7 @@ class Grid:
 
 @pytest.fixture
 def entered(tmp_path: Path) -> Entered:
-    """A package of one module, and records of two tests."""
+    """A package of one module, and what three tests enter of it."""
     (tmp_path / "ortho_pipeline").mkdir()
     (tmp_path / "ortho_pipeline" / "a.py").write_text(KERNELS)
     (tmp_path / "map").mkdir()

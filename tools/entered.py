@@ -146,6 +146,7 @@ class Entered:
         return found
 
     def _goes_on(self, function: str) -> bool:
+        """Return whether the callers of a function have tests that its own record lacks."""
         return function in self._compiled or not self._tests.get(function)
 
     def _sees(self, user: str, path: str) -> bool:
