@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from networks import Made, Truth
 
-from ortho_pipeline.block.stack import adjustment
 from ortho_pipeline.block.stack.adjustment import AdjustedStack, adjust
+from ortho_pipeline.block.stack.common_changes import CommonChanges, _forms
 from ortho_pipeline.block.stack.components import WAVES, ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells
 from ortho_pipeline.block.stack.graph import pairs_of
 from ortho_pipeline.block.stack.network import Network
-from ortho_pipeline.block.stack.seasons import _forms
 from ortho_pipeline.block.stack.steps import steps_of
 
 
@@ -252,7 +251,7 @@ def test_one_date_a_year_has_the_sigmas_that_loops_show(monkeypatch):
     made = Truth(seed=5, dates=8, interval=365.25).made()
     years = 50.5 + np.arange(8.0)
     found = adjust(made.truth.cells, made.edges, years.tolist())
-    monkeypatch.setattr(adjustment, "yearly_variances", lambda *given: np.zeros((2, 2)))
+    monkeypatch.setattr(CommonChanges, "yearly_variances", lambda self: np.zeros((2, 2)))
     np.testing.assert_array_equal(found.sigma, adjust(made.truth.cells, made.edges, years.tolist()).sigma)
 
 

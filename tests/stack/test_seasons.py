@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ortho_pipeline.block.stack.common_changes import CommonChanges
 from ortho_pipeline.block.stack.components import ErrorComponents
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import left_of
-from ortho_pipeline.block.stack.seasons import yearly_variances
 from ortho_pipeline.block.stack.trends import design_of, trends_of
 
 CELLS = Cells.over(np.zeros(2), np.full(2, 1000.0))
@@ -35,7 +35,7 @@ def found(of_dates: np.ndarray, noise: float = 0.0, years: np.ndarray = YEARS) -
     network = np.repeat(trends.value, len(PLACE), axis=1)
     known = dataclasses.replace(errors, own=np.full((2, 7), 1e-6))
     left = left_of(edges, network, known, np.ones(len(FIRST), dtype=bool), years)
-    return yearly_variances(left, edges, trends, errors, PLACE, years)
+    return CommonChanges(left, edges, trends, errors, PLACE, years).yearly_variances()
 
 
 def waves(number: int, seed: int, sizes: tuple[float, float]) -> np.ndarray:

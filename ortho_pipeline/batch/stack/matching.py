@@ -26,8 +26,6 @@ from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions
 from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.stores.objects import Objects
 
-#: Error that all matches of a pair share, px of a chip; more than `ortho verify` assumes.
-_ALIKE = 0.0075
 _BYTES = 100_000_000
 
 
@@ -115,17 +113,17 @@ class Matcher:
         matches = measured.matched.matches
         # Matches on moving ground contradict the others, and they are measured like those.
         kept = np.isin(matches.reason, ("", "contradicts")) & np.isfinite(matches.ground).all(axis=1)
-        sigma = np.full(len(kept), float(np.median(measured.sigma)))
+        usual = float(np.median(measured.sigma))
+        sigma = np.full(len(kept), usual)
         sigma[matches.reason == ""] = measured.sigma
         shown = first.scene.model.image_to_ground(matches.image[kept], 0.0)[:, :2]
-        alike = max(float(matches.points.sigma_alike.max(initial=0.0)), _ALIKE * matches.factor)
         return EdgeMatches(
             first=first.name,
             second=second.name,
             place=_pairs(matches.ground[kept, :2]),
             shown=_pairs(shown),
             sigma_px=tuple(sigma[kept].tolist()),
-            alike_px=alike,
+            alike_px=float(measured.alike(usual)),
             tried=len(kept),
             kept=int((matches.reason == "").sum()),
         )

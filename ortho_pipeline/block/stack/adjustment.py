@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ortho_pipeline.block.stack.common_changes import CommonChanges
 from ortho_pipeline.block.stack.components import ErrorComponents, components_of
 from ortho_pipeline.block.stack.edges import Cells, Edges
 from ortho_pipeline.block.stack.moving import Left, Motion, left_of, motion_of
 from ortho_pipeline.block.stack.network import Closures, Network, accepted_edges, solve
-from ortho_pipeline.block.stack.seasons import yearly_variances
 from ortho_pipeline.block.stack.steps import DateStep, steps_of
 from ortho_pipeline.block.stack.trends import Trends, design_of, trends_of
 from ortho_pipeline.models.base import Array
@@ -156,8 +156,10 @@ def _referred(
     cells: Cells, solved: _Solved, motion: Motion, years: Array, datum: int | None, sloped: NDArray[np.bool_]
 ) -> AdjustedStack:
     """Return a stack with its datum."""
-    yearly = yearly_variances(solved.left(years), solved.edges, solved.trends, solved.components, cells.place, years)
-    found = solved.network.with_seasons(solved.components.of_seasons, yearly, years)
+    changes = CommonChanges(solved.left(years), solved.edges, solved.trends, solved.components, cells.place, years)
+    drift = changes.drift(motion.beside(cells))
+    found = solved.network.with_seasons(solved.components.of_seasons, changes.yearly_variances(), years)
+    found = found.with_drift(drift.rate, drift.variance, drift.time)
     known = np.isfinite(years)
     part = found.part
     if datum is None:

@@ -28,6 +28,8 @@ LEAST = 0.1
 _FEWEST, _STEPS = 4, 10
 #: Squared sigmas within which places share a rate.
 _ALIKE = 9.2
+#: Cells of an area that moves, and what is next to a cell. A single cell can be one by chance.
+_AREA, _NEXT = 4, np.ones((3, 3))
 #: Seasons repeat if the dates span so many years.
 WAVE = 1.5
 #: A step has so many dates on each side. What is left is clipped at so many sigmas, so many times.
@@ -56,10 +58,18 @@ class Motion:
     ratio: Array
     form: NDArray[np.str_]
 
+    def beside(self, cells: Cells) -> NDArray[np.bool_]:
+        """Tell which places ``(K,)`` are neighbours of a moving area: their chips show some of it."""
+        columns, rows = cells.shape
+        large = np.zeros(len(self.moving), dtype=bool)
+        for area in self.areas(cells):
+            large[area] = len(area) >= _AREA
+        return np.asarray(ndimage.binary_dilation(large.reshape(rows, columns), _NEXT).ravel() & ~self.moving)
+
     def areas(self, cells: Cells) -> list[NDArray[np.int_]]:
         """Return connected moving cells, largest area first."""
         columns, rows = cells.shape
-        numbered, count = ndimage.label(self.moving.reshape(rows, columns), structure=np.ones((3, 3)))
+        numbered, count = ndimage.label(self.moving.reshape(rows, columns), structure=_NEXT)
         found = [np.flatnonzero(numbered.ravel() == number + 1) for number in range(count)]
         return sorted(found, key=lambda one: (-len(one), one[0]))
 

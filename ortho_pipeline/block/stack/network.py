@@ -106,6 +106,13 @@ class Network:
             covariance[:, ::3, ::3] += one[:, None, None] * wave
         return replace(self, covariance=covariance)
 
+    def with_drift(self, rate: Array, variance: Array, time: Array) -> Network:
+        """Return corrections of dates that move by a rate ``(2,)``, with its variance, over a time ``(T,)``."""
+        value, covariance = self.value.copy(), self.covariance.copy()
+        value[:, 0] += time[:, None] * rate
+        covariance[:, ::3, ::3] += variance[:, None, None] * np.outer(time, time)
+        return replace(self, value=value, covariance=covariance)
+
 
 def accepted_edges(
     edges: Edges, trends: Trends, components: ErrorComponents, place: Array, dates: int

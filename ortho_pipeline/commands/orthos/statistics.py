@@ -22,7 +22,6 @@ from scipy import spatial
 
 from ortho_pipeline.commands.orthos.measuring import CELLS, MeasuredOrtho
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
-from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
 from ortho_pipeline.models.base import Array
 
 #: A cell is tested if a match is nearer than so many spacings of tried places.
@@ -30,9 +29,6 @@ _REACH = 2.0
 _LEVELS = 0.025, 0.975
 #: Minimum number of points for a covariance.
 FEWEST_POINTS = 4
-#: Part of the noise of a match that all matches share, besides `MATCHED_ALIKE`: objects with a direction, such as
-#: shadows, change alike all over an image. No match shows it. The likeliest value in 90 drawn pairs of known truth.
-_ALIKE = 0.06
 #: Draws of means and covariances of points, and of errors for each.
 _DRAWS, _ERRORS = 2000, 500
 NAMES = ("bias_east", "bias_north", "bias", "rmse", "ce90")
@@ -148,9 +144,7 @@ class Verified:
         cells = tested_cells(measured)
         draws = field.draws(cells, seed)
         # Residuals cannot show an error that all matches share.
-        matches = measured.matched.matches
-        bands = max(float(matches.points.sigma_alike.max(initial=0.0)), MATCHED_ALIKE * matches.factor)
-        alike = np.hypot(bands * measured.pixel, _ALIKE * field.noise)
+        alike = measured.pixel * measured.alike(field.noise / measured.pixel)
         common = np.random.default_rng([seed, 1]).normal(0.0, alike, (len(draws), 1, 2))
         return cls(measured, field, cells, draws + common, len(cells) / measured.shown.sum())
 

@@ -1,0 +1,147 @@
+r"""Errors that change with time alike in all edges: they close all loops, so the network cannot show them.
+
+The ground looks different through the year, and its looks displace matches alike in all years. What does not move the
+mean of the places is seen: a place has a wave of one year, :math:`a \cos 2\pi t + b \sin 2\pi t`, that other places do
+not have. How much these waves vary from place to place, and how far neighbours share them, gives the variance of their
+mean, which displaces the dates. Errors of dates and of edges are part of the expected products.
+
+A chip at the rim of moving ground shows some of it: it moves too little to be found, and many such places together move
+all dates steadily. So the rate of the stack is that of the places that are not beside moving ground. Its variance
+follows from what the rates vary from place to place, too.
+
+Source: Cressie 1993, section 2.4 (moments of a variogram); Lawson and Hanson 1974 (non-negative least squares).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from ortho_pipeline.block.stack.components import WAVES, ErrorComponents, classes_of, correlations_of
+from ortho_pipeline.block.stack.edges import Edges
+from ortho_pipeline.block.stack.moving import WAVE, Left
+from ortho_pipeline.block.stack.trends import FEWEST, Trends
+from ortho_pipeline.models.base import Array
+
+#: A wave is determined if so much (root mean square; 0.7 of all phases) is left of it without a constant and a rate.
+_LEFT = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """What stable ground moves relative to a network.
+
+    Parameters
+    ----------
+    rate : (2,)
+        px a year along columns and rows.
+    variance : (2,)
+        Of the rate, as far as the network does not contain it.
+    time : (T,)
+        Years from the mean of the dates; 0 of a date without a time.
+    """
+
+    rate: Array
+    variance: Array
+    time: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CommonChanges:
+    """What a network leaves of its edges, and the errors that it knows of.
+
+    Parameters
+    ----------
+    years : (T,)
+        NaN of a date without a time, such as a reference.
+    """
+
+    left: Left
+    edges: Edges
+    trends: Trends
+    components: ErrorComponents
+    place: Array
+    years: Array
+
+    def yearly_variances(self) -> Array:
+        """Return the variances ``(2, 2)`` px² of the mean of all places: waves of a year and half a year, both axes.
+
+        They are zero if the dates span less than one and a half years, because seasons do not repeat then, and if all
+        dates have the same phase of a wave, because it moves all of them alike.
+        """
+        found, known, weight = np.zeros((len(WAVES), 2)), np.isfinite(self.years), self._weight
+        if not weight.any() or not known.any() or np.ptp(self.years[known]) < WAVE:
+            return found
+        without = replace(self.left, value=self.left.change(np.where(known, self.years, 0.0))[2])
+        for row, number in enumerate(WAVES):
+            found[row] = self._variance_of_mean(without, _forms(number, self.years), weight)
+        return found
+
+    def drift(self, beside: NDArray[np.bool_]) -> Drift:
+        """Return the drift of the stable places that are not `beside` moving ground ``(K,)``; of all if too few are."""
+        known, weight = np.isfinite(self.years), self._weight
+        time = np.where(known, self.years - self.years[known].mean(), 0.0) if known.any() else np.zeros(len(known))
+        if not weight.any():
+            return Drift(np.zeros(2), np.zeros(2), time)
+        far = np.where(beside, 0.0, weight)
+        far = far / far.sum() if (far > 0).sum() >= FEWEST else weight
+        apart, every = far - weight, np.arange(len(weight))
+        noise = np.array([apart @ one @ apart for one in self._noise(self.left, time, every)])
+        variance = noise + self._variance_of_mean(self.left, [time], far)
+        return Drift(apart @ self.left.change(time)[0], variance, time)
+
+    @property
+    def _weight(self) -> Array:
+        """Part of each place ``(K,)`` in the corrections of dates; its sum is 1, or 0 if no place is tested."""
+        good = self.trends.good
+        usual = self.trends.weights[good, :, 0].mean(axis=0) if good.any() else np.zeros(len(self.place))
+        usual = np.where(self.left.tested & (usual > 0), usual, 0.0)
+        return np.asarray(usual / max(usual.sum(), 1e-300))
+
+    def _correlations(self, seen: NDArray[np.int_]) -> Array:
+        """Return the correlations ``(7, n, n)`` of errors of some places: noise, and those of all ranges."""
+        noisy = np.diag(self.edges.relative[self.trends.good][:, seen].mean(axis=0))
+        return np.concatenate([noisy[None], correlations_of(self.place[seen])])
+
+    def _noise(self, left: Left, form: Array, seen: NDArray[np.int_]) -> list[Array]:
+        """Return the covariances ``(n, n)``, along both axes, of how much of a form some places have."""
+        shares, of_dates = (one[:, seen] for one in left.shares(form))
+        dates = of_dates.T @ (self.components.scale[:, None] * of_dates)
+        own = shares.T @ (self.components.factor[:, None] * shares)
+        root, matrices = np.sqrt(left.noisier[seen]), self._correlations(seen)
+        shared, single = (np.tensordot(of, matrices, 1) for of in (self.components.shared, self.components.own))
+        return [(dates * shared[axis] + own * single[axis]) * np.outer(root, root) for axis in (0, 1)]
+
+    def _variance_of_mean(self, left: Left, forms: list[Array], weight: Array) -> Array:
+        """Return the variance ``(2,)`` px² of what a mean with weights ``(K,)`` has of a form."""
+        seen = np.flatnonzero(weight)
+        weight = weight[seen]
+        centred, matrices = np.eye(len(seen)) - weight, self._correlations(seen)
+        classes = classes_of(self.place[seen]).ravel()
+        expected = np.stack([np.bincount(classes, (centred @ one @ centred.T).ravel()) for one in matrices], axis=1)
+        products = np.zeros((2, len(expected)))
+        for form in forms:
+            apart = centred @ left.change(form)[0][seen]
+            for axis, noise in enumerate(self._noise(left, form, seen)):
+                rest = np.outer(apart[:, axis], apart[:, axis]) - centred @ noise @ centred.T
+                products[axis] += np.bincount(classes, rest.ravel()) / len(forms)
+        size, of_mean = np.maximum(np.linalg.norm(expected, axis=0), 1e-12), matrices @ weight @ weight
+        return np.array([of_mean @ (optimize.nnls(expected / size, one)[0] / size) for one in products])
+
+
+def _forms(number: int, years: Array) -> list[Array]:
+    """Return cosine and sine ``(T,)`` of a wave without a constant, a rate and each other, if enough is left."""
+    known = np.isfinite(years)
+    time = years[known] - years[known].mean()
+    taken, found = [np.ones(len(time)), time], list[Array]()
+    for wave in (np.cos, np.sin):
+        course = wave(2 * np.pi * number * time)
+        course = course - np.column_stack(taken) @ np.linalg.lstsq(np.column_stack(taken), course, rcond=None)[0]
+        if np.sqrt((course**2).mean()) > _LEFT:
+            taken.append(course)
+            found.append(np.zeros(len(years)))
+            found[-1][known] = course
+    return found
