@@ -42,18 +42,18 @@ def grid_of(path: str | PathLike[str], **access: Any) -> Grid:
         If it is none: a raster without a CRS, or one that is not north up.
     """
     dataset = open_dataset(path, **access)
-    left, dx, skew, top, other, dy = dataset.GetGeoTransform()
-    if skew or other:
-        raise InputError(
-            "this raster is not north-up",
-            field="geotransform",
-            remedy=f"resample it: `gdalwarp {converted(path, 'north_up')}`",
-        )
     if not dataset.GetProjection():
         raise InputError(
             "this raster has no coordinate system",
             field="CRS",
             remedy=f"rectify the image, or state its CRS: `gdal_edit.py -a_srs CRS {typed(path)}`",
+        )
+    left, dx, skew, top, other, dy = dataset.GetGeoTransform()
+    if skew or other or dx <= 0 or dy >= 0:
+        raise InputError(
+            "this raster is not north-up",
+            field="geotransform",
+            remedy=f"resample it: `gdalwarp {converted(path, 'north_up')}`",
         )
     crs = parse_crs(dataset.GetProjection())
     return Grid(crs, left, top, dx, -dy, dataset.RasterXSize, dataset.RasterYSize)

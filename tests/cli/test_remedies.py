@@ -265,13 +265,16 @@ def _overviews(printed: Printed, folder: Path) -> None:
 
 @case("raster", "gdalwarp")
 def _north_up(printed: Printed, folder: Path) -> None:
-    path = tiff(folder / "turned.tif", GREY, dem=True)
-    dataset = gdal.Open(str(path), gdal.GA_Update)
-    dataset.SetGeoTransform((530000.0, 20.0, 2.0, 4124000.0, 2.0, -20.0))
-    dataset.FlushCache()
-    del dataset
-    printed.paste(refused(grid_of, path))
-    assert grid_of(folder / "turned_north_up.tif").width >= 200
+    skew = (530000.0, 20.0, 2.0, 4124000.0, 2.0, -20.0)
+    south_up, mirrored = (530000.0, 20.0, 0.0, 4120000.0, 0.0, 20.0), (534000.0, -20.0, 0.0, 4124000.0, 0.0, -20.0)
+    for number, numbers in enumerate((skew, south_up, mirrored)):
+        path = tiff(folder / f"turned{number}.tif", GREY, dem=True)
+        dataset = gdal.Open(str(path), gdal.GA_Update)
+        dataset.SetGeoTransform(numbers)
+        dataset.FlushCache()
+        del dataset
+        printed.paste(refused(grid_of, path))
+        assert grid_of(folder / f"turned{number}_north_up.tif").width >= 200
 
 
 @case("raster", "gdal_edit.py -a_srs")
