@@ -87,6 +87,15 @@ def test_corrections_are_the_errors(made):
     assert 'data-plot="timeline"' in page
 
 
+def test_matches_of_a_pair_share_an_error(made):
+    """As `ortho verify` has it: 0.002 px of a chip, and 6 % of the noise of a match."""
+    pairs = [json.loads(path.read_text()) for path in (made[1] / "pairs").glob("*.json") if "record" not in path.name]
+    assert len(pairs) == 6
+    for pair in pairs:
+        noise = np.median(pair["sigma_px"])
+        assert pair["alike_px"] == pytest.approx(np.hypot(0.002, 0.06 * noise), rel=1e-6)
+
+
 def test_the_page_tells_what_affine_corrections_are_at_the_corners(made, tmp_path):
     record = StackRecord.read(json.loads((made[1] / "stack.json").read_text()))
     one, *rest = record.dates

@@ -127,6 +127,13 @@ class _Solved:
         network = solve(edges, trends, components, place, closures.accepted, sloped)
         return cls(edges, trends, components, closures, network)
 
+    def linked(self, years: Array) -> NDArray[np.bool_]:
+        """Return which dates with a time ``(T,)`` accepted edges compare with one without; all of them if none."""
+        known, ends = np.isfinite(years), np.stack([self.edges.first, self.edges.second])
+        some = self.closures.accepted & (known[ends].sum(axis=0) == 1)
+        found = known & np.isin(np.arange(len(years)), ends[:, some])
+        return np.asarray(found if found.any() else known)
+
     def left(self, years: Array) -> Left:
         """Return what the network leaves of accepted edges."""
         terms = self.trends.design.shape[1]
@@ -157,9 +164,10 @@ def _referred(
 ) -> AdjustedStack:
     """Return a stack with its datum."""
     changes = CommonChanges(solved.left(years), solved.edges, solved.trends, solved.components, cells.place, years)
-    drift = changes.drift(motion.beside(cells))
     found = solved.network.with_seasons(solved.components.of_seasons, changes.yearly_variances(), years)
+    drift = changes.drift(motion.touched(cells), solved.linked(years))
     found = found.with_drift(drift.rate, drift.variance, drift.time)
+    motion = replace(motion, sigma=np.hypot(motion.sigma, np.sqrt(drift.variance)))
     known = np.isfinite(years)
     part = found.part
     if datum is None:

@@ -5,9 +5,9 @@ mean of the places is seen: a place has a wave of one year, :math:`a \cos 2\pi t
 not have. How much these waves vary from place to place, and how far neighbours share them, gives the variance of their
 mean, which displaces the dates. Errors of dates and of edges are part of the expected products.
 
-A chip at the rim of moving ground shows some of it: it moves too little to be found, and many such places together move
-all dates steadily. So the rate of the stack is that of the places that are not beside moving ground. Its variance
-follows from what the rates vary from place to place, too.
+A chip at the rim of moving ground shows a part of its motion. That part is too small to be found. Many such places
+together move all dates at a steady rate. So the rate of the corrections is that of the places that are not next to
+moving ground. How much the rates of these differ gives its variance in the same way.
 
 Source: Cressie 1993, section 2.4 (moments of a variogram); Lawson and Hanson 1974 (non-negative least squares).
 """
@@ -32,16 +32,16 @@ _LEFT = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What stable ground moves relative to a network.
+    """The rate of stable ground relative to the corrections.
 
     Parameters
     ----------
     rate : (2,)
         px a year along columns and rows.
     variance : (2,)
-        Of the rate, as far as the network does not contain it.
+        The part of its variance that the covariance of the network lacks.
     time : (T,)
-        Years from the mean of the dates; 0 of a date without a time.
+        Years from the middle of dates; 0 of a date without a time.
     """
 
     rate: Array
@@ -80,25 +80,28 @@ class CommonChanges:
             found[row] = self._variance_of_mean(without, _forms(number, self.years), weight)
         return found
 
-    def drift(self, beside: NDArray[np.bool_]) -> Drift:
-        """Return the drift of the stable places that are not `beside` moving ground ``(K,)``; of all if too few are."""
+    def drift(self, touched: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Drift:
+        """Return the drift without the places ``(K,)`` that motion has `touched`; if too few are left, all count.
+
+        Dates that are `linked` ``(T,)`` with a reference keep their place relative to it, on average.
+        """
         known, weight = np.isfinite(self.years), self._weight
-        time = np.where(known, self.years - self.years[known].mean(), 0.0) if known.any() else np.zeros(len(known))
+        time = np.where(known, self.years - self.years[linked].mean(), 0.0)
         if not weight.any():
             return Drift(np.zeros(2), np.zeros(2), time)
-        far = np.where(beside, 0.0, weight)
+        far = np.where(touched, 0.0, weight)
         far = far / far.sum() if (far > 0).sum() >= FEWEST else weight
-        apart, every = far - weight, np.arange(len(weight))
-        noise = np.array([apart @ one @ apart for one in self._noise(self.left, time, every)])
+        more, every = far - weight, np.arange(len(weight))
+        noise = np.array([more @ one @ more for one in self._noise(self.left, time, every)])
         variance = noise + self._variance_of_mean(self.left, [time], far)
-        return Drift(apart @ self.left.change(time)[0], variance, time)
+        return Drift(more @ self.left.change(time)[0], variance, time)
 
     @property
     def _weight(self) -> Array:
-        """Part of each place ``(K,)`` in the corrections of dates; its sum is 1, or 0 if no place is tested."""
+        """Part of each place ``(K,)`` in the corrections of dates; its sum is 1, or 0 without an edge."""
         good = self.trends.good
         usual = self.trends.weights[good, :, 0].mean(axis=0) if good.any() else np.zeros(len(self.place))
-        usual = np.where(self.left.tested & (usual > 0), usual, 0.0)
+        usual = np.where((self.left.weight > 0).any(axis=0) & (usual > 0), usual, 0.0)
         return np.asarray(usual / max(usual.sum(), 1e-300))
 
     def _correlations(self, seen: NDArray[np.int_]) -> Array:
@@ -116,20 +119,36 @@ class CommonChanges:
         return [(dates * shared[axis] + own * single[axis]) * np.outer(root, root) for axis in (0, 1)]
 
     def _variance_of_mean(self, left: Left, forms: list[Array], weight: Array) -> Array:
-        """Return the variance ``(2,)`` px² of what a mean with weights ``(K,)`` has of a form."""
+        """Return the variance ``(2,)`` of the mean, with weights ``(K,)``, of how much of a form places have.
+
+        Noisy places say little of it, so their products count less.
+        """
         seen = np.flatnonzero(weight)
         weight = weight[seen]
         centred, matrices = np.eye(len(seen)) - weight, self._correlations(seen)
-        classes = classes_of(self.place[seen]).ravel()
-        expected = np.stack([np.bincount(classes, (centred @ one @ centred.T).ravel()) for one in matrices], axis=1)
-        products = np.zeros((2, len(expected)))
-        for form in forms:
-            apart = centred @ left.change(form)[0][seen]
-            for axis, noise in enumerate(self._noise(left, form, seen)):
-                rest = np.outer(apart[:, axis], apart[:, axis]) - centred @ noise @ centred.T
-                products[axis] += np.bincount(classes, rest.ravel()) / len(forms)
-        size, of_mean = np.maximum(np.linalg.norm(expected, axis=0), 1e-12), matrices @ weight @ weight
-        return np.array([of_mean @ (optimize.nnls(expected / size, one)[0] / size) for one in products])
+        classes, found = classes_of(self.place[seen]).ravel(), np.zeros(2)
+        spread = [(centred @ one @ centred.T).ravel() for one in matrices]
+        sizes = [centred @ left.change(form)[0][seen] for form in forms]
+        noises = [self._noise(left, form, seen) for form in forms]
+        for axis in (0, 1):
+            products, expected = np.zeros(1), np.zeros(1)
+            for size, noise in zip(sizes, noises, strict=True):
+                known = noise[axis]
+                rest = np.outer(size[:, axis], size[:, axis]) - centred @ known @ centred.T
+                counts = _counts(known.diagonal()).ravel()
+                products = products + np.bincount(classes, counts * rest.ravel())
+                expected = expected + np.stack([np.bincount(classes, counts * one) for one in spread], axis=1)
+            length = np.maximum(np.linalg.norm(expected, axis=0), 1e-12)
+            found[axis] = (matrices @ weight @ weight) @ (optimize.nnls(expected / length, products)[0] / length)
+        return found
+
+
+def _counts(variance: Array) -> Array:
+    """Return how much the products ``(n, n)`` of places with such noise ``(n,)`` count, at most 1."""
+    if not variance.any():
+        return np.ones((len(variance), len(variance)))
+    inverse = np.divide(1.0, np.sqrt(variance), out=np.zeros(len(variance)), where=variance > 0)
+    return np.outer(inverse, inverse) / inverse.max() ** 2
 
 
 def _forms(number: int, years: Array) -> list[Array]:

@@ -28,7 +28,7 @@ LEAST = 0.1
 _FEWEST, _STEPS = 4, 10
 #: Squared sigmas within which places share a rate.
 _ALIKE = 9.2
-#: Cells of an area that moves, and what is next to a cell. A single cell can be one by chance.
+#: An area of so many cells touches its neighbours (fewer can be found by chance). What is next to a cell.
 _AREA, _NEXT = 4, np.ones((3, 3))
 #: Seasons repeat if the dates span so many years.
 WAVE = 1.5
@@ -58,13 +58,13 @@ class Motion:
     ratio: Array
     form: NDArray[np.str_]
 
-    def beside(self, cells: Cells) -> NDArray[np.bool_]:
-        """Tell which places ``(K,)`` are neighbours of a moving area: their chips show some of it."""
+    def touched(self, cells: Cells) -> NDArray[np.bool_]:
+        """Tell which places ``(K,)`` move, or are neighbours of a moving area: their chips show a part of it."""
         columns, rows = cells.shape
         large = np.zeros(len(self.moving), dtype=bool)
         for area in self.areas(cells):
             large[area] = len(area) >= _AREA
-        return np.asarray(ndimage.binary_dilation(large.reshape(rows, columns), _NEXT).ravel() & ~self.moving)
+        return np.asarray(ndimage.binary_dilation(large.reshape(rows, columns), _NEXT).ravel() | self.moving)
 
     def areas(self, cells: Cells) -> list[NDArray[np.int_]]:
         """Return connected moving cells, largest area first."""

@@ -107,7 +107,7 @@ class Network:
         return replace(self, covariance=covariance)
 
     def with_drift(self, rate: Array, variance: Array, time: Array) -> Network:
-        """Return corrections of dates that move by a rate ``(2,)``, with its variance, over a time ``(T,)``."""
+        """Return corrections with a steady motion: a rate ``(2,)`` and its variance, over a time ``(T,)``."""
         value, covariance = self.value.copy(), self.covariance.copy()
         value[:, 0] += time[:, None] * rate
         covariance[:, ::3, ::3] += variance[:, None, None] * np.outer(time, time)
