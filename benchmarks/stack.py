@@ -105,8 +105,8 @@ def told(rows: list[dict[str, Any]]) -> str:
 def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     """Return what `ortho stack` finds of one drawn stack, and what the usual way finds."""
     rasters = Rasters(
-        seed=seed, side=given.side, dates=given.dates, interval=given.interval, error=20.0, seasons=4, clouds=0.3,
-        noise=0.02, moving=given.moving, rate=1.0, ground=("country", "woods", "town")[seed % 3],
+        seed=seed, side=given.side, dates=given.dates, interval=given.interval, error=20.0, seasons=4, sun=given.sun,
+        clouds=0.3, noise=0.02, moving=given.moving, rate=1.0, ground=("country", "woods", "town")[seed % 3],
         wrong=(given.dates // 3,) if given.wrong else (),
     )  # fmt: skip
     true = rasters.shifts()
@@ -208,6 +208,7 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=500, help="columns and rows of images")
     parser.add_argument("--interval", type=float, default=50.0, help="mean days between images")
     parser.add_argument("--moving", type=float, default=0.2, help="share of the images that moves")
+    parser.add_argument("--sun", type=float, default=1.5, help="how much slopes change with the sun")
     parser.add_argument("--wrong", action="store_true", help="one date shows another place")
     parser.add_argument("--alone", action="store_true", help="without the usual way")
     parser.add_argument("--workers", type=int, default=1)

@@ -1,4 +1,4 @@
-"""A stack of rasters of known truth: one ground at many dates, with errors, seasons, haze, clouds and moving ground.
+"""A stack of rasters of known truth: one ground at many dates, with errors, seasons, sun, clouds and moving ground.
 
 Nothing here knows of the matcher, of the adjustment or of the warp: `tests/matching/landscape.py` is the ground.
 """
@@ -10,7 +10,7 @@ from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
-from landscape import SIZE, land, sample
+from landscape import CELL, SIZE, Land, land, sample
 from numpy.typing import NDArray
 from osgeo import gdal, osr
 from scipy.ndimage import gaussian_filter
@@ -33,6 +33,8 @@ class Rasters:
         Largest shift along each axis, px.
     seasons : int
         Looks of the ground through a year; each has half of the contrast of its own.
+    sun : float
+        Brightness that slopes gain or lose with the direction and the height of the sun, which change with the season.
     clouds : float
         Largest share of a raster under clouds.
     moving, rate : float
@@ -49,6 +51,7 @@ class Rasters:
     interval: float = 30.0
     error: float = 5.0
     seasons: int = 1
+    sun: float = 0.0
     clouds: float = 0.0
     noise: float = 0.01
     moving: float = 0.0
@@ -108,9 +111,19 @@ class Rasters:
         values = sample(ground.seen("a", 0, box, 0.35 * box), u, v)
         if season:
             values = 0.5 * (values + sample(ground.seen("a", season, box, 0.35 * box), u, v))
+        if self.sun:
+            values = values * self._lit(ground, u, v, self.years()[number])
         values = self._clouded(values.reshape(self.side, self.side), random)
         values = values + random.normal(0, self.noise, values.shape)
         return self._saved(folder / f"scene_{self.days()[number]:%Y%m%d}.tif", values, number)
+
+    def _lit(self, ground: Land, u: Array, v: Array, year: float) -> Array:
+        """Return the brightness of slopes in the morning sun, which is 25° high in January and 65° in July."""
+        winter = np.cos(2 * np.pi * year)
+        height, azimuth = np.radians(45 - 20 * winter), np.radians(140 + 15 * winter)
+        east, south = np.sin(azimuth) * CELL / 2, -np.cos(azimuth) * CELL / 2
+        rise = ground.heights(u + east, v + south) - ground.heights(u - east, v - south)
+        return np.clip(1.0 - self.sun * rise / np.tan(height), 0.3, 1.7)
 
     def _clouded(self, values: Array, random: np.random.Generator) -> Array:
         share = random.uniform(0, self.clouds)
