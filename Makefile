@@ -40,8 +40,7 @@ VENV := .venv
 CONSTRAINTS := tools/constraints.txt
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-# One more than processors of a small machine: tests wait for browsers and for processes of their own.
-WORKERS ?= 3
+WORKERS ?= 2
 IMAGE ?= python:3.13-slim
 N ?= 100000
 READER ?=

@@ -36,6 +36,8 @@ sys.dont_write_bytecode = False
 ROOT = Path(__file__).resolve().parent.parent
 REAL = data_folder()
 SAMPLE = ROOT / "sample_data"
+#: The longest tests begin first: otherwise one process runs them at the end, and the others wait.
+LONG = "test_tutorials.py", "test_notebooks.py", "test_browser.py", "test_workers.py"
 
 # The same few examples in every run. To search for more: `pytest --hypothesis-profile=search -k round_trip`.
 _QUIET = {
@@ -53,6 +55,7 @@ hypothesis.settings.load_profile("tests")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.name not in LONG)
     for item in items:
         for mark in item.iter_markers("driver"):
             if gdal.GetDriverByName(mark.args[0]) is None:

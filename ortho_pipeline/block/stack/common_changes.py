@@ -123,6 +123,8 @@ class CommonChanges:
 
         Noisy places say little of it, so their products count less.
         """
+        if not forms:
+            return np.zeros(2)
         seen = np.flatnonzero(weight)
         weight = weight[seen]
         centred, matrices = np.eye(len(seen)) - weight, self._correlations(seen)
