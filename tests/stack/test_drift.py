@@ -89,7 +89,7 @@ def test_sigmas_contain_motion_that_is_not_found(dates: int) -> None:
 
 
 def test_sigmas_contain_motion_since_the_reference() -> None:
-    """The reference is half a year older than the first of 8 dates; nothing of the motion is found."""
+    """The reference is half a year older than the first of 8 dates, and hardly any motion is found."""
     found = []
     for seed in range(4):
         made = Truth(seed=seed, dates=8, interval=28.0, moving=0.4).made()

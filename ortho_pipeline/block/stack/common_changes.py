@@ -14,6 +14,7 @@ Source: Cressie 1993, section 2.4 (moments of a variogram); Lawson and Hanson 19
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,9 +40,9 @@ class Drift:
     rate : (2,)
         px a year along columns and rows.
     variance : (2,)
-        The part of its variance that the covariance of the network lacks.
+        Of the rate. The covariance of the network does not contain it.
     time : (T,)
-        Years from the middle of dates; 0 of a date without a time.
+        Years from the mean of the dates that have a link with a reference, or of all; 0 of a date without a time.
     """
 
     rate: Array
@@ -77,7 +78,8 @@ class CommonChanges:
             return found
         without = replace(self.left, value=self.left.change(np.where(known, self.years, 0.0))[2])
         for row, number in enumerate(WAVES):
-            found[row] = self._variance_of_mean(without, _forms(number, self.years), weight)
+            amounts = [self._amount(without, form) for form in _forms(number, self.years)]
+            found[row] = self._variance_of_mean(amounts, weight)
         return found
 
     def drift(self, touched: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Drift:
@@ -91,12 +93,10 @@ class CommonChanges:
             return Drift(np.zeros(2), np.zeros(2), time)
         far = np.where(touched, 0.0, weight)
         far = far / far.sum() if (far > 0).sum() >= FEWEST else weight
-        more, every = far - weight, np.arange(len(weight))
-        noise = np.array([more @ one @ more for one in self._noise(self.left, time, every)])
-        variance = noise + self._variance_of_mean(self.left, [time], far)
-        return Drift(more @ self.left.change(time)[0], variance, time)
+        more, (rate, noise) = far - weight, self._amount(self.left, time)
+        return Drift(more @ rate, noise @ more @ more + self._variance_of_mean([(rate, noise)], far), time)
 
-    @property
+    @functools.cached_property
     def _weight(self) -> Array:
         """Part of each place ``(K,)`` in the corrections of dates; its sum is 1, or 0 without an edge."""
         good = self.trends.good
@@ -104,44 +104,45 @@ class CommonChanges:
         usual = np.where((self.left.weight > 0).any(axis=0) & (usual > 0), usual, 0.0)
         return np.asarray(usual / max(usual.sum(), 1e-300))
 
-    def _correlations(self, seen: NDArray[np.int_]) -> Array:
-        """Return the correlations ``(7, n, n)`` of errors of some places: noise, and those of all ranges."""
-        noisy = np.diag(self.edges.relative[self.trends.good][:, seen].mean(axis=0))
-        return np.concatenate([noisy[None], correlations_of(self.place[seen])])
+    @functools.cached_property
+    def _correlations(self) -> Array:
+        """Correlations ``(7, K, K)`` of errors of places: noise, and those of all ranges."""
+        noisy = np.diag(self.edges.relative[self.trends.good].mean(axis=0))
+        return np.concatenate([noisy[None], correlations_of(self.place)])
 
-    def _noise(self, left: Left, form: Array, seen: NDArray[np.int_]) -> list[Array]:
-        """Return the covariances ``(n, n)``, along both axes, of how much of a form some places have."""
-        shares, of_dates = (one[:, seen] for one in left.shares(form))
+    def _amount(self, left: Left, form: Array) -> tuple[Array, Array]:
+        """Return how much of a form places have ``(K, 2)``, and the covariances ``(2, K, K)`` of its known errors."""
+        shares, of_dates = left.shares(form)
         dates = of_dates.T @ (self.components.scale[:, None] * of_dates)
         own = shares.T @ (self.components.factor[:, None] * shares)
-        root, matrices = np.sqrt(left.noisier[seen]), self._correlations(seen)
-        shared, single = (np.tensordot(of, matrices, 1) for of in (self.components.shared, self.components.own))
-        return [(dates * shared[axis] + own * single[axis]) * np.outer(root, root) for axis in (0, 1)]
+        shared, single = (
+            np.tensordot(of, self._correlations, 1) for of in (self.components.shared, self.components.own)
+        )
+        root = np.sqrt(left.noisier)
+        return left.change(form)[0], (dates * shared + own * single) * np.outer(root, root)
 
-    def _variance_of_mean(self, left: Left, forms: list[Array], weight: Array) -> Array:
-        """Return the variance ``(2,)`` of the mean, with weights ``(K,)``, of how much of a form places have.
+    def _variance_of_mean(self, amounts: list[tuple[Array, Array]], weight: Array) -> Array:
+        """Return the variance ``(2,)`` of the mean with weights ``(K,)`` of amounts, which places share in part.
 
-        Noisy places say little of it, so their products count less.
+        Products of noisy places count less.
         """
-        if not forms:
-            return np.zeros(2)
         seen = np.flatnonzero(weight)
         weight = weight[seen]
-        centred, matrices = np.eye(len(seen)) - weight, self._correlations(seen)
+        centred, matrices = np.eye(len(seen)) - weight, self._correlations[:, seen][:, :, seen]
         classes, found = classes_of(self.place[seen]).ravel(), np.zeros(2)
         spread = [(centred @ one @ centred.T).ravel() for one in matrices]
-        sizes = [centred @ left.change(form)[0][seen] for form in forms]
-        noises = [self._noise(left, form, seen) for form in forms]
+        number, of_mean = classes.max() + 1, matrices @ weight @ weight
         for axis in (0, 1):
-            products, expected = np.zeros(1), np.zeros(1)
-            for size, noise in zip(sizes, noises, strict=True):
-                known = noise[axis]
-                rest = np.outer(size[:, axis], size[:, axis]) - centred @ known @ centred.T
+            products, expected = np.zeros(number), np.zeros((number, len(spread)))
+            for size, noise in amounts:
+                known, apart = noise[axis][seen][:, seen], centred @ size[seen, axis]
                 counts = _counts(known.diagonal()).ravel()
-                products = products + np.bincount(classes, counts * rest.ravel())
-                expected = expected + np.stack([np.bincount(classes, counts * one) for one in spread], axis=1)
+                products += np.bincount(
+                    classes, counts * (np.outer(apart, apart) - centred @ known @ centred.T).ravel()
+                )
+                expected += np.stack([np.bincount(classes, counts * one) for one in spread], axis=1)
             length = np.maximum(np.linalg.norm(expected, axis=0), 1e-12)
-            found[axis] = (matrices @ weight @ weight) @ (optimize.nnls(expected / length, products)[0] / length)
+            found[axis] = of_mean @ (optimize.nnls(expected / length, products)[0] / length)
         return found
 
 
