@@ -97,8 +97,8 @@ def test_a_noisier_place_has_a_larger_variance() -> None:
     rest = np.array([[[1.0, 2.0]], [[3.0, 4.0]], [[50.0, 60.0]]])
     weight = np.array([[2.0], [0.5], [0.0]])
     # 2, 8, 4.5, 8: the median is 6.25. The last edge does not count.
-    np.testing.assert_allclose(_noisier(rest, weight), [6.25 / chi2.median(1)])
-    np.testing.assert_array_equal(_noisier(0.1 * rest, weight), [1.0])
+    np.testing.assert_allclose(_noisier(np.moveaxis(rest, 0, -1), weight.T), [6.25 / chi2.median(1)])
+    np.testing.assert_array_equal(_noisier(0.1 * np.moveaxis(rest, 0, -1), weight.T), [1.0])
 
 
 def test_the_majority_of_places_gives_the_rate_of_stable_ground() -> None:

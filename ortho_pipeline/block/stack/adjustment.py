@@ -138,7 +138,7 @@ class _Solved:
         """Return what the network leaves of accepted edges."""
         terms = self.trends.design.shape[1]
         apart = self.network.value[self.edges.first] - self.network.value[self.edges.second]
-        predicted = np.einsum("km,emc->ekc", self.trends.design, apart[:, :terms])
+        predicted = self.trends.design @ apart[:, :terms]
         return left_of(self.edges, predicted, self.components, self.closures.accepted, years)
 
 
@@ -173,7 +173,7 @@ def _referred(
     if datum is None:
         number = int(np.bincount(part).argmax())
         weights = (part == number) / max(int((part == number).sum()), 1)
-        network = _mean_shift(found, weights, bool(sloped[part == number].all()))
+        network = found.relative_to(weights, 3 if sloped[part == number].all() else 1)
     else:
         number = int(part[datum])
         network = found.relative_to(np.eye(len(years))[datum])
@@ -187,16 +187,3 @@ def _referred(
         cells, solved.edges, network, solved.components, solved.trends, solved.closures, motion, steps, determined,
         sloped if datum is None else sloped | bool(sloped[datum]),
     )  # fmt: skip
-
-
-def _mean_shift(network: Network, weights: Array, slopes: bool) -> Network:
-    """Return corrections with a mean shift of zero; slopes too if all dates have them."""
-    about = network.relative_to(weights)
-    if slopes:
-        return about
-    dates = len(weights)
-    change = np.eye(3 * dates)
-    change[::3, ::3] -= weights
-    value = network.value.copy()
-    value[:, 0] -= weights @ network.value[:, 0]
-    return replace(network, value=value, covariance=np.array([change @ one @ change.T for one in network.covariance]))

@@ -206,24 +206,33 @@ class _Shapes:
 
     def _sums(self, pairs: list[tuple[int, int, float]]) -> tuple[Array, Array, Array]:
         """Return expected sums ``(classes, 7)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
-        classes, terms = len(_CLASSES) + 1, _TERMS
-        expected, seen, number = np.zeros((classes, terms)), np.zeros((classes, 2)), np.zeros(classes)
-        design, relative = self.trends.design, np.sqrt(self.edges.relative)
-        for one, other, sign in pairs:
-            rows, columns = (np.flatnonzero(self.trends.used[edge]) for edge in (one, other))
-            block = np.ix_(rows, columns)
-            place = self.classes[block].ravel()
-            number += np.bincount(place, minlength=classes)
-            for axis in (0, 1):
-                product = sign * np.outer(self.left[one, rows, axis], self.left[other, columns, axis])
-                seen[:, axis] += np.bincount(place, product.ravel(), classes)
-            before, behind = self.trends.weights[one, rows], self.trends.weights[other, columns]
-            noise = (rows[:, None] == columns) * np.outer(relative[one, rows], relative[other, columns])
-            for term, kernel in enumerate([noise, *self.correlations[:, block[0], block[1]]]):
-                # From the left, and from the right: a trend has few terms, so no square matrices are multiplied.
-                left = kernel - design[rows] @ (before.T @ kernel)
-                left = left - (left @ behind) @ design[columns].T
-                expected[:, term] += np.bincount(place, left.ravel(), classes)
+        number_of = len(_CLASSES) + 1
+        expected, seen, number = np.zeros((number_of, _TERMS)), np.zeros((number_of, 2)), np.zeros(number_of)
+        if not pairs:
+            return expected, seen, number
+        one, other = np.array([pair[:2] for pair in pairs]).T
+        sign, trends, root = np.array([pair[2] for pair in pairs]), self.trends, np.sqrt(self.edges.relative)
+        used, there = trends.used[one].astype(float), trends.used[other].astype(float)  # (P, K)
+        many = used.T @ there
+        for axis in (0, 1):
+            product = (sign[:, None] * self.left[one, :, axis]).T @ self.left[other, :, axis]
+            seen[:, axis] = np.bincount(self.classes.ravel(), product.ravel(), number_of)
+        before, behind = (trends.weights[end].transpose(0, 2, 1) for end in (one, other))  # (P, m, K)
+        rows, columns = (which[:, None, :] * trends.design.T for which in (used, there))
+        for place in range(number_of):
+            # A trend takes parts of its rows and columns from the products of a class, the same for all kernels.
+            here = (self.classes == place).astype(float)
+            number[place] = (here * many).sum()
+            left, right = rows @ here * there[:, None, :], columns @ here * used[:, None, :]
+            left = left - (left @ columns.transpose(0, 2, 1)) @ behind
+            parts = (
+                here * many
+                - np.tensordot(before, left, ((0, 1), (0, 1)))
+                - np.tensordot(right, behind, ((0, 1), (0, 1)))
+            )
+            expected[place, 1:] = (self.correlations * parts).sum(axis=(1, 2))
+            single = here.diagonal() * used * there - (before * left).sum(axis=1) - (right * behind).sum(axis=1)
+            expected[place, 0] = (root[one] * root[other] * single).sum()
         return expected, seen, number
 
 

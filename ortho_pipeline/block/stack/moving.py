@@ -102,22 +102,23 @@ class Left:
     @property
     def noisier(self) -> Array:
         """By how much the variance of each place ``(K,)`` is larger than the one of most."""
-        return _noisier(self.value, self.weight)
+        return _noisier(_by_place(self.value), _by_place(self.weight))
 
     def change(self, form: Array) -> tuple[Array, Array, Array]:
         """Return how much of a form ``(T,)`` each place has ``(K, 2)``, its variance ``(K,)`` and what is left."""
-        apart = (form[self.first] - form[self.second])[:, None]
+        apart = form[self.first] - form[self.second]
         shares, of_dates = self.shares(form)
-        size = np.einsum("ek,ekc->kc", shares, self.value)
+        value, weight, part = _by_place(self.value), _by_place(self.weight), _by_place(shares)
+        size = np.einsum("ke,kce->kc", part, value)
         for _ in range(_CLIPPED):
             # A cloud that was matched at a few dates must not look like motion.
-            rest = self.value - apart[:, :, None] * size
-            reach = _CLIP * np.sqrt(_noisier(rest, self.weight) / np.maximum(self.weight, 1e-12))[:, :, None]
-            size = size + np.einsum("ek,ekc->kc", shares, np.clip(rest, -reach, reach))
+            rest = value - apart * size[:, :, None]
+            reach = _CLIP * np.sqrt(_noisier(rest, weight)[:, None] / np.maximum(weight, 1e-12))[:, None]
+            size = size + np.einsum("ke,kce->kc", part, np.clip(rest, -reach, reach))
         scaled = np.sqrt(self.scale)[:, None] * of_dates
         of_shared = np.maximum((scaled**2).sum(axis=0), (scaled * (self.alike @ scaled)).sum(axis=0))
         variance = self.shared * of_shared + (shares**2 * self.own).sum(axis=0)
-        return size, variance, self.value - (apart[:, :, None] * size)
+        return size, variance, self.value - apart[:, None, None] * size
 
     def shares(self, form: Array) -> tuple[Array, Array]:
         """Return what the errors of edges ``(E, K)`` and of dates ``(T, K)`` have in how much of a form places have."""
@@ -195,11 +196,15 @@ def left_of(
     )
 
 
+def _by_place(values: Array) -> Array:
+    """Return values of edges at places ``(E, K, ...)`` as ``(K, ..., E)``, next to each other in memory."""
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+
+
 def _noisier(rest: Array, weight: Array) -> Array:
-    """Return by how much the variance of each place ``(K,)`` is larger than the one of most."""
-    seen: NDArray[np.bool_] = np.greater(weight, 0.0)
-    square = (rest**2 * weight[:, :, None]).transpose(1, 0, 2).reshape(weight.shape[1], -1)
-    middle = median_of(square, np.repeat(seen.T, 2, axis=1))
+    """Return by how much the variance of each place ``(K,)`` is larger than the one of most, from ``(K, 2, E)``."""
+    square, seen = rest**2 * weight[:, None], np.greater(weight, 0.0)
+    middle = median_of(square.reshape(len(weight), -1), np.tile(seen, (1, 2)))
     return np.asarray(np.maximum(middle / chi2.median(1), 1.0))
 
 

@@ -81,11 +81,16 @@ class Network:
     covariance: Array
     part: NDArray[np.int_]
 
-    def relative_to(self, weights: Array) -> Network:
-        """Return corrections of which the mean with weights ``(T,)``, with a sum of 1, is zero."""
-        change = np.kron(np.eye(len(self.value)) - weights, np.eye(3))
-        value = self.value - np.einsum("t,tmc->mc", weights, self.value)
-        return replace(self, value=value, covariance=np.array([change @ one @ change.T for one in self.covariance]))
+    def relative_to(self, weights: Array, terms: int = 3) -> Network:
+        """Return corrections of which the mean with weights ``(T,)``, with a sum of 1, is zero: the shift alone (1 of
+        the `terms`), or slopes too (3).
+        """
+        dates, value = len(self.value), self.value.copy()
+        value[:, :terms] -= np.einsum("t,tmc->mc", weights, value[:, :terms])
+        covariance = self.covariance.reshape(2, dates, 3, dates, 3).copy()
+        covariance[:, :, :terms] -= np.einsum("t,atmun->amun", weights, covariance[:, :, :terms])[:, None]
+        covariance[..., :terms] -= np.einsum("u,atmun->atmn", weights, covariance[..., :terms])[:, :, :, None]
+        return replace(self, value=value, covariance=covariance.reshape(self.covariance.shape))
 
     def with_seasons(self, variance: Array, yearly: Array, years: Array) -> Network:
         """Return the same corrections, with errors that dates of one season share.

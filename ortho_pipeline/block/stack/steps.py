@@ -57,7 +57,7 @@ def _at(value: Array, covariance: Array, scatter: Array, low: int, at: int, high
     contrast = np.zeros(len(value))
     contrast[before], contrast[after] = -1.0 / len(before), 1.0 / len(after)
     size = _level(value[after], scatter) - _level(value[before], scatter)
-    known = np.einsum("t,atu,u->a", contrast, covariance, contrast)
+    known = (contrast @ covariance * contrast).sum(axis=1)
     variance = scatter * (1.0 / len(before) + 1.0 / len(after)) + known
     ratio = float((size**2 / np.maximum(variance, 1e-12)).sum()) / 2
     sigma = np.sqrt(variance)

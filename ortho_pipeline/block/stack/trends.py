@@ -60,8 +60,8 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
     used = _near(left, allowed)
     for _ in range(_ROUNDS):
         weights = _functionals(design, base * used)
-        trend = np.einsum("ekm,ekc->emc", weights, value)
-        left = value - np.einsum("km,emc->ekc", design, trend)
+        trend = weights.transpose(0, 2, 1) @ value
+        left = value - design @ trend
         again = _near(left, allowed)
         if (again == used).all():
             break
@@ -70,8 +70,8 @@ def trends_of(edges: Edges, design: Array, stable: NDArray[np.bool_]) -> Trends:
     weights = _functionals(design, base * used)
     used &= np.asarray(weights.any(axis=(1, 2)))[:, None]
     weights = np.where(used[:, :, None], weights, 0.0)
-    trend = np.einsum("ekm,ekc->emc", weights, value)
-    left = np.where(used[:, :, None], value - np.einsum("km,emc->ekc", design, trend), 0.0)
+    trend = weights.transpose(0, 2, 1) @ value
+    left = np.where(used[:, :, None], value - design @ trend, 0.0)
     return Trends(design, weights, trend, left, used)
 
 
@@ -97,4 +97,4 @@ def _functionals(design: Array, weight: Array) -> Array:
     values, vectors = np.linalg.eigh(normal)
     sound = values[:, 0] > 1e-3 * values[:, -1]
     inverse = np.einsum("eij,ej,ekj->eik", vectors, 1.0 / np.where(sound[:, None], values, np.inf), vectors)
-    return np.asarray(np.einsum("ek,kn,emn->ekm", weight, design, inverse))
+    return np.asarray(weight[:, :, None] * (design @ inverse))
