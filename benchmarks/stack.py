@@ -8,7 +8,7 @@
 `network` draws edges (tests/stack/networks.py) and runs the network alone. `images` draws rasters
 (tests/stack/rasters.py), matches them and measures misfit, moving ground and time. Misfit is the length of the error
 between any two dates, in px. The usual way matches each date with the middle one alone: with our matcher, and with
-AROSICS (the median of its tie points).
+AROSICS (the median of its tie points). `--wrong-edges` displaces all matches of some pairs by 2 to 15 px on both axes.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ import resource
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from osgeo import gdal
@@ -35,6 +38,7 @@ from peers import AROSICS, PeerFailed, measured, result_of  # noqa: E402
 from rasters import Rasters  # noqa: E402
 
 from ortho_pipeline.batch.stack.command import stack  # noqa: E402
+from ortho_pipeline.batch.stack.matching import EdgeMatches, read_matches  # noqa: E402
 from ortho_pipeline.block.stack.adjustment import adjust  # noqa: E402
 from ortho_pipeline.commands.orthos.aligning import align  # noqa: E402
 from ortho_pipeline.errors import OrthoError  # noqa: E402
@@ -102,6 +106,25 @@ def told(rows: list[dict[str, Any]]) -> str:
     )
 
 
+@dataclass
+class Spoiled:
+    """Reads the matches of pairs, and displaces all matches of a share of them."""
+
+    seed: int
+    share: float
+    pairs: set[tuple[str, str]] = field(default_factory=set)
+
+    def __call__(self, path: Path) -> EdgeMatches:
+        """Return the matches in a file; pixels have one metre."""
+        found = read_matches(path)
+        random = np.random.default_rng([self.seed, zlib.crc32(path.name.encode())])
+        if random.random() >= self.share:
+            return found
+        self.pairs.add((found.first, found.second))
+        shift = random.uniform(2, 15, 2) * random.choice([-1, 1], 2)
+        return found.model_copy(update={"shown": tuple(map(tuple, (np.array(found.shown) + shift).tolist()))})
+
+
 def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     """Return what `ortho stack` finds of one drawn stack, and what the usual way finds."""
     rasters = Rasters(
@@ -117,8 +140,9 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
         paths = rasters.write(folder / "in")
         begin, wall = _cpu(), time.monotonic()
         with_workers: Any = {"executor": "processes", "workers": given.workers} if given.workers > 1 else {}
-        match = MatchOptions(search=60.0)
-        document = stack([folder / "in"], folder / "out", match=match, output=output, **with_workers).document
+        match, spoiled = MatchOptions(search=60.0), Spoiled(seed, given.wrong_edges)
+        with mock.patch("ortho_pipeline.batch.stack.matching.read_matches", spoiled):
+            document = stack([folder / "in"], folder / "out", match=match, output=output, **with_workers).document
         seconds, wall = _cpu() - begin, time.monotonic() - wall
         found = np.array([one["shift_px"] or (np.nan, np.nan) for one in document["dates"]])
         sigma = np.array([one["sigma_px"] or (np.nan, np.nan) for one in document["dates"]])
@@ -137,9 +161,11 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     truth = rasters.moves(cells) & tested
     still = _still(rasters, cells) & tested
     status = [one["status"] for one in document["pairs"]]
+    wrong = [(one["first"], one["second"]) in spoiled.pairs for one in document["pairs"]]
     return {
         "seed": seed, "dates": given.dates, "side": given.side, "pairs": len(status),
         **{one.replace(" ", "_"): status.count(one) for one in ("accepted", "rejected", "not matched", "untested")},
+        "wrong": sum(wrong), "wrong_found": sum(map(lambda one, bad: one == "rejected" and bad, status, wrong)),
         **_of(found - true, kept), "of": int(kept.sum()),
         "spread": float(np.sqrt(((errors / sigma[known]) ** 2).mean())),
         **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},
@@ -210,6 +236,7 @@ def main() -> None:
     parser.add_argument("--moving", type=float, default=0.2, help="share of the images that moves")
     parser.add_argument("--sun", type=float, default=1.5, help="how much slopes change with the sun")
     parser.add_argument("--wrong", action="store_true", help="one date shows another place")
+    parser.add_argument("--wrong-edges", type=float, default=0.0, help="share of the pairs with displaced matches")
     parser.add_argument("--alone", action="store_true", help="without the usual way")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--arosics", type=Path, help="Python of an environment that has AROSICS")
