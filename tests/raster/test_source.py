@@ -73,3 +73,16 @@ def test_bands_of_several_files_are_valid_each_as_in_its_own(tmp_path):
     for band in (0, 5):
         with pytest.raises(InputError, match=f"no band {band}: the image has 4"):
             RasterSource(plain, holes, bands=[band])
+
+
+@pytest.mark.parametrize(("side", "kind", "stated"), [(32768, gdal.GDT_Byte, None), (32768, gdal.GDT_UInt16, 1 << 31)])
+def test_a_block_that_needs_too_much_memory_is_refused(tmp_path, side, kind, stated):
+    path = str(tmp_path / "a.tif")
+    options = [f"BLOCKYSIZE={side}", "SPARSE_OK=TRUE", "COMPRESS=DEFLATE"]
+    dataset = gdal.GetDriverByName("GTiff").Create(path, side, side, 1, kind, options)
+    del dataset
+    if stated is None:
+        assert RasterSource(path).width == side
+        return
+    with pytest.raises(InputError, match=f"{side} x {side} pixels in blocks of {stated} bytes"):
+        RasterSource(path)
