@@ -22,14 +22,15 @@ from ortho_pipeline.runtime.compilation.marked import Marked
 
 log = logging.getLogger(__name__)
 
-_njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
+#: C never calls a kernel, and Python none that is inlined: making what such calls need took a fifth of the time.
+_njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True)
 
 
 def dispatcher(kernel: Marked) -> Any:
     """Return numba's object for a kernel, with a cache of ours unless it is inlined; one kernel at a time."""
     function = kernel.py_func
     if kernel.inline:
-        return _njit(forceinline=True)(function)
+        return _njit(forceinline=True, no_cpython_wrapper=True)(function)
     made: Any = _njit()(function)
     # As enable_caching() does with numba's own.
     made._cache = _Kept(_cache_in(cache_folders.own()[0], function), _cache_in(cache_folders.of_root(), function))
