@@ -20,6 +20,7 @@ Kass and Raftery 1995, section 4.1 (Schwarz criterion).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -248,10 +249,18 @@ class DisplacementField:
         family, length = kernel
         return np.asarray(FAMILIES[family](_between_chips(spatial.distance.cdist(one, other), self.side) / length))
 
+    @functools.cached_property
+    def _own_noise(self) -> Array:
+        return _noise(self.place, self.weight, self.side)
+
+    @functools.cached_property
+    def _own_distance(self) -> Array:
+        return _between_chips(spatial.distance.cdist(self.place, self.place), self.side)
+
     def _whitened(self, kernel: tuple[int, float], ratio: float) -> Callable[[Array], Array]:
         """Return the function that whitens columns."""
-        variance = _noise(self.place, self.weight, self.side) + ratio * self._covariance(kernel, self.place, self.place)
-        root = linalg.cholesky(variance, lower=True)
+        family, length = kernel
+        root = linalg.cholesky(self._own_noise + ratio * FAMILIES[family](self._own_distance / length), lower=True)
         return lambda columns: np.asarray(linalg.solve_triangular(root, columns, lower=True))
 
     def _kriged(
