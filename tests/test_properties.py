@@ -213,7 +213,8 @@ def seen(model: SensorModel, count: int, seed: int, noise: float = 0.0) -> Point
 
 
 def test_no_kind_of_model_is_left_out() -> None:
-    assert set(MODELS) == set(KINDS.values())
+    # Other tests install models of their own.
+    assert set(MODELS) == {kind for kind in KINDS.values() if kind.__module__.startswith("ortho_")}
 
 
 @EVERY_KIND
