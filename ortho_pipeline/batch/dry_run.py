@@ -12,7 +12,7 @@ from ortho_pipeline.errors import OrthoError, error_document
 
 
 def check_scenes(
-    config: str | os.PathLike[str] | Plan, only: Sequence[str] = (), shard: tuple[int, int] | None = None
+    config: str | os.PathLike[str] | Plan, only: Sequence[str], shard: tuple[int, int] | None
 ) -> list[dict[str, Any]]:
     """Open all inputs of every scene (images, points, DEM) and check the coverage; read no pixels.
 

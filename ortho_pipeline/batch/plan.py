@@ -400,9 +400,7 @@ class _Planner:
                     )
 
 
-def for_run(
-    jobs: Sequence[Job], run: str, memory: int, threads: int | None, *, allow_network: bool = False
-) -> list[Job]:
+def for_run(jobs: Sequence[Job], run: str, memory: int, threads: int | None, *, allow_network: bool) -> list[Job]:
     """Return the jobs of a run, with the bytes and threads that each may use, and leave to use the network."""
     return [replace(job, run=run, request=_within(job.request, memory, threads, allow_network)) for job in jobs]
 

@@ -258,8 +258,8 @@ def write_report(
     made: SceneReport,
     fit: Fit,
     files: dict[str, Path],
-    matched: Matched | None = None,
-    pixels: RasterSource | None = None,
+    matched: Matched | None,
+    pixels: RasterSource | None,
 ) -> None:
     """Write report and residuals; without points there are no residuals, and they are taken out of `files`.
 

@@ -409,7 +409,7 @@ def _outlying_checks(
 
 
 def checks_apart(
-    solution: Solution, points: Points, used: np.ndarray, outliers: Sequence[OutlyingPoint], *, shared: bool = False
+    solution: Solution, points: Points, used: np.ndarray, outliers: Sequence[OutlyingPoint], *, shared: bool
 ) -> list[Notice]:
     """Return a notice if check points contradict the control points, so that their RMSE is no measure of accuracy.
 

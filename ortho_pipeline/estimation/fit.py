@@ -344,8 +344,8 @@ def gross_errors(
     model: SensorModel,
     points: Points,
     *,
-    priors: Mapping[str, Prior] | None = None,
-    ridge: float | str | None = None,
+    priors: Mapping[str, Prior] | None,
+    ridge: float | str | None,
 ) -> dict[str, str]:
     """Return the control points that `fit` would leave out, with the reason of each.
 

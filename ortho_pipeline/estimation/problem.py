@@ -75,7 +75,7 @@ class Solution:
         white = self.errors.whitened(self.jacobian)
         return np.eye(2) - white @ self.cofactors @ white.transpose(0, 2, 1)
 
-    def leave_one_out(self, further: Array | None = None) -> Array:
+    def leave_one_out(self, further: Array | None) -> Array:
         """Return leave-one-out residuals ``(n, 2)`` px; points of a group are left out together.
 
         NaN if the point or group is indispensable. `further` ``(n, 2, k)`` are what independent unknowns besides the

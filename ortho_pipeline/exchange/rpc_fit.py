@@ -21,6 +21,8 @@ from ortho_pipeline.models.rpc_box import RPC_TERMS, has_pole
 WARN_ERROR, REFUSE_ERROR = 0.02, 0.1
 #: Weight of the penalty on the size of the normalised coefficients in `fit_rpc`, relative to one observation.
 TIKHONOV = 1e-7
+#: Iterations of the weights of a ratio; the best one counts.
+_ITERATIONS = 5
 log = logging.getLogger(__name__)
 
 
@@ -117,13 +119,13 @@ def _fit_ratio(terms: Array, values: Array) -> tuple[Array, Array]:
     return num, den
 
 
-def _iterate_ratio(terms: Array, values: Array, damping: float, iterations: int = 5) -> tuple[Array, Array] | None:
+def _iterate_ratio(terms: Array, values: Array, damping: float) -> tuple[Array, Array] | None:
     """Return the best of some iterations; None if the first one has a pole in the box of the terms."""
     system = np.column_stack([terms, -values[:, None] * terms[:, 1:], values])
     penalty = np.sqrt(len(terms)) * np.repeat([TIKHONOV, damping], [20, 19])
     denominator = np.ones(len(terms))
     best: tuple[float, Array, Array] | None = None
-    for _ in range(iterations):
+    for _ in range(_ITERATIONS):
         # The right side is the last column, so R is enough. The penalty is applied to the singular values of R: as
         # further rows of the system it would fill the reflections with denormal numbers.
         r: Array = np.asarray(np.linalg.qr(system / denominator[:, None], mode="r"))

@@ -39,7 +39,7 @@ _NONE = 0.1
 # -- finding edges ---------------------------------------------------------------------------------------------------
 
 
-def find_edges(pixels: Array, *, most: int = _MOST) -> list[Edge]:
+def find_edges(pixels: Array) -> list[Edge]:
     """Find straight edges between even areas, clearest first, and measure them.
 
     Parameters
@@ -61,9 +61,9 @@ def find_edges(pixels: Array, *, most: int = _MOST) -> list[Edge]:
         if edge.contrast < _CLEAR * edge.noise or edge.misfit > _MISFIT or edge.sigma_error > _UNSURE * edge.sigma:
             continue
         clear.append(edge)
-        if len(clear) >= 2 * most:
+        if len(clear) >= 2 * _MOST:
             break
-    return _distinct(clear, most)
+    return _distinct(clear, _MOST)
 
 
 def _distinct(edges: Iterable[Edge], most: int) -> list[Edge]:

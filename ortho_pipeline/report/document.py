@@ -324,9 +324,7 @@ def _ortho(grid: Grid, warp: WarpRecord | None) -> OrthoRecord:
     )
 
 
-def with_layers(
-    report: SceneReport, *, accuracy: AccuracyLayer | None, angles: AnglesLayer | None = None
-) -> SceneReport:
+def with_layers(report: SceneReport, *, accuracy: AccuracyLayer | None, angles: AnglesLayer | None) -> SceneReport:
     """Return the report with what layers next to the ortho say; the headline gives the accuracy over the scene."""
     report = report.replaced(angles=angles)
     if accuracy is None:

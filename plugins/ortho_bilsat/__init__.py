@@ -97,7 +97,7 @@ def open_scene(dataset: gdal.Dataset, *, survey: str | None = None, attitude: st
     )
 
 
-def rigorous_model(survey: Survey, *, use_attitude: bool = True) -> FrameCamera:
+def rigorous_model(survey: Survey, *, use_attitude: bool) -> FrameCamera:
     """Return the collinearity model of a survey: its attitude, or zero angles (equation 5)."""
     position, velocity = np.array(survey.position), np.array(survey.velocity)
     rotation = None

@@ -69,7 +69,7 @@ class PhotoPose:
         return math.degrees(math.acos(max(-1.0, min(1.0, -float(self.rotation[2, 2])))))
 
 
-def pose_of(tags: Tags, pitch: str | None = None) -> PhotoPose:
+def pose_of(tags: Tags, pitch: str | None) -> PhotoPose:
     """Return the pose in the tags; `pitch` says where pitch is zero, if the tags say it wrongly.
 
     Raises

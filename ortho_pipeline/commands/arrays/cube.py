@@ -53,8 +53,8 @@ def cube_of(
     paths: Sequence[str | os.PathLike[str]],
     times: Sequence[datetime],
     of_times: Mapping[str, Any],
-    chunks: int | None = None,
-    access: Mapping[str, Any] = {},
+    chunks: int | None,
+    access: Mapping[str, Any],
 ) -> xarray.DataArray:
     """Return orthos of one grid as an array ``(time, band, y, x)``.
 

@@ -60,7 +60,7 @@ def open_by_evidence(request: Request, *, needs_model: bool = True) -> Scene:
 def settled_options(
     images: Sequence[str | os.PathLike[str]],
     scenes: Sequence[SceneOptions],
-    surface: SurfaceOptions = SurfaceOptions(),
+    surface: SurfaceOptions,
     points: Callable[[int], Points | None] = lambda _: None,
 ) -> tuple[list[SceneOptions], list[Notice]]:
     """Return the options of images of a block with the offsets of crops that points or heights settle, and notices.

@@ -266,7 +266,7 @@ def match_scene(
 
 
 def open_reference_views(
-    scene: Scene, options: MatchOptions, surface: Surface | None, opened: SceneOptions = SceneOptions()
+    scene: Scene, options: MatchOptions, surface: Surface | None, opened: SceneOptions
 ) -> tuple[SceneView, tuple[Reference, ...]]:
     """Open a scene and its references as a matcher sees them.
 

@@ -121,11 +121,7 @@ class Tied:
 
 @cache_restored()
 def tie_scenes(
-    scenes: Mapping[str, Scene],
-    options: MatchOptions,
-    surface: Surface,
-    opened: SceneOptions = SceneOptions(),
-    threads: int | None = None,
+    scenes: Mapping[str, Scene], options: MatchOptions, surface: Surface, opened: SceneOptions = SceneOptions()
 ) -> Tied:
     """Find tie points between scenes, by their names.
 
@@ -164,7 +160,7 @@ def tie_scenes(
         points=options.wanted,
         apart=options.points is None,
         dem_sigma=sigma,
-        threads=threads or os.cpu_count() or 1,
+        threads=os.cpu_count() or 1,
     )
     ties = tie(views, settings)
     notices = [*_few(ties, tuple(scenes)), *_crowded(ties, options.points)]

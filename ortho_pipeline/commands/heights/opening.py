@@ -101,9 +101,7 @@ def _require_same_place(surface: DemSurface, sigma: float | Surface | None) -> N
         )
 
 
-def open_sigma(
-    options: SurfaceOptions, scene: SceneOptions = SceneOptions(), memory: int = OutputOptions.memory
-) -> float | Surface | None:
+def open_sigma(options: SurfaceOptions, scene: SceneOptions, memory: int) -> float | Surface | None:
     """Return the standard deviation of heights: a number (m), a raster, or None if not stated.
 
     Raises

@@ -190,7 +190,7 @@ def _assumptions(budget: Budget, surface: Surface) -> list[str]:
     return assumptions
 
 
-def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | None = None) -> Path | Hiding:
+def ortho_of(placed: Placement, files: Mapping[str, Path], other: Regridded | None) -> Path | Hiding:
     """Return the path of the ortho; if requested, with the treatment of pixels that terrain hides."""
     if placed.request.output.visibility is None:
         return files["ortho"]

@@ -140,7 +140,7 @@ class Ledger:
         ]
 
     @contextlib.contextmanager
-    def hashed_beside(self, digest: Callable[..., str] = sha256) -> Iterator[Future[list[dict[str, Any]]]]:
+    def hashed_beside(self, digest: Callable[..., str]) -> Iterator[Future[list[dict[str, Any]]]]:
         """Take the checksums in a thread while the block runs; an error in the block does not wait for them.
 
         The thread ends with the block, whatever happens, and never calls GDAL: the interpreter cannot exit while a

@@ -65,7 +65,7 @@ def _(comparison: ComparisonRecord, axes: Any = None) -> Any:
 
 
 def residual_axes(
-    image: NDArray[np.float64], residuals: NDArray[np.float64], kinds: Sequence[str], title: str, axes: Any = None
+    image: NDArray[np.float64], residuals: NDArray[np.float64], kinds: Sequence[str], title: str, axes: Any
 ) -> Any:
     """Draw residual vectors (px, drawn longer) at their places in the image; return the axes.
 
@@ -110,7 +110,7 @@ def residual_axes(
     return axes
 
 
-def rmse_axes(rows: Mapping[str, Mapping[str, float]], chosen: str | None, axes: Any = None) -> Any:
+def rmse_axes(rows: Mapping[str, Mapping[str, float]], chosen: str | None, axes: Any) -> Any:
     """Draw the RMSE (px) of models by what they are of (``control``, ``check``, ``loo``); return the axes.
 
     Raises

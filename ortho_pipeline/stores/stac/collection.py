@@ -164,7 +164,7 @@ class Collection:
 
 
 @reads(_REMEDY)
-def read_collection(address: AnyPath, *, allow_network: bool = False) -> dict[str, Any]:
+def read_collection(address: AnyPath, *, allow_network: bool) -> dict[str, Any]:
     """Return the document of a collection, or of a list of items."""
     document = read_document(address, allow_network=allow_network)
     _require_collection(document, address)

@@ -190,7 +190,7 @@ def read_item(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPat
 
 
 @reads(REMEDY)
-def item_at(path: AnyPath, *, allow_network: bool = False, roots: tuple[AnyPath, ...] = ()) -> Item | None:
+def item_at(path: AnyPath, *, allow_network: bool, roots: tuple[AnyPath, ...]) -> Item | None:
     """Read a STAC item as `read_item` does; None if it is a collection."""
     document = read_document(path, allow_network=allow_network)
     return None if document.get("type") in COLLECTIONS else item_of(document, path, roots)

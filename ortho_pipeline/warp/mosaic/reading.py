@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ortho_pipeline.raster.caching.block_cache import limit_cache
-from ortho_pipeline.raster.source import MEMORY, RasterSource
+from ortho_pipeline.raster.source import RasterSource
 from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, PlacedOrtho, box_of, intersection
 
 #: Orthos that are open at a time. A process may have 1024 files open by default, some of them several for an ortho.
@@ -49,7 +49,7 @@ class Opened:
         return values, valid
 
 
-def open_layers(placed: Mosaic, memory: int = MEMORY) -> list[Opened]:
+def open_layers(placed: Mosaic, memory: int) -> list[Opened]:
     """Return all orthos of a mosaic for reading, with GDAL's cache within the memory (bytes)."""
     source_of = functools.lru_cache(maxsize=_OPEN)(functools.partial(RasterSource, memory=memory))
     opened = [Opened(layer, source_of) for layer in placed.layers]

@@ -200,7 +200,7 @@ def _three(covariance: Array) -> Array:
 # -- everywhere ------------------------------------------------------------------------------------------------------
 
 
-def layer_grid(grid: Grid, step: int = STEP) -> Grid:
+def layer_grid(grid: Grid, step: int) -> Grid:
     """Return the grid of a layer: the corner of the ortho's, `step` of its pixels to one; the last may reach beyond."""
     return Grid(
         grid.crs, grid.left, grid.top, grid.dx * step, grid.dy * step, -(-grid.width // step), -(-grid.height // step)

@@ -86,7 +86,7 @@ def compare_corrections(
     names: Sequence[str],
     points: BlockPoints,
     hold: float | None,
-    heights: DemHeights | None = None,
+    heights: DemHeights | None,
 ) -> dict[str, Any]:
     """Return rows and recommendation, as JSON values.
 

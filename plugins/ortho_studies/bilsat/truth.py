@@ -123,7 +123,7 @@ class Snapshot:
     k1: float = 0.0
 
     @classmethod
-    def over_ankara(cls, off_nadir_deg: float = OFF_NADIR_DEG, *, size: int = SIZE, ascending: bool = False) -> Self:
+    def over_ankara(cls, off_nadir_deg: float, *, size: int) -> Self:
         """Aim the camera at the scene from a circular orbit, by a roll; a positive one looks to the right.
 
         A smaller `size` has larger pixels, so that the frame covers the same ground.
@@ -132,9 +132,8 @@ class Snapshot:
         up = ground / np.linalg.norm(ground)
         east = np.cross([0.0, 0.0, 1.0], up)
         east /= np.linalg.norm(east)
-        # cos(inclination) = cos(latitude) sin(azimuth) gives the azimuth of the track.
-        sine = np.cos(np.radians(INCLINATION_DEG)) / np.linalg.norm(up[:2])
-        azimuth = np.arcsin(sine) if ascending else np.pi - np.arcsin(sine)
+        # cos(inclination) = cos(latitude) sin(azimuth) gives the azimuth of the track, which descends.
+        azimuth = np.pi - np.arcsin(np.cos(np.radians(INCLINATION_DEG)) / np.linalg.norm(up[:2]))
         along = np.cos(azimuth) * np.cross(up, east) + np.sin(azimuth) * east
         radius, roll = EARTH_A + ALTITUDE, np.radians(off_nadir_deg)
         earth_angle = np.arcsin(radius * np.sin(roll) / np.linalg.norm(ground)) - roll

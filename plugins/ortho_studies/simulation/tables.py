@@ -155,7 +155,7 @@ def make_document(
     numbers: Sequence[Number],
     found: ArrayLike,
     titles: Mapping[Any, str],
-    statements: Sequence[Statement] = (),
+    statements: Sequence[Statement],
     curves: Sequence[Curve] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
