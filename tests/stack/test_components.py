@@ -93,7 +93,11 @@ def test_the_variance_of_a_single_value_is_the_mean_of_both_axes() -> None:
 
 def test_what_loops_lack_is_shared_by_two_dates() -> None:
     errors = dataclasses.replace(components(), constant=np.array([-0.08, 0.03]))
-    np.testing.assert_allclose(errors.of_seasons, [0.04, 0.0])
+    np.testing.assert_allclose(errors.of_seasons(np.full(5, 0.3)), [0.04, 0.0])
+    # Of most edges three times as much is stated as of the quietest one.
+    np.testing.assert_allclose(errors.of_seasons(np.array([0.3, 0.9, 0.9])), [0.36, 0.0])
+    none = dataclasses.replace(components(), constant=np.zeros(2))
+    np.testing.assert_array_equal(none.of_seasons(np.zeros(5)), [0.0, 0.0])
 
 
 def test_correlations_and_classes_of_places_by_hand() -> None:

@@ -195,6 +195,6 @@ def test_the_variance_of_a_value_is_the_sum_of_all_that_errs() -> None:
             assert of_date[edge, place] == pytest.approx(noise[0] * value + noise[1:].sum())
             wanted = (2.0, 5.0)[edge] * (rest[0] * value + rest[1:].sum()) + 0.2 + (0.09, 0.0)[edge]
             assert of_edge[edge, place] == pytest.approx(wanted)
-    np.testing.assert_allclose(made.of_seasons, [0.0, 0.0])
+    np.testing.assert_allclose(made.of_seasons(np.array([0.7, 0.8])), [0.0, 0.0])
     less = ErrorComponents(shared, own, np.ones(3), np.ones(2), np.array([-0.4, 0.3]))
-    np.testing.assert_allclose(less.of_seasons, [0.2, 0.0])
+    np.testing.assert_allclose(less.of_seasons(np.array([0.8, 0.8])), [0.2, 0.0])

@@ -164,7 +164,8 @@ def _referred(
 ) -> AdjustedStack:
     """Return a stack with its datum."""
     changes = CommonChanges(solved.left(years), solved.edges, solved.trends, solved.components, cells.place, years)
-    found = solved.network.with_seasons(solved.components.of_seasons, changes.yearly_variances(), years)
+    of_seasons = solved.components.of_seasons(solved.edges.alike[solved.trends.good])
+    found = solved.network.with_seasons(of_seasons, changes.yearly_variances(), years)
     drift = changes.drift(motion.touched(cells), solved.linked(years))
     found = found.with_drift(drift.rate, drift.variance, drift.time)
     motion = replace(motion, sigma=np.hypot(motion.sigma, np.sqrt(drift.variance)))

@@ -65,10 +65,19 @@ class ErrorComponents:
     factor: Array
     constant: Array
 
-    @property
-    def of_seasons(self) -> Array:
-        """Variance ``(2,)`` of a date's error that closes all loops: the part of the stated error that loops lack."""
-        return np.asarray(np.maximum(-self.constant, 0.0) / 2)
+    def of_seasons(self, stated: Array) -> Array:
+        """Return the variance ``(2,)`` of a date's error that closes all loops: the stated error that loops lack.
+
+        The constant cannot take more from edges than the quietest one states. As large a part of the typical error
+        belongs to dates: edges between seasons have this error, and they are noisier than those within one.
+
+        Parameters
+        ----------
+        stated : (E,)
+            Standard deviations of errors that all values of an edge share.
+        """
+        lacking, least = np.maximum(-self.constant, 0.0), float(stated.min(initial=np.inf))
+        return np.asarray(lacking * (np.median(stated) / least) ** 2 / 2) if lacking.any() else lacking
 
     def at_place(self, edges: Edges) -> tuple[Array, Array]:
         """Return variances of single values ``(E, K)``, mean of both axes: in units of a date's scale, and own."""
