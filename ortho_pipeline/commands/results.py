@@ -75,10 +75,10 @@ class FitResult:
 
     scene: Scene
     fit: Fit
-    warnings: tuple[Notice, ...] = ()
-    removed: tuple[Removed, ...] = ()
-    near: float | None = None
-    matched: Matched | None = None
+    warnings: tuple[Notice, ...]
+    removed: tuple[Removed, ...]
+    near: float | None
+    matched: Matched | None
 
     @property
     def matching(self) -> MatchingRecord | None:
@@ -134,7 +134,7 @@ class CompareResult:
 
     scene: Scene
     comparison: ComparisonRecord
-    matched: Matched | None = None
+    matched: Matched | None
     files: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:

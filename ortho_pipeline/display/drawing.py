@@ -88,7 +88,7 @@ class Drawing:
     width: float
     height: float
     label: str
-    name: str = "plot"
+    name: str
     items: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
 
     def line(self, kind: str, x1: float, y1: float, x2: float, y2: float) -> None:

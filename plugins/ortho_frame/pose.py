@@ -18,8 +18,8 @@ class Pose:
     geographic: bool
     position: tuple[float, float, float]
     angles: tuple[float, float, float]
-    crs: str | None = None
-    camera: str | None = None
+    crs: str | None
+    camera: str | None
 
 
 @dataclass(frozen=True)

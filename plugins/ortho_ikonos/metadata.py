@@ -137,7 +137,7 @@ class MapPlacement:
     upper_left: tuple[float, float] | None
     pixel: tuple[float, float] | None
     size: tuple[int, int] | None
-    reference_height: float | None = None
+    reference_height: float | None
 
     def completed_by(self, other: MapPlacement) -> MapPlacement:
         """Return this placement with missing values taken from another."""

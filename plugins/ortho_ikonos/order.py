@@ -116,8 +116,8 @@ class Position:
     corner: tuple[float, float] | None
     pixel: tuple[float, float] | None
     reference_height: float | None
-    warnings: tuple[Notice, ...] = ()
-    sources: tuple[Path, ...] = ()
+    warnings: tuple[Notice, ...]
+    sources: tuple[Path, ...]
 
     def place_of(self, other: Position) -> tuple[float, float, float] | None:
         """Return column and row of the first corner of another image in this, and its pixels' width; None: unknown."""

@@ -38,7 +38,7 @@ class LabelGroup:
     """A group of a label: texts and lists of texts by key, and groups by name, with the file and its own place."""
 
     file: str
-    path: str = ""
+    path: str
     values: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
     groups: Mapping[str, LabelGroup] = field(default_factory=dict)
 

@@ -103,8 +103,8 @@ class RecordedFolder:
     """
 
     place: str
-    allow_network: bool = False
-    rebuild: bool = False
+    allow_network: bool
+    rebuild: bool
 
     @property
     def is_far(self) -> bool:

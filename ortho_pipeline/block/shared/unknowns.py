@@ -24,9 +24,9 @@ _FIRST_ROUNDS = 1
 class SharedUnknowns:
     """An error of known ground, the heights of a DEM with their errors, and parameters that images share."""
 
-    error: BlockCommonError | None = None
-    heights: Heights | None = None
-    priors: SharedPriors | None = None
+    error: BlockCommonError | None
+    heights: Heights | None
+    priors: SharedPriors | None
 
     def applied(self, problem: BlockProblem) -> BlockProblem:
         """Return the problem with the estimates of the error and of shared parameters."""

@@ -48,7 +48,7 @@ class Known:
     unknown: tuple[str, ...]
     assumptions: tuple[str, ...]
     adjusted: bool
-    common: float = 0.0
+    common: float
 
 
 def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:

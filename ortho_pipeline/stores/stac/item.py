@@ -77,8 +77,8 @@ class Item:
     address: str
     id: str
     assets: tuple[Asset, ...]
-    boxes: tuple[Box, ...] = ()
-    date: float = 0.0
+    boxes: tuple[Box, ...]
+    date: float
 
     def image(self, key: str = "") -> Asset:
         """Return the raster that an image or a reference is read from.

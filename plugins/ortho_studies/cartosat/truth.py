@@ -62,7 +62,7 @@ class RpcBias:
 
     col: float
     row: float
-    row_per_col: float = 0.0
+    row_per_col: float
     row_per_row: float = 0.0
     col_per_row: float = 0.0
 
