@@ -46,8 +46,8 @@ class ExportedImage:
     path: str
     model: str
     size: tuple[int, int]
-    bands: int
-    nodata: float | None
+    bands: int = 1
+    nodata: float | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class BlockExport:
     pairs: Sequence[ImagePair]
     resolution: float
     crs: str
-    elevation: str | None
+    elevation: str | None = None
 
 
 def pairs_of(images: Mapping[str, tuple[SensorModel, tuple[int, int]]], height: float) -> list[ImagePair]:

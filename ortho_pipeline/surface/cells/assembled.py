@@ -64,10 +64,10 @@ class SeaCell:
 def open_cells(
     source: Source,
     extents: Iterable[Extent],
-    vertical: Vertical | str | None,
-    override: bool,
-    fill: str | float,
-    memory: int,
+    vertical: Vertical | str | None = None,
+    override: bool = False,
+    fill: str | float = "error",
+    memory: int = 512_000_000,
 ) -> DemSurface:
     """Return the cells under some extents as a DEM.
 
