@@ -165,7 +165,8 @@ def images(given: argparse.Namespace, seed: int) -> dict[str, Any]:
     return {
         "seed": seed, "dates": given.dates, "side": given.side, "pairs": len(status),
         **{one.replace(" ", "_"): status.count(one) for one in ("accepted", "rejected", "not matched", "untested")},
-        "wrong": sum(wrong), "wrong_found": sum(map(lambda one, bad: one == "rejected" and bad, status, wrong)),
+        "wrong": sum(wrong),
+        "wrong_found": sum(one == "rejected" and bad for one, bad in zip(status, wrong, strict=True)),
         **_of(found - true, kept), "of": int(kept.sum()),
         "spread": float(np.sqrt(((errors / sigma[known]) ** 2).mean())),
         **{f"{name}_{key}": value for name, each in usual.items() for key, value in _of(each - true, kept).items()},

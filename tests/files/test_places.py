@@ -162,7 +162,7 @@ def test_credentials_are_seen_however_often_they_are_encoded(times: int) -> None
 
 def test_a_closed_network_is_opened_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     for key in (*locations._CLOSED, *locations._PATIENT):
-        monkeypatch.setenv(key, "")  # what is missing is forgotten only if it was set here
+        monkeypatch.setenv(key, "")  # monkeypatch restores only what it has set or deleted
         monkeypatch.delenv(key)
     monkeypatch.setattr(locations, "_closed_with", {})
     monkeypatch.setattr(locations, "count_gdal", lambda: None)

@@ -40,7 +40,7 @@ class Drift:
     rate : (2,)
         px a year along columns and rows.
     variance : (2,)
-        Of the rate. The covariance of the network does not contain it.
+        Variance of the rate. It is no part of the network's covariance.
     time : (T,)
         Years from the mean of the dates that have a link with a reference, or of all; 0 of a date without a time.
     """

@@ -69,7 +69,7 @@ class ErrorComponents:
         """Return the variance ``(2,)`` of a date's error that closes all loops: the stated error that loops lack.
 
         The constant cannot take more from edges than the quietest one states. As large a part of the typical error
-        belongs to dates: edges between seasons have this error, and they are noisier than those within one.
+        belongs to dates: edges between seasons have this error, and they are noisier than edges within one season.
 
         Parameters
         ----------
@@ -215,23 +215,21 @@ class _Shapes:
 
     def _sums(self, pairs: list[tuple[int, int, float]]) -> tuple[Array, Array, Array]:
         """Return expected sums ``(classes, 7)`` per unit of variance, those seen ``(classes, 2)``, and numbers."""
-        number_of = len(_CLASSES) + 1
-        expected, seen, number = np.zeros((number_of, _TERMS)), np.zeros((number_of, 2)), np.zeros(number_of)
-        if not pairs:
-            return expected, seen, number
-        one, other = np.array([pair[:2] for pair in pairs]).T
+        count = len(_CLASSES) + 1
+        expected, seen = np.zeros((count, _TERMS)), np.zeros((count, 2))
+        one, other = np.array([pair[:2] for pair in pairs], dtype=int).reshape(-1, 2).T
         sign, trends, root = np.array([pair[2] for pair in pairs]), self.trends, np.sqrt(self.edges.relative)
         used, there = trends.used[one].astype(float), trends.used[other].astype(float)  # (P, K)
         many = used.T @ there
+        number = np.asarray(np.bincount(self.classes.ravel(), many.ravel(), count), dtype=float)
         for axis in (0, 1):
             product = (sign[:, None] * self.left[one, :, axis]).T @ self.left[other, :, axis]
-            seen[:, axis] = np.bincount(self.classes.ravel(), product.ravel(), number_of)
+            seen[:, axis] = np.bincount(self.classes.ravel(), product.ravel(), count)
         before, behind = (trends.weights[end].transpose(0, 2, 1) for end in (one, other))  # (P, m, K)
         rows, columns = (which[:, None, :] * trends.design.T for which in (used, there))
-        for place in range(number_of):
-            # A trend takes parts of its rows and columns from the products of a class, the same for all kernels.
-            here = (self.classes == place).astype(float)
-            number[place] = (here * many).sum()
+        for kind in range(count):
+            # The trends of both edges take a part of the products of a class. It is the same for all kernels.
+            here = (self.classes == kind).astype(float)
             left, right = rows @ here * there[:, None, :], columns @ here * used[:, None, :]
             left = left - (left @ columns.transpose(0, 2, 1)) @ behind
             parts = (
@@ -239,9 +237,9 @@ class _Shapes:
                 - np.tensordot(before, left, ((0, 1), (0, 1)))
                 - np.tensordot(right, behind, ((0, 1), (0, 1)))
             )
-            expected[place, 1:] = (self.correlations * parts).sum(axis=(1, 2))
+            expected[kind, 1:] = (self.correlations * parts).sum(axis=(1, 2))
             single = here.diagonal() * used * there - (before * left).sum(axis=1) - (right * behind).sum(axis=1)
-            expected[place, 0] = (root[one] * root[other] * single).sum()
+            expected[kind, 0] = (root[one] * root[other] * single).sum()
         return expected, seen, number
 
 

@@ -8,6 +8,7 @@ ones. Nothing shows whether these errors change from date to date or with the se
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,16 +100,21 @@ class Left:
         """Which places ``(K,)`` enough edges see."""
         return np.asarray((self.weight > 0).sum(axis=0) >= _FEWEST)
 
-    @property
+    @functools.cached_property
     def noisier(self) -> Array:
         """By how much the variance of each place ``(K,)`` is larger than the one of most."""
-        return _noisier(_by_place(self.value), _by_place(self.weight))
+        return _noisier(*self._placed)
+
+    @functools.cached_property
+    def _placed(self) -> tuple[Array, Array]:
+        """Values ``(K, 2, E)`` and weights ``(K, E)``."""
+        return _by_place(self.value), _by_place(self.weight)
 
     def change(self, form: Array) -> tuple[Array, Array, Array]:
         """Return how much of a form ``(T,)`` each place has ``(K, 2)``, its variance ``(K,)`` and what is left."""
         apart = form[self.first] - form[self.second]
         shares, of_dates = self.shares(form)
-        value, weight, part = _by_place(self.value), _by_place(self.weight), _by_place(shares)
+        (value, weight), part = self._placed, _by_place(shares)
         size = np.einsum("ke,kce->kc", part, value)
         for _ in range(_CLIPPED):
             # A cloud that was matched at a few dates must not look like motion.

@@ -82,8 +82,12 @@ class Network:
     part: NDArray[np.int_]
 
     def relative_to(self, weights: Array, terms: int = 3) -> Network:
-        """Return corrections of which the mean with weights ``(T,)``, with a sum of 1, is zero: the shift alone (1 of
-        the `terms`), or slopes too (3).
+        """Return corrections of which the mean with weights ``(T,)``, with a sum of 1, is zero.
+
+        Parameters
+        ----------
+        terms : int
+            1: the mean of the shifts; 3: that of the slopes, too.
         """
         dates, value = len(self.value), self.value.copy()
         value[:, :terms] -= np.einsum("t,tmc->mc", weights, value[:, :terms])

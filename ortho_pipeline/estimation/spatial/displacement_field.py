@@ -206,7 +206,7 @@ class DisplacementField:
         for axis, one in enumerate(self.axes):
             kernel, ratio = one.best
             noise = _noise(inside, np.ones(len(inside)), self.side)
-            variance = noise + one.ratios[ratio] * self._covariance(one.kernels[kernel], inside, inside)
+            variance = noise + one.ratios[ratio] * _covariance(one.kernels[kernel], self._distance(inside, inside))
             root = linalg.cholesky(variance, lower=True)
             columns = np.column_stack([_design(inside), along, value[:, axis]])
             white = linalg.solve_triangular(root, columns, lower=True)
@@ -245,9 +245,8 @@ class DisplacementField:
         both = np.array(found)
         return both[:, 0], both[:, 1]
 
-    def _covariance(self, kernel: tuple[int, float], one: Array, other: Array) -> Array:
-        family, length = kernel
-        return np.asarray(FAMILIES[family](_between_chips(spatial.distance.cdist(one, other), self.side) / length))
+    def _distance(self, one: Array, other: Array) -> Array:
+        return _between_chips(spatial.distance.cdist(one, other), self.side)
 
     @functools.cached_property
     def _own_noise(self) -> Array:
@@ -255,12 +254,11 @@ class DisplacementField:
 
     @functools.cached_property
     def _own_distance(self) -> Array:
-        return _between_chips(spatial.distance.cdist(self.place, self.place), self.side)
+        return self._distance(self.place, self.place)
 
     def _whitened(self, kernel: tuple[int, float], ratio: float) -> Callable[[Array], Array]:
         """Return the function that whitens columns."""
-        family, length = kernel
-        root = linalg.cholesky(self._own_noise + ratio * FAMILIES[family](self._own_distance / length), lower=True)
+        root = linalg.cholesky(self._own_noise + ratio * _covariance(kernel, self._own_distance), lower=True)
         return lambda columns: np.asarray(linalg.solve_triangular(root, columns, lower=True))
 
     def _kriged(
@@ -276,14 +274,14 @@ class DisplacementField:
         """Return the mean ``(m,)`` of the field of an axis at places, and a root of its covariance over the noise's."""
         white, terms = self._whitened(kernel, ratio), 3 if slopes else 1
         design, value = white(_design(self.place)[:, :terms]), white(self.value[:, axis])
-        across = white(ratio * self._covariance(kernel, self.place, place))
+        across = white(ratio * _covariance(kernel, self._distance(self.place, place)))
         normal = linalg.cho_factor(design.T @ design)
         trend = linalg.cho_solve(normal, design.T @ value)
         left = _design(place)[:, :terms] - across.T @ design
         mean = across.T @ value + left @ trend
         if not root:
             return mean, np.zeros((0, 0))
-        covariance = ratio * self._covariance(kernel, place, place) - across.T @ across
+        covariance = ratio * _covariance(kernel, self._distance(place, place)) - across.T @ across
         covariance += left @ linalg.cho_solve(normal, left.T)
         values, vectors = np.linalg.eigh(covariance)
         return mean, vectors * np.sqrt(np.maximum(values, 0.0))
@@ -327,6 +325,11 @@ def _on_a_line(place: Array) -> bool:
 
 def _design(place: Array) -> Array:
     return np.column_stack([np.ones(len(place)), place])
+
+
+def _covariance(kernel: tuple[int, float], distance: Array) -> Array:
+    family, length = kernel
+    return np.asarray(FAMILIES[family](distance / length))
 
 
 def _between_chips(distance: Array, side: float) -> Array:

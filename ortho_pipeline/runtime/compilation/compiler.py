@@ -22,7 +22,7 @@ from ortho_pipeline.runtime.compilation.marked import Marked
 
 log = logging.getLogger(__name__)
 
-#: C never calls a kernel, and Python none that is inlined: making what such calls need took a fifth of the time.
+#: C calls no kernel, and Python calls no inlined one. Wrappers for such calls took a fifth of the time of compiling.
 _njit = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True)
 
 
