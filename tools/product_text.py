@@ -17,6 +17,7 @@ Nothing is imported; the files are read as text.
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import sys
 from collections import defaultdict
@@ -109,8 +110,13 @@ class Shown(NamedTuple):
         return [sentence for sentence in self.sentences() if words.length(sentence) > words.NEARLY_ALL]
 
 
-def shown(root: Path) -> Iterator[Shown]:
-    """Yield all texts of a checkout."""
+@functools.cache
+def shown(root: Path) -> tuple[Shown, ...]:
+    """Return all texts of a checkout, read once: that takes some seconds."""
+    return tuple(_shown(root))
+
+
+def _shown(root: Path) -> Iterator[Shown]:
     for folder in ("ortho_pipeline", "plugins"):
         for path in sorted((root / folder).rglob("*")):
             reader = READERS.get(path.suffix)
@@ -159,10 +165,10 @@ def _strings(node: ast.AST, kind: str) -> Iterator[tuple[str, int, str]]:
             kind = "message"
         case ast.FunctionDef() | ast.ClassDef() | ast.AsyncFunctionDef():
             text = ast.get_docstring(node)
-            if text and any(_name(one).endswith(".command") for one in node.decorator_list):
+            if text and any(_name(one) == "command" for one in node.decorator_list):
                 yield "help", node.lineno, text
         case ast.Call():
-            name = _name(node).rpartition(".")[2]
+            name = _name(node)
             if name in _SILENT:
                 return
             kind = _KINDS.get(name, "message" if name.endswith("Error") else kind)
@@ -183,8 +189,9 @@ _KINDS = {"Notice": "notice", "Option": "help", "option": "help", "reads": "reme
 
 
 def _name(node: ast.AST) -> str:
-    """Return the dotted name of a call, or of a decorator."""
-    return ast.unparse(node.func if isinstance(node, ast.Call) else node)
+    """Return the name of a call or of a decorator, without what is before its last dot."""
+    node = node.func if isinstance(node, ast.Call) else node
+    return str(getattr(node, "attr", getattr(node, "id", "")))
 
 
 def _text(node: ast.AST) -> str | None:
