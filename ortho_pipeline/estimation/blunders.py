@@ -23,7 +23,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import DegeneratePoints, NotConverged, TooFewPoints
 from ortho_pipeline.errors.texts import counted
-from ortho_pipeline.estimation.problem import Problem, Solution
+from ortho_pipeline.estimation.problem import SCALE_FLOOR, Problem, Solution
 from ortho_pipeline.estimation.regularisation import regularised
 from ortho_pipeline.estimation.statistics import chance_of, left_out, rms, squared_distances
 from ortho_pipeline.files.json.records import Record
@@ -51,8 +51,6 @@ _OWN_PLACE = 3
 _MEDIAN_OF_TWO = 2 * math.log(2)
 #: If a larger share of the control points is rejected, this is an error.
 REJECTED_LIMIT = 0.3
-#: Lower limit of the scale in tests, as a part of the stated sigma (for noise-free simulations).
-SCALE_FLOOR = 1e-3
 #: A point with a smaller determinant of its redundancy is not tested.
 _TESTABLE = 1e-6
 #: Error of a point without an image (px): its square is still finite.
@@ -258,7 +256,7 @@ def _chance(problem: Problem, keep: np.ndarray) -> tuple[Array, Array]:
     except (DegeneratePoints, TooFewPoints):
         return np.ones(len(keep)), np.zeros(len(keep))
     apart = _Apart.of(solution, problem)
-    scale = max(solution.sigma0 or 0.0, SCALE_FLOOR)
+    scale = 1.0 if solution.sigma0 is None else max(solution.sigma0, SCALE_FLOOR)
     return chance_of(apart.squares / scale**2, 2, max(solution.freedom, 1.0)), np.hypot(*apart.miss.T)
 
 

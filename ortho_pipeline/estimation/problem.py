@@ -5,18 +5,24 @@ block :math:`\Sigma = C + G S G^T` for each point (`ImageErrors`): C of the meas
 by the partials G of the start. Each `Prior`, and each constraint of the model (`SensorModel.constraints`), is a further
 observation. The estimate minimises :math:`v^T W v`. Then
 
-- redundancy :math:`r` = observations - parameters, :math:`\sigma_0^2 = v^T W v / r`,
+- redundancy :math:`r` = image observations - parameters, :math:`\sigma_0^2 = v^T W v / r` of the image observations,
 - covariance :math:`C = \sigma_0^2 (J^T W J)^{-1}` (a-priori :math:`\sigma_0 = 1` where :math:`r = 0`),
 - leave-one-out residual of point i, without a refit: :math:`R_{ii}^{-1} v_i` with the 2 x 2 block
   :math:`R_{ii} = I - J_i (J^T W J)^{-1} J_i^T W_i` of the redundancy matrix (exact for models linear in their
   parameters). Points of one group (`Points.groups`) share errors and are left out together; then :math:`R_{ii}` is that
   of the group.
 
-Pseudo-observations of zero (regularisation) and soft constraints of a model are fictitious: they do not count in
-:math:`v^T W v`. The effective number of parameters, the trace of the hat matrix of the true observations, replaces the
-number of parameters. Otherwise constraints that are never violated would make every sigma too small.
+Pseudo-observations do not count in :math:`\sigma_0`. The effective number of parameters, the trace of the hat matrix of
+the image observations, replaces the number of parameters. Otherwise constraints that are never violated would make
+every sigma too small.
 
-Source: Cook and Weisberg 1982 (leave-one-out); Hansen 1998 (regularisation, effective degrees of freedom).
+:math:`\sigma_0` is the factor by which stated image errors are wrong. Priors and measured constraints of a model have
+other sources, so their sigmas stay as stated: their weights are multiplied by :math:`\sigma_0^2`, and the problem is
+solved again until it settles. Weights of fictitious pseudo-observations (regularisation, soft constraints) are relative
+to those of the points.
+
+Source: Cook and Weisberg 1982 (leave-one-out); Hansen 1998 (regularisation, effective degrees of freedom); Rao 1973,
+section 4j (a variance from the residuals of one group of observations).
 """
 
 from __future__ import annotations
@@ -41,14 +47,20 @@ from ortho_pipeline.points import Points
 CONDITION_LIMIT = 1e6
 #: A point with less redundancy than this in some direction is indispensable.
 INDISPENSABLE = 1e-9
+#: Lower limit of sigma0 in tests and in weights (for noise-free simulations).
+SCALE_FLOOR = 1e-3
+#: sigma0 is settled if it changes by less than this part.
+_SETTLED, _ROUNDS = 1e-3, 30
+#: With priors and a smaller redundancy, points can fit by chance, and priors would no longer count.
+_FEWEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Solution of the problem; `jacobian` ``(n, 2, P)`` and `residuals` ``(n, 2)`` px belong to the control points.
 
-    `freedom` is the number of observations minus that of (effective) parameters; `condition` is the condition number of
-    the design without regularisation; `groups` ``(n,)`` are those of `Points`.
+    `freedom` is the number of image observations minus that of (effective) parameters; `condition` is the condition
+    number of the design without regularisation; `groups` ``(n,)`` are those of `Points`.
     """
 
     model: SensorModel
@@ -64,7 +76,7 @@ class Solution:
 
     @property
     def redundancy(self) -> int:
-        """Number of observations minus parameters, rounded down."""
+        """Number of image observations minus effective parameters, rounded down."""
         return math.floor(self.freedom + 1e-6)
 
     def redundancy_blocks(self) -> Array:
@@ -152,13 +164,28 @@ class Problem:
 
         With `linear`, only one step of the linearised problem; the model stays unchanged.
         """
+        solution = stated = self._solved(keep, 1.0, linear=linear)
+        if not self.priors and self.model.constraints().fictitious.all():
+            return solution
+        scale = 1.0
+        for _ in range(_ROUNDS):
+            if solution.sigma0 is None or solution.freedom < _FEWEST:
+                return replace(stated, sigma0=None)
+            last, scale = scale, max(solution.sigma0, SCALE_FLOOR)
+            if abs(scale - last) <= _SETTLED * last:
+                break
+            solution = replace(self, model=solution.model)._solved(keep, scale, linear=linear)
+        return replace(solution, sigma0=scale)
+
+    def _solved(self, keep: np.ndarray, scale: float, *, linear: bool) -> Solution:
+        """Adjust with priors whose sigmas are those of points of a sigma0 of `scale`."""
         ground, image, errors = self.ground[keep], self.image[keep], self.errors[keep]
         count = len(self.model.params)
         self._enough(len(ground))
-        model = self._adjusted(ground, image, errors) if count and not linear else self.model
+        model = self._adjusted(ground, image, errors, scale) if count and not linear else self.model
         residuals = image - model.ground_to_image(ground)
         jacobian = model.param_partials(ground) if count else np.zeros((len(ground), 2, 0))
-        believed, rows, true = self._pseudo(model)
+        believed, rows = self._pseudo(model, scale)
         data = errors.whitened(jacobian).reshape(2 * len(ground), count)
         design = np.vstack([data, rows])
         solved = solve_linear(design, np.concatenate([errors.whitened(residuals).ravel(), believed]), refine=False)
@@ -166,9 +193,8 @@ class Problem:
         self._determined(solved.condition)
         if linear:
             residuals = residuals - jacobian @ solved.values
-            believed = believed - rows @ solved.values
-        observed = np.concatenate([errors.whitened(residuals).ravel(), believed[true]])
-        effective = effective_parameters(count, [(rows[~true], solved.cofactors)])
+        observed = errors.whitened(residuals).ravel()
+        effective = effective_parameters(count, [(rows, solved.cofactors)])
         freedom = len(observed) - effective
         # A redundancy below one observation gives no sigma0.
         sigma0 = unit_weight(float(observed @ observed), freedom, 1 - 1e-6)
@@ -208,12 +234,9 @@ class Problem:
                 remedy="spread the points over the image (for 3D models also over height), or use a simpler model",
             )
 
-    def _pseudo(self, model: SensorModel) -> tuple[Array, Array, np.ndarray]:
-        """Return misclosures and design rows of the model's constraints, the priors and the regularisation.
-
-        The last value is the mask of true observations among them.
-        """
-        wanted = [(name, prior.mean, prior.sigma) for name, prior in self.priors.items()]
+    def _pseudo(self, model: SensorModel, scale: float) -> tuple[Array, Array]:
+        """Return misclosures and design rows of the model's constraints, the priors and the regularisation."""
+        wanted = [(name, prior.mean, prior.sigma / scale) for name, prior in self.priors.items()]
         wanted += [(name, 0.0, sigma) for name, sigma in self.ridge.items()]
         own = model.constraints()
         index = {name: k for k, name in enumerate(model.param_names)}
@@ -223,24 +246,23 @@ class Problem:
         for i, (name, mean, sigma) in enumerate(wanted):
             rows[i, index[name]] = 1.0 / sigma
             believed[i] = (mean - params[index[name]]) / sigma
-        scaled = own.jacobian / own.sigma[:, None]
-        true = np.concatenate([~own.fictitious, np.arange(len(wanted)) < len(self.priors)])
-        return np.concatenate([own.residuals / own.sigma, believed]), np.vstack([scaled, rows]), true
+        sigma = np.where(own.fictitious, own.sigma, own.sigma / scale)
+        return np.concatenate([own.residuals / sigma, believed]), np.vstack([own.jacobian / sigma[:, None], rows])
 
-    def _adjusted(self, ground: Array, image: Array, errors: ImageErrors) -> SensorModel:
+    def _adjusted(self, ground: Array, image: Array, errors: ImageErrors, scale: float) -> SensorModel:
         start = self.model
         origin = start.params
 
         def misfit(params: Array) -> Array:
             model = start.with_params(params)
             return np.concatenate(
-                [errors.whitened(image - model.ground_to_image(ground)).ravel(), self._pseudo(model)[0]]
+                [errors.whitened(image - model.ground_to_image(ground)).ravel(), self._pseudo(model, scale)[0]]
             )
 
         def slopes(params: Array) -> Array:
             model = start.with_params(params)
             image_part = errors.whitened(model.param_partials(ground))
-            return np.vstack([image_part.reshape(-1, len(params)), self._pseudo(model)[1]])
+            return np.vstack([image_part.reshape(-1, len(params)), self._pseudo(model, scale)[1]])
 
         # If the start is nearly singular, the iteration would only wander: raise the error at once.
         self._determined(condition_of(slopes(origin)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tracemalloc
 
 import numpy as np
@@ -152,10 +153,35 @@ def test_priors_are_observations(rpc):
     tight = fit(start(rpc), points, priors={"col_shift": Prior(0.0, 1e-6)}, robust=False)
     assert abs(tight.values[0]) < 1e-9
     assert tight.values[1] == pytest.approx(free.values[1], abs=1e-9)
-    equal = fit(start(rpc), points, priors={"col_shift": Prior(0.0, 0.5)}, robust=False)
-    # Four observations of sigma 1 against one of sigma 0.5: equal weights.
-    assert equal.values[0] == pytest.approx(free.values[0] / 2, abs=1e-9)
-    assert equal.redundancy == free.redundancy + 1
+
+
+@pytest.mark.parametrize("noise", [0.2, 1.0, 3.0])
+def test_a_prior_keeps_its_sigma_whatever_the_points_show(rpc, noise):
+    """Four points of a stated sigma of 1 are as good as their residuals say; the prior is as good as stated."""
+    points = make_points(rpc, count=4, noise=noise)
+    free = fit(start(rpc), points, robust=False)
+    mean = free.values[0] - 0.3
+    found = fit(start(rpc), points, priors={"col_shift": Prior(mean, 0.5)}, robust=False)
+    weights = np.array([4 / found.sigma0**2, 0.5**-2])
+    assert found.values[0] == pytest.approx(weights @ [free.values[0], mean] / weights.sum(), abs=2e-3 * 0.3)
+    assert found.sigmas[0] == pytest.approx(weights.sum() ** -0.5, rel=2e-3)
+    assert found.sigmas[1] == pytest.approx(found.sigma0 / 2, rel=2e-3)
+    # The prior has a part of the column shift: the points have that much more redundancy.
+    freedom = free.degrees_of_freedom + weights[1] / weights.sum()
+    assert found.degrees_of_freedom == pytest.approx(freedom, abs=2e-3)
+    squares = (found.residuals[found.used] ** 2).sum()
+    assert found.sigma0 == pytest.approx(math.sqrt(squares / freedom), rel=2e-3)
+
+
+def test_with_few_points_and_priors_stated_sigmas_hold(rpc):
+    """Two points of three that nearly agree by chance would otherwise outweigh any prior."""
+    points = make_points(rpc, "affine", count=3, noise=0.3)
+    known = {name: Prior(0.0, 9.0) for name in start(rpc, "affine").param_names}
+    found = fit(start(rpc, "affine"), points, priors=known, robust=False)
+    assert found.sigma0 is None
+    partials = found.model.param_partials(found.points.ground)
+    information = np.einsum("nip,niq->pq", partials, partials) + np.eye(6) / 81
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-6, atol=1e-15)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.5, 20.0])
@@ -166,13 +192,13 @@ def test_constraints_of_a_model_are_observations(rpc, sigma):
         def constraints(self) -> Constraints:
             return Constraints(np.array([1.0 - self.params[0]]), np.array([[1.0, 0.0]]), np.array([sigma]))
 
-    points = make_points(rpc, count=4)
+    points = make_points(rpc, count=4, noise=0.5)
     free = fit(start(rpc), points, robust=False)
     found = fit(Observed(rpc, "shift", (500, 400), start(rpc).coefficients), points, robust=False)
-    weights = np.array([4.0, sigma**-2])
-    assert found.values[0] == pytest.approx(weights @ [free.values[0], 1.0] / weights.sum(), abs=1e-9)
+    weights = np.array([4 / found.sigma0**2, sigma**-2])
+    assert found.values[0] == pytest.approx(weights @ [free.values[0], 1.0] / weights.sum(), rel=2e-3)
     assert found.values[1] == pytest.approx(free.values[1], abs=1e-9)
-    assert found.redundancy == free.redundancy + 1
+    assert found.degrees_of_freedom == pytest.approx(free.degrees_of_freedom + weights[1] / weights.sum(), abs=2e-3)
 
 
 def test_a_prior_for_nothing_is_refused(rpc):

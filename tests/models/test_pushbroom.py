@@ -374,7 +374,7 @@ def test_a_circle_about_the_earth_meets_its_constraints() -> None:
     assert np.abs(bent.residuals / bent.sigma).max() > 5
 
 
-def test_what_is_measured_counts_and_what_is_fictitious_does_not() -> None:
+def test_what_is_known_without_points_leaves_them_redundancy() -> None:
     camera = scanner(5)
     points = points_of(*sample(camera, 12, 5, noise=0.5))
     soft = fit(metadata_start(camera), points, robust=False)
@@ -385,8 +385,11 @@ def test_what_is_measured_counts_and_what_is_fictitious_does_not() -> None:
     assert soft.degrees_of_freedom < held.degrees_of_freedom < soft.degrees_of_freedom + 1
     tables = exact(camera, position_sigma=0.5, angle_sigma=1e-5, splines=SplineForm(3, 2, 4)).freed("path", "attitude")
     hard = fit(tables, points, robust=False)
-    assert not tables.constraints().fictitious.any()
-    assert hard.redundancy == 24 + len(tables.constraints()) - len(tables.params)
+    own = hard.model.constraints()
+    assert not own.fictitious.any()
+    rows = own.jacobian / own.sigma[:, None]
+    seen = 24 - len(tables.params) + np.trace(rows @ hard.covariance @ rows.T)
+    assert hard.degrees_of_freedom == pytest.approx(seen, abs=0.01)
 
 
 def test_tables_hold_the_coefficients_that_they_observe() -> None:
