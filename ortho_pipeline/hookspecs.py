@@ -118,8 +118,8 @@ class Scene:
         What users must know before they trust the result. A `Notice` has its own code.
     priors : mapping of str to Prior
         How well parameters of the first model with parameters (`adjustable`) are known, in their units. With
-        ``--correction model`` they are observations like the control points. With ``shared=True``, all images of a
-        block with this prior have one value.
+        ``--correction model`` they are observations like the control points. Images of a block whose priors have
+        the same text in ``shared``, such as a camera, have one value.
     rasters : tuple of path
         Files of the same size whose bands the ortho stacks, in this order; default: the image alone.
     pieces : tuple of Piece

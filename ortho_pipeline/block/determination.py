@@ -80,9 +80,13 @@ def uncertain_images(solved: Solved, stated: BlockPoints, whole: Cofactors | Non
     Points count as measured as they were `stated` even where they turned out better: constraints of the models are
     stated too, and bound what is known of the images. The warning has sigmas of the `whole` covariance, which contains
     errors that all points share.
+
+    Without control, priors of all parameters say where images are, such as positions by GNSS. They may be worse than
+    any measurement, so corners of such images are compared with their own points.
     """
     problem = solved.problem
     found, held = [], any(one.held for one in problem.pseudo)
+    control, priors = problem.placed[solved.linear.ordering.grounded].any(), [one.column for one in problem.pseudo]
     for image, model in enumerate(solved.state.models):
         used = solved.linear.ordering.rays_of_image[image]
         if not len(model.params) or not len(used):
@@ -94,6 +98,8 @@ def uncertain_images(solved: Solved, stated: BlockPoints, whole: Cofactors | Non
         sigma = max(measured, float(np.median(stated.sigma_image[of_image])))
         inside = float(np.sqrt(np.median(_variances(partials, cofactors)))) * measured / sigma
         name = problem.points.images[image]
+        if not control and np.isin(problem.columns.of_image(image), priors).all():
+            sigma, inside = sigma * max(inside, 1.0), min(inside, 1.0)
         if inside > EXTRAPOLATION_LIMIT and not held:
             raise DegeneratePoints(
                 f"the points do not determine the image {name!r}: at them, its position is {inside:.0f} times less "

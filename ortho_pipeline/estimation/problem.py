@@ -246,8 +246,8 @@ class Problem:
         for i, (name, mean, sigma) in enumerate(wanted):
             rows[i, index[name]] = 1.0 / sigma
             believed[i] = (mean - params[index[name]]) / sigma
-        sigma = np.where(own.fictitious, own.sigma, own.sigma / scale)
-        return np.concatenate([own.residuals / sigma, believed]), np.vstack([own.jacobian / sigma[:, None], rows])
+        sigmas = np.where(own.fictitious, own.sigma, own.sigma / scale)
+        return np.concatenate([own.residuals / sigmas, believed]), np.vstack([own.jacobian / sigmas[:, None], rows])
 
     def _adjusted(self, ground: Array, image: Array, errors: ImageErrors, scale: float) -> SensorModel:
         start = self.model

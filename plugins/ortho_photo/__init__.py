@@ -85,7 +85,12 @@ def open_scene(
     camera = camera_of(tags, *size, _width(sensor_width))
     stated = vertical or pose.datum or UNKNOWN
     model = _model(camera.interior, pose, stated, heights, tags)
-    priors = _priors(model, pose, camera, stated, sigmas, calibrate == "yes")
+    priors = _priors(model, pose, stated, sigmas)
+    if calibrate == "yes":
+        shared = _camera_name(tags, model.interior)
+        priors |= {
+            name: Prior(float(getattr(model.interior, name)), sigma, shared) for name, sigma in camera.sigmas.items()
+        }
     model = replace(model, free=tuple(priors))
     if not (model.sees_ground and pose.tilt_deg < FLATTEST_DEG):
         other = HORIZON if pose.convention == NADIR else NADIR
@@ -129,22 +134,22 @@ def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> 
     return height_range(text)
 
 
-def _priors(
-    model: FrameCamera, pose: PhotoPose, camera: PhotoCamera, stated: str, sigmas: str | None, calibrate: bool
-) -> dict[str, Prior]:
-    """Return what is known of the pose and, to `calibrate`, of the camera, which all photos of a block share."""
+def _priors(model: FrameCamera, pose: PhotoPose, stated: str, sigmas: str | None) -> dict[str, Prior]:
+    """Return what is known of the pose."""
     (plan, height), angle = pose.sigmas, ANGLE
     if sigmas is not None:
         plan, angle = pose_sigmas(sigmas)
         height = plan
     height = math.hypot(height, DATUM_SIGMA) if stated == UNKNOWN else height
-    priors = priors_at(model, {**exterior_sigmas(plan, math.radians(angle)), "Z_L": height})
-    if calibrate:
-        priors |= {
-            name: Prior(float(getattr(model.interior, name)), sigma, shared=True)
-            for name, sigma in camera.sigmas.items()
-        }
-    return priors
+    return priors_at(model, {**exterior_sigmas(plan, math.radians(angle)), "Z_L": height})
+
+
+def _camera_name(tags: Tags, interior: Interior) -> str:
+    """Return what tells a camera from others whose lenses are as well known: a block estimates each of them."""
+    named = (tags.text("Make", "tiff:Make"), tags.text("Model", "tiff:Model"))
+    numbers = [tags.text(name) for name in ("BodySerialNumber", "drone-dji:CameraSerialNumber")]
+    focal = interior.focal_length / interior.pitch_x
+    return " ".join([*named, *numbers, f"{interior.width} x {interior.height}, {focal:.6g} px"])
 
 
 def _unknown_datum(pose: PhotoPose) -> Notice:

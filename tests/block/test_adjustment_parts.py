@@ -81,7 +81,7 @@ def test_priors_are_observations_of_the_columns_of_their_images(flown: Block, po
     models = [ImageCorrection.identity(one.model, kind, ORIGIN) for one, kind in
               zip(flown.start.values(), kinds, strict=True)]  # fmt: skip
     names = models[0].param_names, models[2].param_names
-    priors = {"i0": {names[0][4]: Prior(3.0, 0.5), names[0][1]: Prior(-1.0, 0.2, shared=True)},
+    priors = {"i0": {names[0][4]: Prior(3.0, 0.5), names[0][1]: Prior(-1.0, 0.2, shared="camera")},
               "i2": {names[1][3]: Prior(7.0, 2.0)}}  # fmt: skip
     found = pseudo_of(models, points, priors)
     assert [(one.column, one.mean, one.held, one.slow) for one in found] == [

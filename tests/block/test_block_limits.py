@@ -185,6 +185,22 @@ def test_an_uncertain_image_is_said_from_ten_and_refused_from_a_hundred_measurem
     )
 
 
+def test_an_image_that_is_placed_by_its_priors_is_as_uncertain_as_these(flown: Block) -> None:
+    """A position of GNSS is hundreds of times less accurate than ties: that refuses no image and warns of none."""
+    problem, state, selection = _prepared(tuple(flown.start.values()), flown.points, {}, ())
+    linear = Linear.at(problem, state, selection)
+    cofactors = SimpleNamespace(of_image=lambda image: np.eye(2) * 15.0**2)
+    for count, refused in ((problem.size, False), (problem.size - 1, True)):
+        pseudo = tuple(Pseudo(column, 0.0, 15.0) for column in range(count))
+        solved: Any = SimpleNamespace(problem=replace(problem, pseudo=pseudo), linear=linear, state=state,
+                                      cofactors=cofactors)  # fmt: skip
+        if refused:
+            with pytest.raises(DegeneratePoints, match="150 times less"):
+                uncertain_images(solved, problem.points)
+        else:
+            assert uncertain_images(solved, problem.points) == []
+
+
 def rays_of(folder: Path, *rows: str) -> Path:
     path = folder / "rays.csv"
     path.write_text("id,image,col,row,x,y,h\n" + "\n".join(rows) + "\n")

@@ -287,7 +287,7 @@ def test_a_shared_parameter_is_published_in_its_unit() -> None:
     for weak, known in ((0.04, False), (0.06, True)):
         told = np.diag([3.0, weak / (1 - weak)])
         parameters = tuple(
-            SharedParameter(name, ("i0", "i1"), Prior(mean, sigma, shared=True), (0, 3))
+            SharedParameter(name, ("i0", "i1"), Prior(mean, sigma, shared="camera"), (0, 3))
             for name, mean, sigma in (("f", 100.0, 2.0), ("k1", 0.0, 0.5))
         )
         made = SharedPriors(

@@ -109,7 +109,7 @@ def check_dem(found: AdjustedDem | None, common: CommonHeights, mixed: np.ndarra
 @pytest.mark.parametrize("with_dem", [False, True])
 def test_a_shared_parameter_is_one_unknown(flown: Block, tmp_path: Path, with_dem: bool) -> None:
     """Two images share the column of a shift, the third has its own; heights of a DEM err together, too."""
-    shared, apart = Prior(1.0, 3.0, shared=True), Prior(0.5, 2.0, shared=True)
+    shared, apart = Prior(1.0, 3.0, shared="one camera"), Prior(0.5, 2.0, shared="another")
     name, other = flown.start["i0"].param_names
     priors: dict[str, dict[str, Prior]] = {
         "i0": {name: shared}, "i1": {name: shared, other: Prior(0.0, 4.0)}, "i2": {name: apart},

@@ -175,9 +175,16 @@ def test_photos_share_the_camera_with_sigmas_of_its_source(tmp_path):
     lens = ("focal_length", "x0", "y0", "k1", "k2", "k3", "p1", "p2")
     for scene, focal, k1 in ((nominal, 0.02, 0.03), (calibrated, 0.005, 0.01)):
         assert scene.model.param_names[6:] == lens
-        assert all(scene.priors[name].shared == (name in lens) for name in scene.model.param_names)
+        assert all(bool(scene.priors[name].shared) == (name in lens) for name in scene.model.param_names)
         assert scene.priors["focal_length"].sigma == pytest.approx(focal * scene.model.interior.focal_length)
         assert scene.priors["k1"].sigma == k1
+    # Other cameras have other lenses, even where as much is known of them.
+    same = opened(photo(tmp_path / "same.tif"), calibrate="yes")
+    assert same.priors["k1"] == nominal.priors["k1"]
+    for other in (EXIF | {"Model": "FC330"}, EXIF | {"BodySerialNumber": "2"}, EXIF | {"FocalLength": "(9.1)"}):
+        k1 = opened(photo(tmp_path / "other.tif", other), calibrate="yes").priors["k1"]
+        assert (k1.mean, k1.sigma) == (0.0, 0.03)
+        assert k1 != nominal.priors["k1"]
     fixed = opened(tmp_path / "a.tif", calibrate="no")
     assert fixed.model.param_names == ("X_L", "Y_L", "Z_L", "omega", "phi", "kappa")
 

@@ -18,18 +18,19 @@ class Prior:
     ----------
     mean, sigma : float
         Expected value and its standard deviation.
-    shared : bool
-        All images of a block with this prior have the same value of the parameter, as photos of one camera.
+    shared : str
+        What the value belongs to, such as a camera. Images of a block with the same prior and the same text have one
+        value. Empty: each image has its own.
 
     Examples
     --------
     >>> Prior(0.0, sigma=0.01)
-    Prior(mean=0.0, sigma=0.01, shared=False)
+    Prior(mean=0.0, sigma=0.01, shared='')
     """
 
     mean: float
     sigma: float
-    shared: bool = False
+    shared: str = ""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and self.sigma > 0):
@@ -51,7 +52,7 @@ def priors_at(model: SensorModel, sigmas: Mapping[str, float]) -> dict[str, Prio
     --------
     >>> model = op.ImageCorrection.identity(op.read_rpc("sample_data/scene_RPC.TXT"), "shift", (500, 500))
     >>> priors_at(model, {"col_shift": 2.0})
-    {'col_shift': Prior(mean=0.0, sigma=2.0, shared=False)}
+    {'col_shift': Prior(mean=0.0, sigma=2.0, shared='')}
     """
     values = dict(zip(model.param_names, model.params.tolist(), strict=True))
     return {name: Prior(values[name], sigma) for name, sigma in sigmas.items()}
