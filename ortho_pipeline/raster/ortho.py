@@ -20,6 +20,7 @@ from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster.pixel_types import holds, pixel_type
 from ortho_pipeline.raster.source import Grid, RasterSource
+from ortho_pipeline.raster.stored_crs import stored_wkt
 from ortho_pipeline.raster.verified_writing import abandon, check_written, checked_options, close, gdal_errors
 from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
 
@@ -296,7 +297,7 @@ class RasterWriter:
             creation = [] if path is None else [f"{k}={v}" for k, v in options.items()]
             dataset = gdal.GetDriverByName(driver).Create(where, grid.width, grid.height, profile.count, code, creation)
             failed.callback(abandon, dataset)
-            dataset.SetProjection(grid.crs.to_wkt())
+            dataset.SetProjection(stored_wkt(grid))
             dataset.SetGeoTransform(grid.geotransform)
             dataset.SetMetadataItem("AREA_OR_POINT", "Area")
             for key, value in profile.metadata.items():

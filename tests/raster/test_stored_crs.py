@@ -1,0 +1,55 @@
+"""Files whose place is read back with PROJ: systems that GeoTIFF keys hold, and those that they do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.errors import CrsError
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid
+
+
+def grid_at(crs: str, lon: float, lat: float, size: float = 10.0) -> Grid:
+    system = pyproj.CRS(crs)
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True).transform(lon, lat)
+    return Grid(system, x, y, size, size, 40, 30)
+
+
+def write(path: Path, grid: Grid, driver: str) -> None:
+    with RasterWriter(path, grid, Profile(1, np.dtype("u1"), "nodata", 0.0), driver=driver) as writer:
+        writer.write(0, 0, np.full((1, 30, 40), 7, dtype="u1"), None)
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "COG"])
+@pytest.mark.parametrize(
+    ("crs", "lon", "lat"),
+    [
+        ("EPSG:32636", 33.1, 37.1), ("EPSG:4326", 33.1, 37.1), ("EPSG:3035", 10.0, 50.0),
+        ("EPSG:32636+5773", 33.1, 37.1),
+        ("+proj=aeqd +lat_0=37 +lon_0=33", 33.1, 37.1), ("ESRI:102429", 0.0, 50.0), ("EPSG:27704", 10.0, 50.0),
+        ("EPSG:2180", 19.0, 52.0), ("EPSG:5514", 15.0, 50.0), ("EPSG:2056", 8.0, 47.0), ("EPSG:3413", -45.0, 80.0),
+    ],
+)  # fmt: skip
+def test_a_file_has_the_place_of_its_grid(tmp_path: Path, crs: str, lon: float, lat: float, driver: str) -> None:
+    """Azimuthal equidistant grids were thousands of kilometres off in the file, without a word."""
+    size = 1e-4 if crs == "EPSG:4326" else 10.0
+    write(tmp_path / "a.tif", grid_at(crs, lon, lat, size), driver)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+    dataset = gdal.Open(str(tmp_path / "a.tif"))
+    left, _, _, top, _, _ = dataset.GetGeoTransform()
+    found = pyproj.CRS.from_wkt(dataset.GetProjection())
+    place = pyproj.Transformer.from_crs(found, "EPSG:4326", always_xy=True).transform(left, top)
+    np.testing.assert_allclose(place[:2], (lon, lat), atol=1e-6)
+
+
+@pytest.mark.parametrize(("crs", "lon", "lat"), [("EPSG:8857", 10.0, 50.0), ("EPSG:9311", -100.0, 40.0)])
+def test_a_crs_that_no_file_gives_back_is_refused(tmp_path: Path, crs: str, lon: float, lat: float) -> None:
+    with pytest.raises(CrsError, match=crs) as caught:
+        write(tmp_path / "a.tif", grid_at(crs, lon, lat), "GTiff")
+    assert caught.value.field == "output.crs"
+    assert not [*tmp_path.iterdir()]
