@@ -21,11 +21,10 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import families
 from ortho_pipeline.options import PathLike, SceneOptions
 from ortho_pipeline.raster import source as raster
+from ortho_pipeline.raster.verified_writing import ATTACHED
 
 #: Sidecar files that GDAL attaches to an image of this stem, whatever the image itself contains.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
-#: The same, after the whole name of the image.
-ATTACHED = (".aux.xml", ".ovr", ".msk")
 #: Name of the "sensor" of an image that has no model of its own.
 POINTS_ONLY = "points only"
 

@@ -21,7 +21,14 @@ from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.raster.pixel_types import holds, pixel_type
 from ortho_pipeline.raster.source import Grid, RasterSource
 from ortho_pipeline.raster.stored_crs import stored_wkt
-from ortho_pipeline.raster.verified_writing import abandon, check_written, checked_options, close, gdal_errors
+from ortho_pipeline.raster.verified_writing import (
+    abandon,
+    check_written,
+    checked_options,
+    close,
+    gdal_errors,
+    retire_attached,
+)
 from ortho_pipeline.runtime.process_limits import Progress, claim_gdal_threads
 
 #: Bytes up to which a raster that is going to be copied is kept in memory instead of in a file.
@@ -244,6 +251,7 @@ class RasterWriter:
     def __enter__(self) -> RasterWriter:
         with contextlib.ExitStack() as stack:
             self._temporary = stack.enter_context(whole_or_nothing(self.path))
+            retire_attached(self.path)
             if self.driver == "COG":
                 # The COG driver copies a finished raster: overviews come before the pixels in the file.
                 size = self.grid.width * self.grid.height * self.profile.count * self.profile.dtype.itemsize

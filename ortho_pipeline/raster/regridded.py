@@ -87,7 +87,7 @@ class Regridded:
         self.path, self._grid, self._resampling = path, grid, resampling
         self._memory, self._local = memory, threading.local()
         self._source = RasterSource(path, memory=memory, **access)
-        self._own = grid_of(path)
+        self._own = grid_of(path, **access)
         self._check_overlap()
         self._offset = _offset(grid, self._own)
 

@@ -23,10 +23,12 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.files import whole_or_nothing
+from ortho_pipeline.files import retire, whole_or_nothing
 from ortho_pipeline.files.locations import VsiPath
 from ortho_pipeline.raster.source import first_line, open_dataset
 
+#: Files of statistics, overviews and masks, after the whole name of a raster: GDAL attaches them to it.
+ATTACHED = (".aux.xml", ".ovr", ".msk")
 #: Blocks of a file that are read again before it gets its name.
 _SAMPLES = 12
 
@@ -38,7 +40,8 @@ _SAMPLES = 12
 def raster_output(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path for a raster that GDAL writes; the raster appears at `path` when it is complete.
 
-    Close it with `close` or `written` within the block. Masks are written into the file itself.
+    Close it with `close` or `written` within the block. Masks are written into the file itself. Statistics, overviews
+    and masks of a raster that was there before go with it.
 
     Raises
     ------
@@ -46,10 +49,16 @@ def raster_output(path: str | os.PathLike[str]) -> Iterator[Path]:
         If it cannot be written, or cannot be read again.
     """
     with whole_or_nothing(path) as temporary:
+        retire_attached(path)
         with gdal_errors(path):
             yield temporary
         if temporary.suffix.lower() != ".vrt":
             check_written(temporary, path)
+
+
+def retire_attached(path: str | os.PathLike[str]) -> None:
+    """Let statistics, overviews and masks go when the raster that is being written gets its name: they are old."""
+    retire(f"{os.fspath(path)}{ending}" for ending in ATTACHED)
 
 
 @contextlib.contextmanager

@@ -235,3 +235,23 @@ def test_an_extent_is_widened_to_multiples_of_the_resolution():
         turned = [value + 100.0 * (k == side) * (1 if side < 2 else -1) for k, value in enumerate(grid.extent)]
         with pytest.raises(InputError, match="is not an extent"):
             Grid.of_extent(crs, turned, (2.0, 5.0))
+
+
+@pytest.mark.parametrize("driver", ["GTiff", "COG"])
+def test_statistics_overviews_and_masks_go_with_the_raster_that_is_replaced(tmp_path, driver):
+    """GDAL would show the picture of the old raster in the new one when it is zoomed out."""
+    path, grid = tmp_path / "a.tif", Grid(parse_crs("EPSG:32636"), 5e5, 4.1e6, 10.0, 10.0, 64, 48)
+    profile = Profile(1, np.dtype("u1"), "nodata", 0.0)
+    for value in (200, 40):
+        with RasterWriter(path, grid, profile, driver=driver) as writer:
+            writer.write(0, 0, np.full((1, 48, 64), value, dtype="u1"), None)
+        dataset = gdal.Open(str(path))
+        assert dataset.GetRasterBand(1).GetStatistics(False, False)[:2] in ([0.0, 0.0], [value, value])
+        overview = dataset.GetRasterBand(1).GetOverview(0)
+        assert overview is None or (overview.ReadAsArray() == value).all()
+        assert [one.name for one in tmp_path.iterdir()] == ["a.tif"]
+        dataset.GetRasterBand(1).ComputeStatistics(False)
+        dataset.BuildOverviews("NEAREST", [2])
+        dataset = None
+        assert len([*tmp_path.iterdir()]) > 1
+        (tmp_path / "a.tif.msk").write_bytes(b"")

@@ -161,3 +161,12 @@ def test_bounds_in_another_crs_hold_the_whole_grid() -> None:
     lon, lat = way.transform(*GRID.xy(*np.meshgrid(np.linspace(0, 60, 21), np.linspace(0, 40, 21))))
     wanted = (lon.min(), lat.min(), lon.max(), lat.max())
     assert warped_bounds(GRID, parse_crs("EPSG:4326")) == pytest.approx(wanted, abs=1e-7)
+
+
+def test_a_file_that_refers_to_another_folder_is_read_where_that_is_allowed(ortho: Path, tmp_path: Path) -> None:
+    gdal.BuildVRT(str(tmp_path / "a.vrt"), [str(ortho)])
+    with pytest.raises(InputError, match="outside"):
+        Regridded(tmp_path / "a.vrt", GRID)
+    pixels, valid = Regridded(tmp_path / "a.vrt", GRID, roots=(ortho.parent,)).read(0, 0, 60, 40)
+    np.testing.assert_array_equal(np.where(valid, pixels, 0.0), np.where(valid, middles(GRID), 0.0))
+    assert valid.sum() == 2 * 60 * 40 - 1
