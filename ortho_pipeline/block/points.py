@@ -35,6 +35,8 @@ from ortho_pipeline.points.rows import ROLES
 
 #: Two statements of one point's ground are the same within this (degrees or metres): files round.
 SAME_PLACE = 1e-9
+#: The same for two tables, which may be in different systems: a millimetre on a map, and in degrees.
+_MILLIMETRE = 1e-3, 1e-8
 Index = NDArray[np.int64]
 
 
@@ -307,14 +309,18 @@ def _joined(tables: Mapping[str, Points]) -> BlockPoints:
         raise InputError("no images with points; a block needs some", field="points")
     crs = next(iter(tables.values())).crs
     index, first, rays = dict[str, int](), list[tuple[Points, int]](), list[tuple[int, int]]()
+    sigmas = list[list[Array]]()
     for number, (name, table) in enumerate(tables.items()):
         moved = table if same_crs(table.crs, crs) else table.to_crs(crs)
         for k, one in enumerate(moved.ids):
             row = index.setdefault(one, len(index))
+            own = [moved.sigma_ground[k], moved.sigma_common[k]]
             if row == len(first):
                 first.append((moved, k))
+                sigmas.append(own)
             else:
                 _agree(one, name, *first[row], moved, k)
+                sigmas[row] = [_stated(one, name, moved, *both) for both in zip(sigmas[row], own, strict=True)]
             rays.append((row, number))
 
     def stated(what: str) -> Any:
@@ -325,7 +331,7 @@ def _joined(tables: Mapping[str, Points]) -> BlockPoints:
         ids=tuple(index),
         ground=np.reshape(stated("ground"), (-1, 3)),
         roles=np.array(stated("roles"), "<U7"),
-        sigma_ground=np.reshape(stated("sigma_ground"), (-1, 3)),
+        sigma_ground=np.reshape([ground for ground, _ in sigmas], (-1, 3)),
         crs=crs,
         images=tuple(tables),
         point=places[:, 0],
@@ -334,7 +340,7 @@ def _joined(tables: Mapping[str, Points]) -> BlockPoints:
         sigma_image=np.concatenate([table.sigma_image for table in tables.values()]),
         source=", ".join(dict.fromkeys(table.source for table in tables.values() if table.source)),
         shape_image=shape_of(np.concatenate([table.covariance_image for table in tables.values()])),
-        sigma_common=np.array(stated("sigma_common")),
+        sigma_common=np.array([common for _, common in sigmas]),
         groups=np.concatenate([table.groups for table in tables.values()]),
     )
 
@@ -401,10 +407,11 @@ def joined(images: Sequence[str], tables: Sequence[BlockPoints]) -> BlockPoints:
 
 def _agree(one: str, name: str, first: Points, row: int, table: Points, k: int) -> None:
     """Refuse two statements of one point, in rows of two tables, that differ."""
-    for what, same in (
-        ("role", first.roles[row] == table.roles[k]),
-        ("ground", np.allclose(first.ground[row], table.ground[k], rtol=0, atol=SAME_PLACE, equal_nan=True)),
-    ):
+    height, degree = _MILLIMETRE
+    plan = degree if first.crs.is_geographic else height
+    limit = np.array([plan, plan, height])
+    near = np.isclose(first.ground[row] / limit, table.ground[k] / limit, rtol=0, atol=1, equal_nan=True)
+    for what, same in (("role", first.roles[row] == table.roles[k]), ("ground", near.all())):
         if not same:
             raise InputError(
                 f"the {what} of the point {one!r} differs in the image {name!r}",
@@ -412,6 +419,18 @@ def _agree(one: str, name: str, first: Points, row: int, table: Points, k: int) 
                 field="role" if what == "role" else "x, y, h",
                 remedy="points with the same id must have the same ground and role",
             )
+
+
+def _stated(one: str, name: str, table: Points, before: Array, sigma: Array) -> Array:
+    """Return a standard deviation of a point that a table states, and others may leave out (0)."""
+    if np.any((before > 0) & (sigma > 0) & (before != sigma)):
+        raise InputError(
+            f"the accuracy of the point {one!r} differs in the image {name!r}",
+            file=table.source or None,
+            field="sigma_ground",
+            remedy="points with the same id must have the same sigmas, or state them once",
+        )
+    return np.maximum(before, sigma)
 
 
 def shape_of(covariance: Array) -> Array | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -162,8 +163,8 @@ def test_tables_of_images_are_joined_value_by_value() -> None:
         BlockPoints.of({})
 
 
-@pytest.mark.parametrize(("apart", "same"), [(0.9e-9, True), (-0.9e-9, True), (1.1e-9, False), (-1.1e-9, False)])
-def test_two_tables_agree_in_a_place_to_a_billionth(apart: float, same: bool) -> None:
+@pytest.mark.parametrize(("apart", "same"), [(0.9e-8, True), (-0.9e-8, True), (1.1e-8, False), (-1.1e-8, False)])
+def test_two_tables_agree_in_a_place_to_a_millimetre(apart: float, same: bool) -> None:
     tables = {name: Points.of([[1.0, 2.0]], [[0.25 + by, 0.5, math.nan]], "EPSG:4979") for name, by in
               (("a", 0.0), ("b", apart))}  # fmt: skip
     if same:
@@ -171,6 +172,33 @@ def test_two_tables_agree_in_a_place_to_a_billionth(apart: float, same: bool) ->
         return
     with pytest.raises(InputError, match="the ground of the point '1' differs in the image 'b'"):
         BlockPoints.of(tables)
+
+
+def test_tables_of_two_zones_state_one_place() -> None:
+    """Coordinates of a map have seven digits before the point, so their transformation cannot agree to a billionth."""
+    east = np.array([[500_000.0, 4_100_000.0, 10.0], [500_333.3, 4_100_777.7, 20.0]])
+    west = np.column_stack([*pyproj.Transformer.from_crs(32636, 32635).transform(*east[:, :2].T), east[:, 2]])
+    image = [[1.0, 2.0], [3.0, 4.0]]
+    found = BlockPoints.of({"a": Points.of(image, east, "EPSG:32636"), "b": Points.of(image, west, "EPSG:32635")})
+    np.testing.assert_array_equal(found.ground, east)
+    west[1, 2] += 1.1e-3
+    with pytest.raises(InputError, match="the ground of the point '2' differs in the image 'b'"):
+        BlockPoints.of({"a": Points.of(image, east, "EPSG:32636"), "b": Points.of(image, west, "EPSG:32635")})
+
+
+def test_one_table_may_leave_out_the_accuracy_that_another_states() -> None:
+    """The order of the tables decided before whether it counted."""
+    image, ground = [[1.0, 2.0], [3.0, 4.0]], [[0.2, 0.5, 1.0], [0.3, 0.6, 2.0]]
+    stated = Points.of(image, ground, "EPSG:4979", sigma_ground=[[0.1, 0.1, 0.3]] * 2)
+    stated = dataclasses.replace(stated, sigma_common=np.array([0.0, 0.7]))
+    tables = {"a": Points.of(image, ground, "EPSG:4979"), "b": stated}
+    for names in ("ab", "ba"):
+        found = BlockPoints.of({name: tables[name] for name in names})
+        assert found.sigma_ground.tolist() == [[0.1, 0.1, 0.3]] * 2
+        assert found.sigma_common.tolist() == [0.0, 0.7]
+    other = Points.of(image, ground, "EPSG:4979", sigma_ground=[[0.1, 0.1, 0.3], [0.1, 0.1, 0.2]])
+    with pytest.raises(InputError, match="the accuracy of the point '2' differs in the image 'b'"):
+        BlockPoints.of({"a": other, "b": stated})
 
 
 def test_the_point_that_was_measured_twice_and_its_image_are_named() -> None:
