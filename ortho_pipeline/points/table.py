@@ -111,6 +111,15 @@ class Points:
             if array.shape != shape:
                 raise InputError(f"{name} has the shape {array.shape}, not {shape}", field=name)
             object.__setattr__(self, name, array)
+        for name in ("sigma_image", "sigma_ground"):
+            sigma = getattr(self, name)
+            if not ((sigma >= 0) & (sigma < np.inf)).all():
+                raise InputError(
+                    "a standard deviation is negative or not finite",
+                    file=self.source or None,
+                    field=name,
+                    remedy="give a number; 0 if the ground is exact",
+                )
         sigma, covariance = reconciled(self.sigma_image, self.covariance_image)
         object.__setattr__(self, "sigma_image", sigma)
         object.__setattr__(self, "covariance_image", covariance)

@@ -125,3 +125,12 @@ def test_columns_of_errors_have_cells_only_for_points_with_such_errors(tmp_path:
     # One column has both horizontal standard deviations: the larger one.
     assert [row[8:10] for row in rows[1:]] == [["2.0", "3.0"]] * 5
     assert [row[5] for row in rows[1:]] == ["10.0", "20.0", "30.0", "40.0", ""]
+
+
+@pytest.mark.parametrize("name", ["sigma_image", "sigma_ground"])
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_a_standard_deviation_is_a_finite_number(name: str, value: float) -> None:
+    """A negative one passed as exact, and an infinite one was blamed on the place of the points."""
+    with pytest.raises(InputError, match="negative or not finite") as caught:
+        Points.of([[1.0, 2.0]], [[0.1, 0.2, 3.0]], "EPSG:4979", **{name: value})
+    assert caught.value.field == name
