@@ -201,7 +201,10 @@ def coarser(grid: Grid, factor: int, width: int, height: int) -> Grid:
 
 
 def warped_bounds(grid: Grid, crs: pyproj.CRS) -> tuple[float, float, float, float]:
-    """Return xmin, ymin, xmax and ymax of a grid in another CRS; infinite if it is nowhere there."""
+    """Return xmin, ymin, xmax and ymax of a grid in another CRS; infinite if it is nowhere there.
+
+    Across longitude 180, xmax is above 180.
+    """
     if grid.crs == crs:
         return grid.extent
     try:
@@ -209,7 +212,7 @@ def warped_bounds(grid: Grid, crs: pyproj.CRS) -> tuple[float, float, float, flo
         xmin, ymin, xmax, ymax = to_crs.transform_bounds(*grid.extent, densify_pts=21)
     except pyproj.exceptions.ProjError:
         return (math.inf,) * 4
-    return xmin, ymin, xmax, ymax
+    return xmin, ymin, xmax + 360.0 if crs.is_geographic and xmax < xmin else xmax, ymax
 
 
 def _offset(grid: Grid, own: Grid) -> tuple[int, int] | None:

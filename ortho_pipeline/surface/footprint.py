@@ -20,7 +20,8 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import share, significant
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
-from ortho_pipeline.geodesy.crs import ground_transform, utm_crs
+from ortho_pipeline.geodesy.crs import ground_transform, parse_crs, utm_crs
+from ortho_pipeline.geodesy.ellipsoid import geocentric
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -35,6 +36,8 @@ _BORDER_SIDE = 65
 _BLOCK = 1024
 #: Margin of the heights under a scene for its model: part of their range, and least margin (m).
 _MARGIN, _LEAST_MARGIN = 0.1, 10.0
+#: No map enlarges a scene so much: parts of it lie on both sides of the map.
+_TORN = 50.0
 _SOUND = Text(
     "give the metadata of this image (",
     Setting("scene.rpc", "FILE"),
@@ -405,6 +408,15 @@ def choose_grid(
             f"the scene is outside the area of {crs.name!r}", field="output.crs", remedy="choose another CRS"
         )
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
+    if not crs.is_geographic:
+        place = geocentric(ground_transform(model.crs, parse_crs("EPSG:4326"))(footprint.reach) * (1.0, 1.0, 0.0))
+        apart = (high - low)[:2] * [axis.unit_conversion_factor for axis in crs.axis_info[:2]]
+        if np.hypot(*apart) > _TORN * np.linalg.norm(np.nanmax(place, axis=0) - np.nanmin(place, axis=0)):
+            raise InputError(
+                f"the edge of {crs.name!r} crosses the scene",
+                field="output.crs",
+                remedy="choose another CRS, such as UTM",
+            )
     if (np.array(step) > (high - low)[:2]).all():
         raise InputError(
             f"a resolution of {step[0]:g} means {step[0]:g} {crs.axis_info[0].unit_name}s in {crs.name!r}; "

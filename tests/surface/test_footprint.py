@@ -302,3 +302,21 @@ def test_a_model_that_misses_the_surface_keeps_its_heights(tmp_path):
     found = laid(far, surface(tmp_path, fill="mask"))
     assert (found.coverage, found.heights) == (0.0, far.height_range)
     assert found.fitted(far) is far
+
+
+@pytest.mark.parametrize(
+    ("crs", "fits"), [("EPSG:3857", False), ("EPSG:6933", False), ("EPSG:3832", True), ("EPSG:4326", True)]
+)
+def test_a_crs_whose_edge_crosses_the_scene_is_refused(crs: str, fits: bool) -> None:
+    """The grid was as wide as the world, and its ortho would have taken hours."""
+    interior = Interior(WIDTH, HEIGHT, 0.01, 1e-5, 1e-5)
+    model = FrameCamera.from_roll_pitch_yaw(interior, [180.0, 24.0, FLYING], 0.0, 0.0, 0.0, heights=(0.0, 100.0))
+    found = laid(model, FlatSurface(GROUND))
+    step = 1e-6 if crs == "EPSG:4326" else 0.12
+    if fits:
+        grid = choose_grid(model, found, (WIDTH, HEIGHT), crs=parse_crs(crs), resolution=step)
+        assert grid.width < 2000
+        return
+    with pytest.raises(InputError, match="crosses the scene") as caught:
+        choose_grid(model, found, (WIDTH, HEIGHT), crs=parse_crs(crs), resolution=step)
+    assert caught.value.field == "output.crs"

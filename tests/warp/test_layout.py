@@ -48,6 +48,24 @@ def test_the_grid_holds_all_orthos_and_each_has_its_place(tmp_path: Path) -> Non
     assert not made.by_pixel
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_orthos_on_both_sides_of_longitude_180_lie_next_to_each_other(tmp_path: Path, order: tuple[int, ...]) -> None:
+    """Their mosaic was as wide as the world."""
+    degrees = [(179.98, 60.0), (-180.0, 60.0), (-179.98, 60.01)]
+    some = [
+        ortho(tmp_path / f"{k}.tif", lon - 5e5, lat - 5e6, (20, 10), (0.001, 0.001), crs=4326)
+        for k, (lon, lat) in enumerate(degrees)
+    ]
+    made = lay_out([some[k] for k in order], "first-on-top")
+    places = {layer.ortho.name: (layer.left, layer.top) for layer in made.layers}
+    assert places == {"0": (0, 10), "1": (20, 10), "2": (40, 0)}
+    assert (made.grid.width, made.grid.height, round(made.grid.left, 9)) == (60, 20, 179.98)
+    # Orthos all around the world stay between -180 and 180.
+    world = [ortho(tmp_path / f"w{k}.tif", lon - 5e5, -5e6, (90, 10), (1.0, 1.0), crs=4326) for k, lon in
+             enumerate((-180.0, -90.0, 0.0, 90.0))]  # fmt: skip
+    assert (lay_out(world).grid.left, lay_out(world).grid.width) == (-180.0, 360)
+
+
 def test_the_steepest_view_is_on_top_and_an_unknown_one_is_last(tmp_path: Path) -> None:
     some = [ortho(tmp_path / f"{name}.tif", 0.0, 0.0, relief=relief, accuracy=Path("x.tif"))
             for name, relief in (("a", None), ("b", 0.4), ("c", 0.1), ("d", 0.4))]  # fmt: skip

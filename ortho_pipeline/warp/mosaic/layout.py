@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +81,7 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
         orthos = sorted(
             orthos, key=lambda ortho: math.inf if ortho.relief_displacement is None else ortho.relief_displacement
         )
-    grids = [grid_of(ortho.path) for ortho in orthos]
+    grids = _beside([grid_of(ortho.path) for ortho in orthos])
     first = grids[0]
     for ortho, grid in zip(orthos, grids, strict=True):
         _check_grid(orthos[0], first, ortho, grid)
@@ -96,6 +96,18 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
         for ortho, grid in zip(orthos, grids, strict=True)
     ]
     return Mosaic(mosaic, tuple(layers), order == "most-accurate")
+
+
+def _beside(grids: list[Grid]) -> list[Grid]:
+    """Return the grids next to each other if they lie on both sides of longitude 180."""
+    if not all(grid.crs.is_geographic for grid in grids):
+        return grids
+    moved = [replace(grid, left=grid.left + (360.0 if grid.left < 0 else 0.0)) for grid in grids]
+    spans = [
+        max(grid.left + grid.width * grid.dx for grid in some) - min(grid.left for grid in some)
+        for some in (grids, moved)
+    ]
+    return moved if spans[1] < spans[0] - 1e-6 else grids
 
 
 def _check_grid(one: Ortho, first: Grid, other: Ortho, grid: Grid) -> None:
