@@ -6,6 +6,7 @@ The text formats are in `ortho_pipeline.exchange.rpc_files`.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from os import PathLike
@@ -51,6 +52,8 @@ __all__ = [
     "write_vrt",
 ]
 
+#: Corners of a chip, and how far (px) they may be from a shift and a scale: they have three decimals.
+_CORNERS, _CHIP_ROUNDING = ("11", "12", "21", "22"), 0.01
 #: Tag and sidecar that differ by more than this at the centre (px) are different models.
 DISAGREEMENT = 1.0
 
@@ -133,7 +136,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     if sidecar:
         return rpc_of_fields(*sidecar), sidecar[1]
     if tag:
-        return rpc_of_fields(tag, name), f"{name} ({_own_kind(dataset)})"
+        return _of_chip(dataset, rpc_of_fields(tag, name)), f"{name} ({_own_kind(dataset)})"
     what = "RPC" if choice is None else {"tag": "RPC tag", "sidecar": "RPC sidecar file"}[str(choice)]
     damaged = ", ".join(_unreadable_beside(place(name))) if choice != "tag" else ""
     raise InputError(
@@ -142,6 +145,34 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
         field="scene.rpc",
         remedy=Text("give the RPC file with ", Setting("scene.rpc", "FILE")),
     )
+
+
+def _of_chip(dataset: gdal.Dataset, model: RPC) -> RPC:
+    """Return the RPC of a NITF image that was cut out of another, whose pixels its RPC has (ICHIPB); GDAL ignores it.
+
+    Source: STDI-0002, appendix B: corners of the chip (OP) and of the full image (FI), both from the outer corner.
+    """
+    stated = dataset.GetMetadata() or {}
+    if not any(name.startswith("ICHIP_") for name in stated):
+        return model
+    sides: dict[str, list[float]] = {}
+    with contextlib.suppress(ValueError, KeyError):
+        for axis in ("COL", "ROW"):
+            chip, full = (
+                np.array([float(stated[f"ICHIP_{of}_{axis}_{corner}"]) for corner in _CORNERS]) for of in ("OP", "FI")
+            )
+            factor, begin = np.polyfit(chip, full, 1).tolist()
+            sides[axis] = [factor, begin, float(np.abs(factor * chip + begin - full).max())]
+    factors = [scale for scale, _, _ in sides.values()]
+    flat = len(sides) == 2 and factors[0] > 0 and abs(factors[1] / factors[0] - 1) < 1e-6
+    if not flat or max(left for _, _, left in sides.values()) > _CHIP_ROUNDING:
+        raise InputError(
+            "this image was cut out of another (ICHIPB), in a way that its RPC cannot follow",
+            file=dataset.GetDescription(),
+            field="ICHIPB",
+            remedy=Text("give an RPC of this image with ", Setting("scene.rpc", "FILE")),
+        )
+    return model.shifted(sides["COL"][1], sides["ROW"][1]).scaled(factors[0])
 
 
 def _begins_like_rpc(path: Path | VsiPath) -> bool:

@@ -803,3 +803,28 @@ def test_a_side_car_that_gdal_cannot_read_is_named(tmp_path):
     assert has_rpc(dataset)
     with pytest.raises(InputError, match="damaged or encrypted"):
         rpc_of_dataset(dataset)
+
+
+@pytest.mark.driver("NITF")
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_chip_of_a_nitf_image_has_the_rpc_of_the_whole_image(tmp_path, factor):
+    """GDAL uses the RPC as if the chip were the whole image: hundreds of pixels off, without a word."""
+    rpc, size, first = make_rpc(), 100, (60.0, 40.0)
+    corners = [(0.5, 0.5), (0.5, size - 0.5), (size - 0.5, 0.5), (size - 0.5, size - 0.5)]  # row, column
+
+    def chip(*full: tuple[float, float]) -> gdal.Dataset:
+        numbers = "".join(f"{value:012.3f}" for pair in (*corners, *full) for value in pair)
+        text = f"00{factor:010.5f}0000{numbers}{800:08d}{1000:08d}"
+        made = gdal.GetDriverByName("MEM").Create("", size, size, 1)
+        made.SetMetadata(rpc_metadata(rpc), "RPC")
+        path = str(tmp_path / "chip.ntf")
+        gdal.GetDriverByName("NITF").CreateCopy(path, made, options=[f"TRE=ICHIPB={text}", "RPC00B=YES"])
+        (tmp_path / "chip.ntf.aux.xml").unlink(missing_ok=True)
+        return gdal.Open(path)
+
+    found, _ = rpc_of_dataset(chip(*((row * factor + first[1], column * factor + first[0]) for row, column in corners)))
+    ground = rpc.image_to_ground([[first[0] + 30 * factor, first[1] + 70 * factor]], 300.0)
+    # Offsets in the file are whole pixels.
+    np.testing.assert_allclose(found.ground_to_image(ground), [[30.0, 70.0]], atol=1.0)
+    with pytest.raises(InputError, match="ICHIPB"):
+        rpc_of_dataset(chip(*((column, row) for row, column in corners)))
