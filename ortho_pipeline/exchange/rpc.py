@@ -119,7 +119,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     """
     name = dataset.GetDescription()
     if choice is not None and str(choice) not in ("tag", "sidecar"):
-        return read_rpc(choice), os.fspath(choice)
+        return _in_tile(dataset, read_rpc(choice), os.path.realpath(choice)), os.fspath(choice)
     if choice != "tag":
         _refuse_unread_sidecar(dataset)
     tag, sidecar = _own_fields(dataset), None
@@ -145,6 +145,17 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
         field="scene.rpc",
         remedy=Text("give the RPC file with ", Setting("scene.rpc", "FILE")),
     )
+
+
+def _in_tile(dataset: gdal.Dataset, model: RPC, path: str) -> RPC:
+    """Return the RPC of a given file; if it is that of the mosaic that an image is a tile of, moved as GDAL moves it."""
+    fields = _fields_beside(dataset)
+    if not fields or path not in {os.path.realpath(file) for file in _sidecar_files(dataset)}:
+        return model
+    used = rpc_of_fields(fields, path)
+    shift = np.array([model.col_off - used.col_off, model.row_off - used.row_off])
+    same = np.allclose([*model.row_num, *model.col_num], [*used.row_num, *used.col_num], rtol=1e-12, atol=0.0)
+    return used if same and np.abs(shift - np.round(shift)).max() < 1e-6 else model
 
 
 def _of_chip(dataset: gdal.Dataset, model: RPC) -> RPC:

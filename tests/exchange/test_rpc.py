@@ -828,3 +828,34 @@ def test_a_chip_of_a_nitf_image_has_the_rpc_of_the_whole_image(tmp_path, factor)
     np.testing.assert_allclose(found.ground_to_image(ground), [[30.0, 70.0]], atol=1.0)
     with pytest.raises(InputError, match="ICHIPB"):
         rpc_of_dataset(chip(*((column, row) for row, column in corners)))
+
+
+@pytest.mark.realdata
+def test_a_tile_has_its_place_in_the_mosaic_also_where_its_rpc_file_is_given(tmp_path, real):
+    """Pléiades: one RPC for all tiles. With `--rpc` the second tile was a whole tile off."""
+    (source,) = real.glob("**/RPC_PHR1A_P_*.XML")
+    name = source.stem.removeprefix("RPC_")
+    shutil.copy(source, tmp_path / source.name)
+    for column in (1, 2):
+        gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"IMG_{name}_R1C{column}.TIF"), 400, 300, 1)
+    tiles = "".join(
+        f'<Data_File tile_R="1" tile_C="{column}"><DATA_FILE_PATH href="IMG_{name}_R1C{column}.TIF"/></Data_File>'
+        for column in (1, 2)
+    )
+    (tmp_path / f"DIM_{name}.XML").write_text(
+        '<Dimap_Document><Metadata_Identification><METADATA_FORMAT version="2.0">DIMAP</METADATA_FORMAT>'
+        "<METADATA_PROFILE>PHR_SENSOR</METADATA_PROFILE></Metadata_Identification><Raster_Data><Data_Access>"
+        f"<Data_Files>{tiles}</Data_Files></Data_Access><Raster_Dimensions><NROWS>300</NROWS><NCOLS>800</NCOLS>"
+        '<NBANDS>1</NBANDS><Tile_Set><NTILES>2</NTILES><Regular_Tiling><NTILES_SIZE nrows="300" ncols="400"/>'
+        '<NTILES_COUNT ntiles_R="1" ntiles_C="2"/><OVERLAP_ROW>0</OVERLAP_ROW><OVERLAP_COL>0</OVERLAP_COL>'
+        "</Regular_Tiling></Tile_Set></Raster_Dimensions></Raster_Data></Dimap_Document>"
+    )
+    whole = read_rpc(source)
+    for column, off in ((1, 0.0), (2, 400.0)):
+        dataset = gdal.Open(str(tmp_path / f"IMG_{name}_R1C{column}.TIF"))
+        for choice in (None, tmp_path / source.name):
+            found, path = rpc_of_dataset(dataset, choice)
+            assert path == str(tmp_path / source.name)
+            assert (found.col_off, found.row_off) == pytest.approx((whole.col_off - off, whole.row_off), abs=1e-6)
+        # A file elsewhere is that of this image.
+        assert same(rpc_of_dataset(dataset, source)[0], whole)
