@@ -148,7 +148,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
 
 
 def _in_tile(dataset: gdal.Dataset, model: RPC, path: str) -> RPC:
-    """Return the RPC of a given file; if it is that of the mosaic that an image is a tile of, moved as GDAL moves it."""
+    """Return the RPC of a given file; that of the mosaic that an image is a tile of is moved, as GDAL moves it."""
     fields = _fields_beside(dataset)
     if not fields or path not in {os.path.realpath(file) for file in _sidecar_files(dataset)}:
         return model
