@@ -100,7 +100,7 @@ def open_scene(
             "Pitch",
             Text(f"if its pitch is zero at the {other}, add ", again, "; else leave this photo out"),
         )
-    warnings = [_unknown_datum(pose)] if stated == UNKNOWN else []
+    warnings = [*pose.position.notices, *([_unknown_datum(pose)] if stated == UNKNOWN else [])]
     return Scene(
         sensor="photo",
         path=tags.path,
@@ -115,12 +115,12 @@ def open_scene(
 
 
 def _model(interior: Interior, pose: PhotoPose, stated: str, heights: str | None, tags: Tags) -> FrameCamera:
-    altitude = pose.altitude
+    lon, lat, altitude = pose.position.lon, pose.position.lat, pose.position.altitude
     if stated != UNKNOWN:
-        altitude += float(Vertical.parse(stated).undulation(np.array([pose.lon]), np.array([pose.lat]))[0])
+        altitude += float(Vertical.parse(stated).undulation(np.array([lon]), np.array([lat]))[0])
     if not math.isfinite(altitude):
         raise tags.error("the height datum does not cover this position", "vertical", "give another datum")
-    place = np.array([[pose.lon, pose.lat, altitude]])
+    place = np.array([[lon, lat, altitude]])
     position, axes = geocentric(place)[0], enu_from_ecef(place)[0]
     ned_from_ecef = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]) @ axes
     ground = _heights(heights, altitude, tags.positive("drone-dji:RelativeAltitude"))
@@ -136,7 +136,7 @@ def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> 
 
 def _priors(model: FrameCamera, pose: PhotoPose, stated: str, sigmas: str | None) -> dict[str, Prior]:
     """Return what is known of the pose."""
-    (plan, height), angle = pose.sigmas, ANGLE
+    (plan, height), angle = pose.position.sigmas, ANGLE
     if sigmas is not None:
         plan, angle = pose_sigmas(sigmas)
         height = plan
@@ -158,7 +158,7 @@ def _unknown_datum(pose: PhotoPose) -> Notice:
         f"{DATUM_SIGMA:.0f} m. An adjustment with a DEM or control points estimates it. If you know the datum, add ",
         Setting("scene.sensor_options", "DATUM", key="vertical"),
     )
-    return Notice("datum-unknown", text, altitude_m=pose.altitude, sigma_m=DATUM_SIGMA)
+    return Notice("datum-unknown", text, altitude_m=pose.position.altitude, sigma_m=DATUM_SIGMA)
 
 
 def _facts(tags: Tags, pose: PhotoPose, model: FrameCamera, camera: PhotoCamera, stated: str) -> dict[str, object]:
@@ -169,12 +169,12 @@ def _facts(tags: Tags, pose: PhotoPose, model: FrameCamera, camera: PhotoCamera,
         "camera": " ".join(filter(None, (tags.text("Make", "tiff:Make"), tags.text("Model", "tiff:Model")))) or None,
         "altitude_above_takeoff_m": relative,
     }
-    plan, height = pose.sigmas
+    plan, height = pose.position.sigmas
     return {
         **{name: value for name, value in known.items() if value is not None},
-        "altitude_m": pose.altitude,
+        "altitude_m": pose.position.altitude,
         "altitude_datum": stated,
-        "positioning": f"{pose.positioning}: {plan:.3g} m in plan, {height:.3g} m in height",
+        "positioning": f"{pose.position.positioning}: {plan:.3g} m in plan, {height:.3g} m in height",
         "perspective_centre": [round(float(value), 9) for value in model.perspective_centre],
         "perspective_centre_crs": model.crs,
         "yaw_pitch_roll_deg": list(pose.angles),

@@ -18,19 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ortho_photo.position import Position, position_of
 from ortho_photo.tags import Tags
 from ortho_pipeline.plugin import Array, camera_from_platform
 
-#: Standard deviation (m) in plan and height of a position without a stated accuracy: a receiver without corrections,
-#: and a height that follows the air pressure from take-off.
-PLAN, HEIGHT = 3.0, 10.0
 #: Standard deviation (degrees) of each angle: a compass near motors.
 ANGLE = 3.0
-#: The least standard deviation (m) of a position: RTK states that of the antenna's fix, not of the time of exposure.
-LEAST = 0.02
 #: Values of the option ``pitch``.
 HORIZON, NADIR = "horizon", "nadir"
-_FIXED = 50.0
 
 
 @dataclass(frozen=True)
@@ -39,28 +34,22 @@ class PhotoPose:
 
     Parameters
     ----------
-    lon, lat, altitude : float
-        Degrees, and metres as written.
-    sigmas : (float, float)
-        Standard deviations in plan and height, m.
+    position : Position
+        Where the photo was taken.
     rotation : ndarray (3, 3)
         From north, east, down to camera axes (x right, y up, z backwards).
     angles : (float, float, float)
         Yaw, pitch, roll (degrees) as written.
     convention : {'horizon', 'nadir'}
         Where pitch is zero.
-    positioning, datum : str
-        How it was positioned; height datum that the tags state, or empty.
+    datum : str
+        Height datum that the tags state, or empty.
     """
 
-    lon: float
-    lat: float
-    altitude: float
-    sigmas: tuple[float, float]
+    position: Position
     rotation: Array
     angles: tuple[float, float, float]
     convention: str
-    positioning: str
     datum: str
 
     @property
@@ -77,12 +66,9 @@ def pose_of(tags: Tags, pitch: str | None) -> PhotoPose:
     InputError
         If position, altitude or angles are missing or impossible.
     """
-    lon, lat, altitude = _position(tags)
+    position = position_of(tags)
     angles, convention = _angles(tags, pitch)
-    sigmas, positioning = _accuracy(tags)
-    return PhotoPose(
-        lon, lat, altitude, sigmas, rotation_of(angles, convention), angles, convention, positioning, _datum(tags)
-    )
+    return PhotoPose(position, rotation_of(angles, convention), angles, convention, _datum(tags))
 
 
 def rotation_of(angles: tuple[float, float, float], convention: str) -> Array:
@@ -103,40 +89,6 @@ def rotation_of(angles: tuple[float, float, float], convention: str) -> Array:
         [[math.cos(roll), -math.sin(roll), 0.0], [math.sin(roll), math.cos(roll), 0.0], [0.0, 0.0, 1.0]]
     )
     return np.asarray(about_axis @ camera_from_platform(0.0, pitch + math.pi / 2, yaw))
-
-
-def _position(tags: Tags) -> tuple[float, float, float]:
-    lat = tags.number("drone-dji:GpsLatitude", "drone-dji:GPSLatitude", "drone-dji:Latitude")
-    # DJI wrote GpsLongtitude for years.
-    names = ("GpsLongtitude", "GpsLongitude", "GPSLongtitude", "GPSLongitude", "Longitude")
-    lon = tags.number(*(f"drone-dji:{name}" for name in names))
-    if not lat or not lon:  # 0, 0 is written without a fix
-        lat, lon = _degrees(tags, "GPSLatitude", "S"), _degrees(tags, "GPSLongitude", "W")
-    if lat is None or lon is None or (lat, lon) == (0.0, 0.0):
-        raise tags.error("this photo has no position", "GPSLatitude")
-    if not (abs(lat) <= 90 and abs(lon) <= 360):
-        raise tags.error(f"latitude {lat}, longitude {lon} is not on Earth", "GPSLatitude")
-    altitude = tags.number("drone-dji:AbsoluteAltitude")
-    if altitude is None:
-        altitude = tags.number("GPSAltitude")
-        # 1 and 3: below the reference surface.
-        if altitude is not None and tags.text("GPSAltitudeRef").lower().removeprefix("0x").lstrip("0") in ("1", "3"):
-            altitude = -altitude
-    if altitude is None:
-        raise tags.error("this photo has a position, but no altitude", "GPSAltitude")
-    if not -1000 < altitude < 100_000:
-        raise tags.error(f"an altitude of {altitude} m is impossible", "GPSAltitude")
-    return lon, lat, altitude
-
-
-def _degrees(tags: Tags, name: str, negative: str) -> float | None:
-    parts = tags.numbers(name)
-    if parts is None:
-        return None
-    if not 1 <= len(parts) <= 3:
-        raise tags.error(f"{len(parts)} numbers are not an angle", name)
-    value = sum(part / 60**power for power, part in enumerate(parts))
-    return -value if tags.text(f"{name}Ref").upper().startswith(negative) else value
 
 
 def _angles(tags: Tags, pitch: str | None) -> tuple[tuple[float, float, float], str]:
@@ -161,19 +113,6 @@ def _angles(tags: Tags, pitch: str | None) -> tuple[tuple[float, float, float], 
             roll = -roll
         return (yaw, tilt, roll), pitch or convention
     raise tags.error("this photo has no camera angles", "Yaw, Pitch, Roll")
-
-
-def _accuracy(tags: Tags) -> tuple[tuple[float, float], str]:
-    east, north = tags.positive("drone-dji:RtkStdLon"), tags.positive("drone-dji:RtkStdLat")
-    up, flag = tags.positive("drone-dji:RtkStdHgt"), tags.number("drone-dji:RtkFlag")
-    if east and north and up:
-        stated = max(east, north, LEAST), max(up, LEAST)
-        return stated, "RTK, fixed" if flag == _FIXED else "RTK, not fixed"
-    plan = tags.positive("Camera:GPSXYAccuracy", "senseFly:GPSXYAccuracy", "GPSHPositioningError")
-    height = tags.positive("Camera:GPSZAccuracy", "senseFly:GPSZAccuracy")
-    if plan:
-        return (max(plan, LEAST), max(height or max(plan, HEIGHT), LEAST)), "accuracy in the tags"
-    return (PLAN, HEIGHT), "no accuracy in the tags; assumed"
 
 
 def _datum(tags: Tags) -> str:

@@ -168,6 +168,40 @@ def test_sigmas_are_those_of_the_tags(tmp_path, tags, wanted):
     assert given.priors["kappa"].sigma == pytest.approx(math.radians(1.0))
 
 
+#: A position in DJI's XMP: that of EXIF, rounded otherwise.
+PLACED = {**DJI, "drone-dji:GpsLatitude": "39.50000004", "drone-dji:GpsLongtitude": "33.25999996"}
+#: EXIF of a program that replaced the position in EXIF alone: 30.9 m north, 7 m higher.
+REPLACED = {**EXIF, "GPSLatitude": "(39) (30) (1)", "GPSAltitude": "(1007.5)", "GPSHPositioningError": "(0.02)"}
+RTK = {"drone-dji:RtkStdLon": "0.5", "drone-dji:RtkStdLat": "0.5", "drone-dji:RtkStdHgt": "0.6"}
+
+
+@pytest.mark.parametrize(
+    ("exif", "xmp", "north", "wanted", "used"),
+    [
+        (REPLACED, PLACED, 30.9, [0.02, 0.02, 10.0], "EXIF"),
+        (REPLACED, {**PLACED, **RTK}, 0.0, [0.5, 0.5, 0.6], "DJI's XMP"),
+        ({**REPLACED, "GPSHPositioningError": "(0)"}, PLACED, 0.0, [3.0, 3.0, 10.0], "DJI's XMP"),
+        (EXIF, {**PLACED, "Camera:GPSXYAccuracy": "1.5", "Camera:GPSZAccuracy": "2"}, 0.0, [1.5, 1.5, 2.0], None),
+        (EXIF, {**PLACED, "drone-dji:AbsoluteAltitude": "990", **RTK}, 0.0, [0.5, 0.5, 0.6], "DJI's XMP"),
+        ({**EXIF, "GPSLatitude": "(x)"}, PLACED, 0.0, [3.0, 3.0, 10.0], None),
+    ],
+)
+def test_an_accuracy_counts_for_the_position_of_its_own_source(tmp_path, exif, xmp, north, wanted, used):
+    scene = opened(photo(tmp_path / "a.tif", exif, xmp))
+    assert sigmas(scene) == pytest.approx(wanted)
+    assert (scene.model.perspective_centre[1] - PLACE[1]) * METRES[1] == pytest.approx(north, abs=0.1)
+    assert [notice.fields["used"] for notice in scene.notices] == ([used] if used else [])
+    assert all(f"The position in {used} is used" in notice for notice in scene.notices)
+
+
+def test_an_ellipsoidal_height_in_exif_is_not_compared_with_djis(tmp_path):
+    scene = opened(photo(tmp_path / "a.tif", {**EXIF, "GPSAltitude": "(1030)", "GPSAltitudeRef": "0x02"}, PLACED))
+    assert scene.notices == ()
+    [notice] = opened(photo(tmp_path / "b.tif", {**EXIF, "GPSAltitude": "(1030)"}, PLACED)).notices
+    assert notice.code == "positions-differ"
+    assert notice.fields["off_m"]["height"] == pytest.approx(29.5)
+
+
 def test_photos_share_the_camera_with_sigmas_of_its_source(tmp_path):
     data = "2018-09-07;400,400,0,0,0,0,0,0,0"
     nominal = opened(photo(tmp_path / "a.tif"), calibrate="yes")
