@@ -12,22 +12,25 @@ from dataclasses import dataclass, field
 from ortho_photo.tags import Tags
 from ortho_pipeline.plugin import InputError, Interior
 
-#: Width (mm) of sensors by the model in EXIF, where it tells the camera; from the makers' specifications.
-SENSOR_MM = {
-    "FC220": 6.17,  # Mavic Pro
-    "FC300S": 6.17,  # Phantom 3 Advanced
-    "FC300X": 6.17,  # Phantom 3 Professional
-    "FC330": 6.17,  # Phantom 4
-    "FC3411": 13.2,  # Air 2S
-    "FC6310": 13.2,  # Phantom 4 Pro
-    "FC6310R": 13.2,  # Phantom 4 RTK
-    "FC6310S": 13.2,  # Phantom 4 Pro 2.0
-    "L1D-20c": 13.2,  # Mavic 2 Pro
-    "L2D-20c": 17.3,  # Mavic 3
-    "M3E": 17.3,  # Mavic 3 Enterprise
-    "ZenmuseP1": 35.9,
-    "S.O.D.A.": 12.75,
+#: Width (mm) of sensors, and columns and rows of their largest photo, by the model in EXIF, where it tells the camera;
+#: from the makers' specifications.
+SENSORS = {
+    "FC220": (6.17, 4000, 3000),  # Mavic Pro
+    "FC300S": (6.17, 4000, 3000),  # Phantom 3 Advanced
+    "FC300X": (6.17, 4000, 3000),  # Phantom 3 Professional
+    "FC330": (6.17, 4000, 3000),  # Phantom 4
+    "FC3411": (13.2, 5472, 3648),  # Air 2S
+    "FC6310": (13.2, 5472, 3648),  # Phantom 4 Pro
+    "FC6310R": (13.2, 5472, 3648),  # Phantom 4 RTK
+    "FC6310S": (13.2, 5472, 3648),  # Phantom 4 Pro 2.0
+    "L1D-20c": (13.2, 5472, 3648),  # Mavic 2 Pro
+    "L2D-20c": (17.3, 5280, 3956),  # Mavic 3
+    "M3E": (17.3, 5280, 3956),  # Mavic 3 Enterprise
+    "ZenmuseP1": (35.9, 8192, 5460),
+    "S.O.D.A.": (12.75, 5472, 3648),
 }
+#: DJI's focal length in pixels counts more than that of EXIF if they differ by more than this part.
+_ALIKE = 0.05
 #: Millimetres of a unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre.
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 #: Width (mm) of a frame of 35 mm film.
@@ -79,7 +82,7 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     InputError
         If nothing tells the focal length in pixels, the lens is a fisheye, or the photo is a crop.
     """
-    full = _full_width(tags, width, height)
+    full, full_rows = _full_size(tags, width, height)
     if tags.text("Camera:ModelType").lower() == "fisheye":
         raise tags.error(
             "the lens is a fisheye, which the model of frames cannot represent",
@@ -90,36 +93,35 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     if sensor_width is not None:
         if focal is None:
             raise tags.error("the tags have no focal length", "FocalLength", "give camera=FILE (docs/formats/frame.md)")
-        return PhotoCamera(_plain(width, height, focal / sensor_width), "sensor width of the options")
+        return PhotoCamera(_plain(width, height, focal / sensor_width * width), "sensor width of the options")
     try:
         calibrated = _dewarped(tags, width, height, full) or _of_pix4d(tags, width, height, full)
     except InputError as error:
         raise tags.error(error.message, error.field or "", _REMEDY) from error
     if calibrated is not None:
         return calibrated
-    known = SENSOR_MM.get(tags.text("Model", "tiff:Model"))
-    if focal and known:
-        return PhotoCamera(_plain(width, height, focal / known), "focal length, and a known sensor")
-    pitch = _pitch_mm(tags)
-    if focal and pitch:
-        return PhotoCamera(
-            _plain(width, height, focal / (pitch * full)), "focal length, and resolution in the focal plane"
-        )
-    nominal = tags.positive("drone-dji:CalibratedFocalLength")
+    by_sensor, nominal = (
+        _of_sensor(tags, width, height, (full, full_rows)),
+        tags.positive("drone-dji:CalibratedFocalLength"),
+    )
     if nominal:
-        return PhotoCamera(_plain(width, height, nominal / full), "nominal focal length in pixels")
+        pixels = nominal * width / full
+        if by_sensor is None or abs(pixels / by_sensor.interior.focal_length * _PIXEL - 1) > _ALIKE:
+            return PhotoCamera(_plain(width, height, pixels), "nominal focal length in pixels")
+    if by_sensor is not None:
+        return by_sensor
     film = tags.positive("FocalLengthIn35mmFilm")
     if film:
-        return PhotoCamera(_plain(width, height, film / _FILM_MM), "focal length in 35 mm film, rounded")
+        return PhotoCamera(_plain(width, height, film / _FILM_MM * width), "focal length in 35 mm film, rounded")
     model = tags.text("Model", "tiff:Model") or "unknown"
     raise tags.error(f"the size of the sensor of this camera ({model}) is not known", "sensor_width", _REMEDY)
 
 
-def _full_width(tags: Tags, width: int, height: int) -> float:
-    """Return the width of the whole photo (px): the file may be a reduced copy of it, but no crop."""
+def _full_size(tags: Tags, width: int, height: int) -> tuple[float, float]:
+    """Return the size of the whole photo (px): the file may be a reduced copy of it, but no crop."""
     full, rows = tags.positive("PixelXDimension"), tags.positive("PixelYDimension")
     if not full or not rows:
-        return float(width)
+        return float(width), float(height)
     # A reduced copy has whole pixels.
     if abs(full * height - rows * width) > max(full, rows):
         raise tags.error(
@@ -127,12 +129,29 @@ def _full_width(tags: Tags, width: int, height: int) -> float:
             "PixelXDimension",
             "give the whole photo; crops are not supported",
         )
-    return full
+    return full, rows
 
 
-def _plain(width: int, height: int, by_width: float) -> Interior:
-    """Return a camera without distortion by its focal length over the width of the sensor."""
-    return Interior(width, height, by_width * width * _PIXEL, _PIXEL, _PIXEL)
+def _plain(width: int, height: int, pixels: float) -> Interior:
+    """Return a camera without distortion by its focal length in pixels of the file."""
+    return Interior(width, height, pixels * _PIXEL, _PIXEL, _PIXEL)
+
+
+def _of_sensor(tags: Tags, width: int, height: int, full: tuple[float, float]) -> PhotoCamera | None:
+    """Return the camera by its focal length (mm), and its model or the resolution in the focal plane."""
+    focal, pitch = tags.positive("FocalLength"), _pitch_mm(tags)
+    if focal and (sensor := SENSORS.get(tags.text("Model", "tiff:Model"))):
+        sensor_mm, columns, rows = sensor
+        # A photo of another shape, as 4:3 of a sensor of 3:2, is the largest part of the sensor with this shape.
+        # A reduced copy has whole pixels, so one row more is no other shape.
+        by_rows = columns / rows
+        whole = max(full) if max(full) > (min(full) - 1) * by_rows else min(full) * by_rows
+        pixels = focal / sensor_mm * whole * width / full[0]
+        return PhotoCamera(_plain(width, height, pixels), "focal length, and a known sensor")
+    if focal and pitch:
+        pixels = focal / pitch * width / full[0]
+        return PhotoCamera(_plain(width, height, pixels), "focal length, and resolution in the focal plane")
+    return None
 
 
 def _dewarped(tags: Tags, width: int, height: int, full: float) -> PhotoCamera | None:

@@ -266,6 +266,32 @@ def test_focal_lengths_in_the_order_of_their_worth(tmp_path, exif, xmp, options,
     assert scene.facts["focal_length_px"] == pytest.approx(pixels, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("model", "size", "whole"),
+    [
+        ("FC6310R", (4864, 3648), 5472),  # 4:3 of a sensor of 3:2
+        ("FC6310R", (5472, 3078), 5472),  # 16:9
+        ("FC6310R", (3648, 5472), 5472),  # stored as a portrait
+        ("FC6310R", (608, 456), 684),  # a reduced copy of 4:3, whose tags state the size of the copy
+        ("M3E", (5280, 3956), 5280),
+    ],
+)
+def test_a_photo_of_another_shape_is_a_part_of_the_sensor(tmp_path, model, size, whole):
+    exif = {**EXIF, "Model": model, "PixelXDimension": str(size[0]), "PixelYDimension": str(size[1])}
+    width = {"FC6310R": 13.2, "M3E": 17.3}[model]
+    for reduced in (1, 8):
+        shown = (size[0] // reduced, size[1] // reduced)
+        scene = opened(photo(tmp_path / "a.tif", exif, size=shown))
+        assert scene.facts["focal_length_px"] == pytest.approx(8.8 / width * whole / reduced, abs=1e-3)
+
+
+@pytest.mark.parametrize(("stated", "pixels"), [("402", 400.0), ("450", 450.0)])
+def test_djis_focal_length_in_pixels_counts_where_the_known_sensor_contradicts_it(tmp_path, stated, pixels):
+    # Some modes show a part of the sensor.
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, "drone-dji:CalibratedFocalLength": stated}))
+    assert scene.facts["focal_length_px"] == pytest.approx(pixels, abs=1e-3)
+
+
 def test_pix4ds_camera_counts_from_the_corner(tmp_path):
     lens = {
         "Camera:PerspectiveFocalLength": "5.5",
