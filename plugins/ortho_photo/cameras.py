@@ -33,7 +33,7 @@ SENSORS = {
 _ALIKE = 0.05
 #: Millimetres of a unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre.
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-#: Width (mm) of a frame of 35 mm film.
+#: The longer side (mm) of a frame of 35 mm film.
 _FILM_MM = 36.0
 #: Standard deviations of the focal length and principal point, in parts of the focal length, and of distortion: of a
 #: maker's calibration, and of a nominal camera without distortion.
@@ -112,7 +112,8 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
         return by_sensor
     film = tags.positive("FocalLengthIn35mmFilm")
     if film:
-        return PhotoCamera(_plain(width, height, film / _FILM_MM * width), "focal length in 35 mm film, rounded")
+        pixels = film / _FILM_MM * max(width, height)
+        return PhotoCamera(_plain(width, height, pixels), "focal length in 35 mm film, rounded")
     model = tags.text("Model", "tiff:Model") or "unknown"
     raise tags.error(f"the size of the sensor of this camera ({model}) is not known", "sensor_width", _REMEDY)
 

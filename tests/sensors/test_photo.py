@@ -292,6 +292,12 @@ def test_djis_focal_length_in_pixels_counts_where_the_known_sensor_contradicts_i
     assert scene.facts["focal_length_px"] == pytest.approx(pixels, abs=1e-3)
 
 
+def test_the_focal_length_in_35_mm_film_is_of_the_longer_side(tmp_path):
+    exif = {**EXIF, "Model": "X", "PixelXDimension": "400", "PixelYDimension": "600"}
+    portrait = opened(photo(tmp_path / "a.tif", exif, size=(400, 600)))
+    assert portrait.facts["focal_length_px"] == pytest.approx(600 * 24 / 36, abs=1e-3)
+
+
 def test_pix4ds_camera_counts_from_the_corner(tmp_path):
     lens = {
         "Camera:PerspectiveFocalLength": "5.5",
