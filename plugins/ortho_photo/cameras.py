@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ortho_photo.tags import Tags
-from ortho_pipeline.plugin import InputError, Interior
+from ortho_pipeline.plugin import InputError, Interior, Setting, Text
 
 #: Width (mm) of sensors, and columns and rows of their largest photo, by the model in EXIF, where it tells the camera;
 #: from the makers' specifications.
@@ -31,6 +31,10 @@ SENSORS = {
 }
 #: DJI's focal length in pixels counts more than that of EXIF if they differ by more than this part.
 _ALIKE = 0.05
+#: Focal lengths whose ratio is more than this cannot be of one photo.
+_CONTRARY = 1.2
+#: The optical centre is nearer to the middle of a photo than this part of half the width or height.
+_NEAR = 0.03
 #: Millimetres of a unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre.
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 #: The longer side (mm) of a frame of 35 mm film.
@@ -49,6 +53,7 @@ CALIBRATED = {
 }
 NOMINAL = {"focal_length": 0.02, "x0": 0.005, "y0": 0.005, "k1": 0.03, "k2": 0.02, "k3": 0.01, "p1": 1e-3, "p2": 1e-3}
 _PIXEL = 1e-6
+_NO_CROPS = "give the whole photo; crops are not supported"
 _REMEDY = "give the sensor option sensor_width=MILLIMETRES, or camera=FILE (docs/formats/frame.md)"
 
 
@@ -59,6 +64,11 @@ class PhotoCamera:
     interior: Interior
     source: str
     known: Mapping[str, float] = field(default_factory=lambda: NOMINAL)
+
+    @property
+    def pixels(self) -> float:
+        """Focal length in pixels of the file."""
+        return self.interior.focal_length / self.interior.pitch_x
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -80,7 +90,8 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
     Raises
     ------
     InputError
-        If nothing tells the focal length in pixels, the lens is a fisheye, or the photo is a crop.
+        If nothing tells the focal length in pixels, tags contradict each other, the lens is a fisheye, or the photo is
+        a crop.
     """
     full, full_rows = _full_size(tags, width, height)
     if tags.text("Camera:ModelType").lower() == "fisheye":
@@ -94,26 +105,23 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
         if focal is None:
             raise tags.error("the tags have no focal length", "FocalLength", "give camera=FILE (docs/formats/frame.md)")
         return PhotoCamera(_plain(width, height, focal / sensor_width * width), "sensor width of the options")
+    by_sensor = _of_sensor(tags, width, height, (full, full_rows))
+    stated = by_sensor or _of_film(tags, width, height)
     try:
-        calibrated = _dewarped(tags, width, height, full) or _of_pix4d(tags, width, height, full)
+        dewarped = _dewarped(tags, width, height, full)
+        by_pix4d = None if dewarped else _of_pix4d(tags, width, height, full)
     except InputError as error:
         raise tags.error(error.message, error.field or "", _REMEDY) from error
-    if calibrated is not None:
-        return calibrated
-    by_sensor, nominal = (
-        _of_sensor(tags, width, height, (full, full_rows)),
-        tags.positive("drone-dji:CalibratedFocalLength"),
-    )
-    if nominal:
-        pixels = nominal * width / full
-        if by_sensor is None or abs(pixels / by_sensor.interior.focal_length * _PIXEL - 1) > _ALIKE:
-            return PhotoCamera(_plain(width, height, pixels), "nominal focal length in pixels")
-    if by_sensor is not None:
-        return by_sensor
-    film = tags.positive("FocalLengthIn35mmFilm")
-    if film:
-        pixels = film / _FILM_MM * max(width, height)
-        return PhotoCamera(_plain(width, height, pixels), "focal length in 35 mm film, rounded")
+    if dewarped is not None:
+        return _agreeing(tags, dewarped, stated, "drone-dji:DewarpData")
+    if by_pix4d is not None:
+        return by_pix4d
+    if nominal := tags.positive("drone-dji:CalibratedFocalLength"):
+        camera = PhotoCamera(_plain(width, height, nominal * width / full), "nominal focal length in pixels")
+        if by_sensor is None or abs(camera.pixels / by_sensor.pixels - 1) > _ALIKE:
+            return _agreeing(tags, camera, stated, "drone-dji:CalibratedFocalLength")
+    if stated is not None:
+        return stated
     model = tags.text("Model", "tiff:Model") or "unknown"
     raise tags.error(f"the size of the sensor of this camera ({model}) is not known", "sensor_width", _REMEDY)
 
@@ -122,15 +130,53 @@ def _full_size(tags: Tags, width: int, height: int) -> tuple[float, float]:
     """Return the size of the whole photo (px): the file may be a reduced copy of it, but no crop."""
     full, rows = tags.positive("PixelXDimension"), tags.positive("PixelYDimension")
     if not full or not rows:
-        return float(width), float(height)
+        full, rows = float(width), float(height)
     # A reduced copy has whole pixels.
     if abs(full * height - rows * width) > max(full, rows):
         raise tags.error(
             f"the photo has {full:.0f} x {rows:.0f} pixels by its tags, but the file {width} x {height}",
             "PixelXDimension",
-            "give the whole photo; crops are not supported",
+            _NO_CROPS,
         )
-    return full, rows
+    scale = _scale(tags, full, rows)
+    return full * scale, rows * scale
+
+
+def _scale(tags: Tags, full: float, rows: float) -> float:
+    """Return how much larger the calibrated photo is: programs that reduce photos often write the new size into EXIF.
+
+    The optical centre of DJI's calibration is near the middle.
+    """
+    x, y = (tags.positive(f"drone-dji:CalibratedOpticalCenter{axis}") for axis in "XY")
+    if x is None:
+        return 1.0
+    y = y or x * rows / full
+    # Some photos are stored as portraits.
+    longer, shorter = 2 * max(x, y) / max(full, rows), 2 * min(x, y) / min(full, rows)
+    if min(abs(longer - 1), abs(shorter - 1)) < _NEAR:
+        return 1.0
+    if abs(longer / shorter - 1) > 2 * _NEAR:
+        raise tags.error(
+            f"the calibration is of a photo of about {2 * x:.0f} x {2 * y:.0f} pixels, "
+            f"but the photo has {full:.0f} x {rows:.0f} by its tags",
+            "drone-dji:CalibratedOpticalCenterX",
+            _NO_CROPS,
+        )
+    return longer
+
+
+def _agreeing(tags: Tags, camera: PhotoCamera, stated: PhotoCamera | None, field: str) -> PhotoCamera:
+    """Return DJI's camera, unless the focal length of EXIF contradicts it."""
+    if stated is not None and not 1 / _CONTRARY < camera.pixels / stated.pixels < _CONTRARY:
+        raise tags.error(
+            f"this tag states a focal length of {camera.pixels:.0f} px, but EXIF one of {stated.pixels:.0f} px",
+            field,
+            Text(
+                "give the photo as the camera wrote it, or state the width of the sensor with ",
+                Setting("scene.sensor_options", "MILLIMETRES", key="sensor_width"),
+            ),
+        )
+    return camera
 
 
 def _plain(width: int, height: int, pixels: float) -> Interior:
@@ -153,6 +199,15 @@ def _of_sensor(tags: Tags, width: int, height: int, full: tuple[float, float]) -
         pixels = focal / pitch * width / full[0]
         return PhotoCamera(_plain(width, height, pixels), "focal length, and resolution in the focal plane")
     return None
+
+
+def _of_film(tags: Tags, width: int, height: int) -> PhotoCamera | None:
+    """Return the camera by the focal length in 35 mm film."""
+    film = tags.positive("FocalLengthIn35mmFilm")
+    if not film:
+        return None
+    pixels = film / _FILM_MM * max(width, height)
+    return PhotoCamera(_plain(width, height, pixels), "focal length in 35 mm film, rounded")
 
 
 def _dewarped(tags: Tags, width: int, height: int, full: float) -> PhotoCamera | None:

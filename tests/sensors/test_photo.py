@@ -292,6 +292,37 @@ def test_djis_focal_length_in_pixels_counts_where_the_known_sensor_contradicts_i
     assert scene.facts["focal_length_px"] == pytest.approx(pixels, abs=1e-3)
 
 
+DEWARP = {"drone-dji:DewarpData": "2018-09-07;402,402,-1,2,0,0,0,0,0"}
+CENTRE = {"drone-dji:CalibratedOpticalCenterX": "300.6", "drone-dji:CalibratedOpticalCenterY": "199.1"}
+
+
+@pytest.mark.parametrize("calibration", [DEWARP, {"drone-dji:CalibratedFocalLength": "402"}])
+@pytest.mark.parametrize("model", ["FC6310R", "X"])
+def test_a_reduced_copy_that_states_its_own_size_is_known_by_the_optical_centre(tmp_path, calibration, model):
+    exif, calibration = {**EXIF, "Model": model}, {**DJI, **calibration}
+    copied = {**exif, "PixelXDimension": "75", "PixelYDimension": "50"}
+    whole = opened(photo(tmp_path / "a.tif", exif, {**calibration, **CENTRE}))
+    copy = opened(photo(tmp_path / "b.tif", copied, {**calibration, **CENTRE}, size=(75, 50)))
+    assert copy.facts["focal_length_px"] == pytest.approx(whole.facts["focal_length_px"] / 8, rel=0.003)
+    # Without the centre nothing decides whether the calibration or EXIF is right.
+    path = photo(tmp_path / "c.tif", copied, calibration, size=(75, 50))
+    with pytest.raises(InputError, match="states a focal length of 402 px, but EXIF one of 50 px") as error:
+        opened(path)
+    assert "sensor_width=MILLIMETRES" in error.value.remedy
+    assert opened(path, sensor_width="13.2").facts["focal_length_px"] == pytest.approx(50, abs=1e-3)
+
+
+def test_the_optical_centre_shows_a_crop(tmp_path):
+    exif = {**EXIF, "PixelXDimension": "300", "PixelYDimension": "300"}
+    path = photo(tmp_path / "a.tif", exif, {**DJI, **DEWARP, **CENTRE}, size=(300, 300))
+    with pytest.raises(InputError, match="of a photo of about 601 x 398 pixels, but the photo has 300 x 300"):
+        opened(path)
+    # Some modes show the middle of the sensor in all its rows.
+    exif = {**EXIF, "PixelXDimension": "534", "PixelYDimension": "400"}
+    part = opened(photo(tmp_path / "b.tif", exif, {**DJI, **DEWARP, **CENTRE}, size=(534, 400)))
+    assert part.facts["focal_length_px"] == pytest.approx(402, abs=1e-3)
+
+
 def test_the_focal_length_in_35_mm_film_is_of_the_longer_side(tmp_path):
     exif = {**EXIF, "Model": "X", "PixelXDimension": "400", "PixelYDimension": "600"}
     portrait = opened(photo(tmp_path / "a.tif", exif, size=(400, 600)))
