@@ -130,8 +130,8 @@ def adjust(
     InputError
         If an input or an option is wrong.
     """
-    labels = labels_of(images := images_of(images, scene))
-    files = _files(labels, Path(folder))
+    images, left_out = images_of(images, scene)
+    files = _files(labels := labels_of(images), Path(folder))
     of_orthos = {} if orthos is None else ortho_files(Path(folder), labels, orthos)
     of_mosaic = mosaic_of_orthos(Path(folder), mosaic, orthos)
     scenes = scenes_of(images, scene, models)
@@ -162,7 +162,7 @@ def adjust(
         starts=starts,
         exported=exported,
         provenance=record,
-        warnings=[*_warnings(fit, starts), *notes, *complaints],
+        warnings=[*left_out, *_warnings(fit, starts), *notes, *complaints],
         join_limit=points.join_limit,
         dem_unused=surface.dem is not None and points.dem_heights == "off",
     )

@@ -155,6 +155,15 @@ def test_adjust_writes_models_points_rpcs_and_one_report(stereo: Stereo, tmp_pat
     assert "8 control points" in adjustment["gauge"]
 
 
+def test_adjust_names_the_images_of_a_folder_that_it_leaves_out(stereo: Stereo, tmp_path: Path) -> None:
+    (stereo.folder / "damaged.jpeg").write_bytes(b"\xff\xd8\xff\xe0")
+    args = ("adjust", stereo.folder, "--points", stereo.write(), "-o", tmp_path / "out", "--json")
+    notices = json.loads(run(*args))["report"]["notices"]
+    [notice] = [one for one in notices if one["code"] == "images-left-out"]
+    assert (notice["count"], notice["images"]) == (1, ["damaged.jpeg"])
+    assert "1 image of the folder cannot be used: damaged.jpeg: cannot be opened: " in notice["text"]
+
+
 def test_written_points_are_read_as_ground_again(stereo: Stereo, tmp_path: Path) -> None:
     out = tmp_path / "out"
     points = stereo.write()

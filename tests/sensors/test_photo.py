@@ -395,8 +395,15 @@ def test_a_folder_stands_for_its_photos_and_says_what_they_lack(tmp_path):
         images_of([folder], SceneOptions())
     assert "ortho info" in error.value.remedy
     other = photo(folder / "c.tif")
-    assert images_of([folder], SceneOptions()) == [one, other]
-    assert images_of([one], SceneOptions()) == [one]
+    third = jpeg(folder / "e.jpeg")
+    (folder / "d.jpg").write_bytes(third.read_bytes()[:100])
+    found, [notice] = images_of([folder], SceneOptions())
+    assert found == [one, other, third]
+    assert notice.code == "images-left-out"
+    assert "2 images of the folder cannot be used: b.tif: " in notice
+    assert "no camera angles; d.jpg: cannot be opened" in notice
+    assert notice.fields == {"count": 2, "images": ["b.tif", "d.jpg"]}
+    assert images_of([one], SceneOptions()) == ([one], [])
     shown = CliRunner().invoke(cli, ["info", str(folder)]).output
     assert f"ortho adjust '{folder}' --ties auto" in shown
     assert "no camera angles" in shown

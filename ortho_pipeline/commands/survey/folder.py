@@ -12,6 +12,7 @@ from typing import Any, Literal
 from ortho_pipeline import host
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
+from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.files.json.values import json_value
@@ -35,6 +36,7 @@ IMAGES = (
     ".vrt",
     ".png",
     ".jpg",
+    ".jpeg",
     ".hdf",
     ".h5",
     ".nc",
@@ -44,9 +46,11 @@ IMAGES = (
 #: Note on a DEM whose file does not declare its height datum.
 NO_DATUM = "no height datum declared"
 #: Those of them that hold pixels and nothing else: such a file that does not open is damaged.
-_PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img")
+_PIXELS = (".tif", ".tiff", ".ntf", ".nitf", ".jp2", ".img", ".png", ".jpg", ".jpeg")
 #: Files that are looked at, and folders below the given one.
 _MOST, _DEPTH = 2000, 3
+#: Images that a notice names.
+_NAMED = 10
 
 
 @dataclass(frozen=True)
@@ -118,8 +122,10 @@ def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions(
 
 def images_of(
     images: Sequence[str | os.PathLike[str]], scene: SceneOptions | Sequence[SceneOptions]
-) -> Sequence[str | os.PathLike[str]]:
+) -> tuple[Sequence[str | os.PathLike[str]], list[Notice]]:
     """Return the images of a command; one folder with several scenes stands for these.
+
+    A notice names the other images of the folder.
 
     Raises
     ------
@@ -127,18 +133,25 @@ def images_of(
         If the folder has no two scenes; the message says why its images are none.
     """
     if len(images) != 1 or not isinstance(scene, SceneOptions) or not Path(images[0]).is_dir():
-        return images
+        return images, []
     seen = survey(images[0], scene)
     scenes = seen.of("scene")
+    others = [f"{file.path}: {file.said}" for file in seen.found if file.kind == "image"]
     if len(scenes) < 2:
-        others = [f"{file.path}: {file.said}" for file in seen.found if file.kind == "image"]
         raise InputError(
             "; ".join([f"this folder has {counted(len(scenes), 'scene')}, and a block needs two", *others[:3]]),
             file=images[0],
             field="images",
             remedy=Text(f"see what is missing with `ortho info {typed(images[0])}`"),
         )
-    return [seen.folder / name for name in scenes]
+    return [seen.folder / name for name in scenes], _left_out(seen.of("image"), others)
+
+
+def _left_out(names: list[str], reasons: list[str]) -> list[Notice]:
+    if not names:
+        return []
+    text = f"{counted(len(names), 'image')} of the folder cannot be used: {'; '.join(reasons[:_NAMED])}"
+    return [Notice("images-left-out", text, count=len(names), images=names[:_NAMED])]
 
 
 def _files(folder: Path, depth: int) -> Iterator[Path]:

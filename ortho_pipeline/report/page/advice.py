@@ -43,6 +43,7 @@ _LOOK: dict[str, str] = {
     "datum-unknown": Text(
         "State the height datum with ", Setting("scene.sensor_options", "DATUM", key="vertical"), "."
     ),
+    "images-left-out": "If you need these images, repair what the message names.",
     "positions-differ": "If the position in use is wrong, remove it from the tags of the photo.",
     "reference-covers-part": "Add references or measured points in the rest of the scene, or do not use the ortho "
     "there.",
