@@ -49,6 +49,8 @@ DATUM_SIGMA = 50.0
 FLATTEST_DEG = 85.0
 #: Lowest and highest ground below a camera where nothing states its heights: m, and parts of the height above take-off.
 _BELOW, _OF_RELATIVE = (500.0, 20.0), (2.0, 0.2)
+#: At less than this above take-off (m) the ground in view can be far below, and near: m below the camera.
+_LEAST_RELATIVE, _BELOW_LOW = 5.0, (500.0, 1.0)
 
 
 @hookimpl
@@ -129,7 +131,12 @@ def _model(interior: Interior, pose: PhotoPose, stated: str, heights: str | None
 
 def _heights(text: str | None, altitude: float, above_takeoff: float | None) -> tuple[float, float]:
     if text is None:
-        low, high = _BELOW if above_takeoff is None else (part * above_takeoff for part in _OF_RELATIVE)
+        if above_takeoff is None:
+            low, high = _BELOW
+        elif above_takeoff < _LEAST_RELATIVE:
+            low, high = _BELOW_LOW
+        else:
+            low, high = (part * above_takeoff for part in _OF_RELATIVE)
         return altitude - low, altitude - high
     return height_range(text)
 
@@ -163,7 +170,7 @@ def _unknown_datum(pose: PhotoPose) -> Notice:
 
 def _facts(tags: Tags, pose: PhotoPose, model: FrameCamera, camera: PhotoCamera, stated: str) -> dict[str, object]:
     taken = tags.text("DateTimeOriginal", "DateTime")
-    relative = tags.number("drone-dji:RelativeAltitude")
+    relative = tags.optional("drone-dji:RelativeAltitude")
     known = {
         "acquired_local": taken.replace(":", "-", 2) if taken else None,
         "camera": " ".join(filter(None, (tags.text("Make", "tiff:Make"), tags.text("Model", "tiff:Model")))) or None,

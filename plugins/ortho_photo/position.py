@@ -97,7 +97,7 @@ def _of_xmp(tags: Tags) -> _Source:
     names = ("GpsLongtitude", "GpsLongitude", "GPSLongtitude", "GPSLongitude", "Longitude")
     lon = tags.number(*(f"drone-dji:{name}" for name in names))
     east, north = tags.positive("drone-dji:RtkStdLon"), tags.positive("drone-dji:RtkStdLat")
-    up, flag = tags.positive("drone-dji:RtkStdHgt"), tags.number("drone-dji:RtkFlag")
+    up, flag = tags.positive("drone-dji:RtkStdHgt"), tags.optional("drone-dji:RtkFlag")
     plan, height = (max(east, north), up) if east and north and up else (None, None)
     return _Source(
         "DJI's XMP",

@@ -27,6 +27,8 @@ PREFIXES = {
 REMEDY = "copy the photo again from the camera, or give a camera file and a table of poses (docs/formats/frame.md)"
 _VERSION = re.compile(r"/(\d+\.\d+)?/?$")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?(/\d+\.?\d*)?", re.ASCII)
+#: As cameras write a number that they do not know, also as a fraction.
+_NOT_FINITE = re.compile(r"[-+]?(nan|inf|infinity)|[-+\d.]+/0+(\.0*)?", re.ASCII | re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -70,9 +72,14 @@ class Tags:
             raise self.error(f"{len(found)} numbers instead of one", names[0])
         return None if found is None else found[0]
 
+    def optional(self, name: str) -> float | None:
+        """Return the number of a tag that nothing needs; None if it is absent or not finite."""
+        text = self.text(name).strip("() ")
+        return None if _NOT_FINITE.fullmatch(text) else self.number(name)
+
     def positive(self, *names: str) -> float | None:
-        """Return the first positive number of these tags: cameras write 0 for what they do not know."""
-        values = (self.number(name) for name in names)
+        """Return the first positive number of these tags: cameras write 0 or nan for what they do not know."""
+        values = (self.optional(name) for name in names)
         return next((value for value in values if value is not None and value > 0), None)
 
     def text(self, *names: str) -> str:

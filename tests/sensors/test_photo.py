@@ -202,6 +202,26 @@ def test_an_ellipsoidal_height_in_exif_is_not_compared_with_djis(tmp_path):
     assert notice.fields["off_m"]["height"] == pytest.approx(29.5)
 
 
+@pytest.mark.parametrize("unknown", ["nan", "+NaN", "-inf", "Infinity", "0/0"])
+def test_an_optional_number_that_is_not_finite_counts_as_absent(tmp_path, unknown):
+    names = ("RelativeAltitude", "RtkStdLon", "RtkStdLat", "RtkStdHgt", "RtkFlag", "CalibratedFocalLength")
+    tags = {f"drone-dji:{name}": unknown for name in names} | {"Camera:GPSXYAccuracy": unknown}
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, **tags}))
+    assert sigmas(scene) == pytest.approx([3.0, 3.0, 10.0])
+    assert "altitude_above_takeoff_m" not in scene.facts
+    assert scene.model.heights == pytest.approx((ALTITUDE - 500, ALTITUDE - 20))
+    with pytest.raises(InputError, match="is not a"):
+        opened(photo(tmp_path / "b.tif", xmp={**DJI, "drone-dji:GimbalYawDegree": unknown}))
+
+
+@pytest.mark.parametrize(("above", "wanted"), [("+0.10", (500, 1)), ("4", (500, 1)), ("5", (10, 1)), ("-3", (500, 20))])
+def test_photos_low_above_takeoff_see_near_and_far_ground(tmp_path, above, wanted):
+    scene = opened(photo(tmp_path / "a.tif", xmp={**DJI, "drone-dji:RelativeAltitude": above}))
+    assert scene.model.heights == pytest.approx([ALTITUDE - below for below in wanted])
+    for below in wanted:
+        np.testing.assert_allclose(looking(scene, RIGHT, below), along(40, 0, below * HALF_WIDTH), atol=0.001 * below)
+
+
 def test_photos_share_the_camera_with_sigmas_of_its_source(tmp_path):
     data = "2018-09-07;400,400,0,0,0,0,0,0,0"
     nominal = opened(photo(tmp_path / "a.tif"), calibrate="yes")
