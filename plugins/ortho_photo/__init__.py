@@ -13,6 +13,7 @@ from ortho_photo.cameras import PhotoCamera, camera_of
 from ortho_photo.pose import ANGLE, HORIZON, NADIR, PhotoPose, pose_of
 from ortho_photo.tags import Tags, has_position, tags_of
 from ortho_pipeline.plugin import (
+    DatumError,
     FrameCamera,
     InputError,
     Interior,
@@ -85,7 +86,7 @@ def open_scene(
     if calibrate not in ("yes", "no"):
         raise InputError(f"{calibrate!r} must be yes or no", field="calibrate")
     camera = camera_of(tags, *size, _width(sensor_width))
-    stated = vertical or pose.datum or UNKNOWN
+    stated = vertical or _known(pose.datum)
     model = _model(camera.interior, pose, stated, heights, tags)
     priors = _priors(model, pose, stated, sigmas)
     if calibrate == "yes":
@@ -159,9 +160,20 @@ def _camera_name(tags: Tags, interior: Interior) -> str:
     return " ".join([*named, *numbers, f"{interior.width} x {interior.height}, {focal:.6g} px"])
 
 
+def _known(datum: str) -> str:
+    """Return the datum that the tags state, or `UNKNOWN`: programs also write free text."""
+    try:
+        Vertical.stated(datum)
+    except DatumError:
+        return UNKNOWN
+    return datum
+
+
 def _unknown_datum(pose: PhotoPose) -> Notice:
+    stated = f"state an unknown height datum of the camera, {pose.datum[:60]!r}"
     text = Text(
-        "the tags do not state the height datum of the camera. Its altitude counts as ellipsoidal, within "
+        f"the tags {stated if pose.datum else 'do not state the height datum of the camera'}. ",
+        "Its altitude counts as ellipsoidal, within "
         f"{DATUM_SIGMA:.0f} m. An adjustment with a DEM or control points estimates it. If you know the datum, add ",
         Setting("scene.sensor_options", "DATUM", key="vertical"),
     )

@@ -149,6 +149,18 @@ def test_the_height_datum_is_stated_or_unknown_and_never_guessed(tmp_path):
     assert stated.notices == ()
 
 
+@pytest.mark.parametrize("text", ["orthometric", "EGM 96 Geoid", "EPSG:4326", "../a.gtx"])
+def test_a_height_datum_in_other_words_is_unknown(tmp_path, text):
+    path = photo(tmp_path / "a.tif", xmp={**CAMERA, "Camera:VertCS": text})
+    scene = open_scene(path)
+    [notice] = scene.notices
+    assert notice.code == "datum-unknown"
+    assert f"the tags state an unknown height datum of the camera, '{text}'." in notice
+    assert scene.facts["altitude_datum"] == "unknown"
+    assert scene.model.perspective_centre[2] == pytest.approx(ALTITUDE)
+    assert opened(path, vertical="egm96").notices == ()
+
+
 @pytest.mark.parametrize(
     ("tags", "wanted"),
     [
