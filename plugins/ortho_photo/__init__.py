@@ -10,7 +10,7 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_photo.cameras import PhotoCamera, camera_of
-from ortho_photo.pose import ANGLE, HORIZON, NADIR, PhotoPose, pose_of
+from ortho_photo.pose import ANGLE, FLATTEST_DEG, HORIZON, NADIR, PhotoPose, pose_of
 from ortho_photo.tags import Tags, has_position, tags_of
 from ortho_pipeline.plugin import (
     DatumError,
@@ -46,8 +46,6 @@ OPTIONS = {
 UNKNOWN = "unknown"
 #: Standard deviation (m) of heights of an unknown datum: geoid and ellipsoid are within twice of it nearly everywhere.
 DATUM_SIGMA = 50.0
-#: A camera that looks flatter than this (degrees from straight down) sees the horizon.
-FLATTEST_DEG = 85.0
 #: Lowest and highest ground below a camera where nothing states its heights: m, and parts of the height above take-off.
 _BELOW, _OF_RELATIVE = (500.0, 20.0), (2.0, 0.2)
 #: At less than this above take-off (m) the ground in view can be far below, and near: m below the camera.

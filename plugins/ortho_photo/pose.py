@@ -20,12 +20,14 @@ import numpy as np
 
 from ortho_photo.position import Position, position_of
 from ortho_photo.tags import Tags
-from ortho_pipeline.plugin import Array, camera_from_platform
+from ortho_pipeline.plugin import Array, Setting, Text, camera_from_platform
 
 #: Standard deviation (degrees) of each angle: a compass near motors.
 ANGLE = 3.0
 #: Values of the option ``pitch``.
 HORIZON, NADIR = "horizon", "nadir"
+#: A camera that looks flatter than this (degrees from straight down) sees the horizon.
+FLATTEST_DEG = 85.0
 
 
 @dataclass(frozen=True)
@@ -109,10 +111,28 @@ def _angles(tags: Tags, pitch: str | None) -> tuple[tuple[float, float, float], 
             raise tags.error(
                 "all gimbal angles are exactly 0: this drone does not record them", f"{space}:GimbalPitchDegree"
             )
+        if space == "Camera" and pitch is None:
+            _refuse_two_readings(tags, tilt)
         if space == "senseFly" or (space == "Camera" and tags.text("Make").lower() == "sensefly"):
             roll = -roll
         return (yaw, tilt, roll), pitch or convention
     raise tags.error("this photo has no camera angles", "Yaw, Pitch, Roll")
+
+
+def _refuse_two_readings(tags: Tags, tilt: float) -> None:
+    """Raise if a camera of Autel looks at the ground by both conventions: some write zero at the horizon."""
+    if tags.text("Make", "tiff:Make").lower().startswith("autel") and -FLATTEST_DEG < tilt < FLATTEST_DEG - 90:
+        raise tags.error(
+            f"a pitch of {tilt:g} is {-tilt:g} degrees backwards from straight down, or {90 + tilt:g} forwards if the "
+            "pitch is zero at the horizon. Cameras of Autel write both",
+            "Camera:Pitch",
+            Text(
+                "find out which one is right, and add ",
+                Setting("scene.sensor_options", HORIZON, key="pitch"),
+                " or ",
+                Setting("scene.sensor_options", NADIR, key="pitch"),
+            ),
+        )
 
 
 def _datum(tags: Tags) -> str:

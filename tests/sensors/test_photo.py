@@ -111,6 +111,32 @@ def test_a_pitch_that_is_written_against_its_definition_asks_for_the_option(tmp_
         opened(path, pitch="sky")
 
 
+@pytest.mark.parametrize(
+    ("make", "angle", "refused"),
+    [
+        ("Autel Robotics", -60, True),
+        ("Autel Robotics", -84, True),
+        ("Autel Robotics", -4, False),
+        ("Autel Robotics", 30, False),
+        ("Parrot", -60, False),
+    ],
+)
+def test_a_pitch_of_autel_with_two_readings_asks_for_the_option(tmp_path, make, angle, refused):
+    path = photo(tmp_path / "a.tif", {**EXIF, "Make": make}, {**CAMERA, "Camera:Pitch": str(angle)})
+    if refused:
+        with pytest.raises(
+            InputError, match=f"{-angle} degrees backwards from straight down, or {90 + angle} forwards"
+        ) as error:
+            opened(path)
+        assert "pitch=horizon` or `scene.sensor_options.pitch=nadir" in error.value.remedy
+        forward = along(40, 100 * math.tan(math.radians(90 + angle)), 0)
+        np.testing.assert_allclose(looking(opened(path, pitch="horizon"), MIDDLE), forward, atol=0.05)
+    scene = opened(path, pitch="nadir") if refused else opened(path)
+    np.testing.assert_allclose(
+        looking(scene, MIDDLE), along(40, 100 * math.tan(math.radians(angle)), 0), rtol=0.01, atol=0.05
+    )
+
+
 def test_a_jpeg_is_recognised_and_has_the_same_model(tmp_path):
     scene = opened(jpeg(tmp_path / "a.jpg"))
     same = opened(photo(tmp_path / "a.tif"))
