@@ -78,15 +78,18 @@ def position_of(tags: Tags) -> Position:
         raise tags.error("this photo has a position, but no altitude", "GPSAltitude")
     if not -1000 < levelled.altitude < 100_000:
         raise tags.error(f"an altitude of {levelled.altitude} m is impossible", "GPSAltitude")
-    # If DJI's XMP has no longitude and latitude, its accuracy is that of EXIF's.
-    stating = placed if placed.plan or xmp.place else xmp
-    height = levelled.height or max(HEIGHT, stating.plan or 0.0)
+    # An accuracy in a source without a position is that of the only position.
+    other = exif if placed is xmp else xmp
+    plan_by = placed if placed.plan or other.place else other
+    other = exif if levelled is xmp else xmp
+    height_by = levelled if levelled.height or other.altitude is not None else other
+    height = height_by.height or max(HEIGHT, plan_by.plan or 0.0)
     return Position(
         lon,
         lat,
         levelled.altitude,
-        (max(stating.plan or PLAN, LEAST), max(height, LEAST)),
-        stating.positioning if stating.plan else "no accuracy in the tags; assumed",
+        (max(plan_by.plan or PLAN, LEAST), max(height, LEAST)),
+        plan_by.positioning if plan_by.plan else "no accuracy in the tags; assumed",
         _differing(tags, placed, xmp, exif),
     )
 

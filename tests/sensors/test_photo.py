@@ -220,6 +220,13 @@ RTK = {"drone-dji:RtkStdLon": "0.5", "drone-dji:RtkStdLat": "0.5", "drone-dji:Rt
         (REPLACED, {**PLACED, **RTK}, 0.0, [0.5, 0.5, 0.6], "DJI's XMP"),
         ({**REPLACED, "GPSHPositioningError": "(0)"}, PLACED, 0.0, [3.0, 3.0, 10.0], "DJI's XMP"),
         (EXIF, {**PLACED, "Camera:GPSXYAccuracy": "1.5", "Camera:GPSZAccuracy": "2"}, 0.0, [1.5, 1.5, 2.0], None),
+        (
+            without(EXIF, "GPS"),
+            {**PLACED, "Camera:GPSXYAccuracy": "1.5", "Camera:GPSZAccuracy": "2"},
+            0.0,
+            [1.5, 1.5, 2.0],
+            None,
+        ),
         (EXIF, {**PLACED, "drone-dji:AbsoluteAltitude": "990", **RTK}, 0.0, [0.5, 0.5, 0.6], "DJI's XMP"),
         ({**EXIF, "GPSLatitude": "(x)"}, PLACED, 0.0, [3.0, 3.0, 10.0], None),
     ],
