@@ -94,6 +94,12 @@ class Profile:
             scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
         )
 
+    def mask_of(self, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which pixels ``(h, w)`` are valid, of what is valid in each band ``(bands, h, w)``."""
+        # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
+        any_band = self.validity == "nodata" or self.dtype.kind == "f"
+        return valid[0] if len(valid) == 1 else np.asarray((np.any if any_band else np.all)(valid, axis=0))
+
 
 def _palette(band: gdal.Band) -> gdal.ColorTable | None:
     # A copy: what GDAL returns ends with the dataset.

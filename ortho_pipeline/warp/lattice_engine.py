@@ -188,7 +188,6 @@ class TileMaker:
         self.resampling = resampling_kernel.Resampling(
             kernel, 0, (1.0, 1.0), *value_range(source.dtype, profile), real=None
         )
-        self.any_band = profile.validity == "nodata" or profile.dtype.kind == "f"
         self._lock = threading.Lock()
         self.valid_pixels = 0
         self.looked: Looked | None = None
@@ -231,9 +230,7 @@ class TileMaker:
             self.looked.fill(left, top, hidden, out, tile.valid)
         if self.profile.validity == "nodata":
             keep_off_nodata(out, tile.valid, fill, low)
-        # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
-        bands = tile.valid
-        mask = bands[0] if len(bands) == 1 else np.asarray((np.any if self.any_band else np.all)(bands, axis=0))
+        mask = self.profile.mask_of(tile.valid)
         with self._lock:
             self.valid_pixels += int(np.count_nonzero(mask))
         return Made(left, top, out, mask, classes)

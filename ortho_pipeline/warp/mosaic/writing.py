@@ -75,7 +75,7 @@ def write_cog(
     """
     opened = open_layers(placed, memory)
     profile, grid = Profile.of(opened[0].source), placed.grid
-    fill = profile.dtype.type(0 if profile.nodata is None else profile.nodata)
+    fill = value_range(profile.dtype, profile)[3]
     clamped = shown = 0
     with RasterWriter(path, grid, profile, threads=threads) as writer:
         for left, top, width, height in windows(grid, _WINDOW):
@@ -85,19 +85,21 @@ def write_cog(
                 np.full((profile.count, height, width), fill, dtype=profile.dtype),
                 np.zeros((profile.count, height, width), dtype=bool),
                 None if owners is None else owners.window(left, top, width, height),
-                np.full((height, width), np.inf, dtype=np.float32) if owners is not None or placed.by_pixel else None,
+                np.full((profile.count, height, width), np.inf, dtype=np.float32)
+                if owners is not None or placed.by_pixel
+                else None,
             )
             for number, raster in enumerate(opened):
                 clamped += window.put(number, raster, balance, profile, by_pixel=placed.by_pixel)
             shown += int(np.count_nonzero(window.valid))
-            writer.write(left, top, window.pixels, np.all(window.valid, axis=0))
+            writer.write(left, top, window.pixels, profile.mask_of(window.valid))
     return clamped / max(shown, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
     """A window of the mosaic in the making: its pixels, which are valid, and where it is chosen pixel by pixel whose
-    they shall be and the ranks ``(h, w)`` of those that there are.
+    they shall be and the ranks ``(bands, h, w)`` of those that there are.
     """
 
     left: int
@@ -127,9 +129,9 @@ class _Window:
                 rank = circular_errors(raster.layer, *there, box[2] - box[0], box[3] - box[1])
             if self.owners is not None:
                 rank[self.owners[part] == number] = -1.0
-            better = good.all(axis=0) & (rank < self.best[part])
-            self.best[part][better] = rank[better]
-            new = np.broadcast_to(better, values.shape)
+            # Band by band: what one band of the better ortho lacks, another ortho may have.
+            new = good & (rank < self.best[place])
+            np.copyto(self.best[place], rank, where=new)
         clamped = 0
         if balance is not None:
             values, clamped = _balanced(balance, number, values, good, new, profile)

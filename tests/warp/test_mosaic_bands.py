@@ -1,0 +1,70 @@
+"""Mosaics of several bands: a value that one band lacks, bands that tell nothing, what bands have to share."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.raster.ortho import Profile, RasterWriter
+from ortho_pipeline.raster.source import Grid
+from ortho_pipeline.warp.mosaic import Ortho, lay_out, owners_of, write_cog
+
+UTM = pyproj.CRS("EPSG:32636")
+#: Three bands of a ground on which two orthos lie, the second 40 px right of the first.
+GROUND = np.random.default_rng(4).integers(50, 200, (3, 60, 120)).astype(np.float64)
+LEFT = {"a": 0, "b": 40}
+
+
+def write(path: Path, pixels: np.ndarray, left: int, profile: Profile) -> Path:
+    grid = Grid(UTM, 5e5 + 2.0 * left, 4e6, 2.0, 2.0, pixels.shape[2], pixels.shape[1])
+    with RasterWriter(path, grid, profile, driver="GTiff") as writer:
+        writer.write(0, 0, pixels.astype(profile.dtype), np.ones(pixels.shape[1:], dtype=bool))
+    return path
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    dataset = gdal.Open(str(path))
+    return dataset.ReadAsArray(), dataset.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+
+
+# -- a value that one band lacks -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["first-on-top", "seamlines", "most-accurate"])
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_a_band_without_a_value_costs_the_other_bands_nothing(tmp_path, way, kind):
+    """The first ortho lacks band 3 in a square, half of which the second fills; its west has no value in any band."""
+    profile = Profile(3, np.dtype(kind), *(("nodata", 0.0) if kind is np.uint8 else ("mask", None)))
+    empty, orthos, seen = (0 if kind is np.uint8 else math.nan), [], np.full((2, 3, 60, 120), np.nan)
+    for number, (name, left) in enumerate(LEFT.items()):
+        pixels = GROUND[:, :, left : left + 80] + number
+        if name == "a":
+            pixels[2, 20:40, 30:50] = pixels[:, :, :5] = np.nan
+        seen[number, :, :, left : left + 80] = pixels
+        path = write(tmp_path / f"{name}.tif", np.where(np.isnan(pixels), empty, pixels), left, profile)
+        errors = np.full((1, 60, 80), 2.0 - number)
+        accuracy = write(
+            tmp_path / f"{name}_accuracy.tif", errors, left, Profile(1, np.dtype("float32"), "nodata", math.nan)
+        )
+        orthos.append(Ortho(name, path, accuracy=accuracy))
+    placed = lay_out(orthos, "most-accurate" if way == "most-accurate" else "first-on-top")
+    owners = owners_of(placed, None, seamlines=True) if way == "seamlines" else None
+    write_cog(placed, tmp_path / "m.tif", owners=owners)
+    values, valid = read(tmp_path / "m.tif")
+    first, second = seen[::-1] if way == "most-accurate" else seen
+    truth = np.where(np.isnan(first), second, first)
+    known = ~np.isnan(truth)
+    np.testing.assert_array_equal(known, ~np.isnan(values) if kind is np.float32 else values > 0)
+    # In a GeoTIFF with nodata the mask of band 1 is that of band 1.
+    np.testing.assert_array_equal(valid, known[0])
+    assert known[0, 20:40, 30:40].all()
+    assert not known[2, 20:40, 30:40].any()
+    if owners is None:
+        np.testing.assert_array_equal(values[known], truth[known])
+    else:
+        assert ((values == seen[0]) | (values == seen[1]))[known].all()
