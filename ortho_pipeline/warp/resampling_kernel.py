@@ -378,7 +378,7 @@ def _row_average(source, columns, rows, left, top, box, integer, out):
 
 @inlined
 def _average_valid(source, valid, masked, col, row, box):
-    """Mean of the valid pixels in a box about (col, row), each weighted by the area that lies in the box."""
+    """Mean of the valid pixels in a box about (col, row), weighted by their areas in the box; NaN without any."""
     height, width = source.shape
     first, last = max(col - 0.5 * box[0], 0.0), min(col + 0.5 * box[0], float(width))
     above, below = max(row - 0.5 * box[1], 0.0), min(row + 0.5 * box[1], float(height))
@@ -390,7 +390,8 @@ def _average_valid(source, valid, masked, col, row, box):
                 weight = tall * (min(i + 1.0, last) - max(float(i), first))
                 total += weight * source[j, i]
                 area += weight
-    return total / area if area > 0.0 else np.nan
+    # A strip of a millionth of a pixel is an error of rounding, no area.
+    return total / area if area > 1e-6 * (box[0] + box[1]) else np.nan
 
 
 @inlined
@@ -398,6 +399,7 @@ def _edge_value(kernel, resampling, source, valid, masked, col, row, left, top, 
     """Value of another kernel than bilinear at image point (col, row) where neighbours may lack; its pixel is valid.
 
     As GDAL does: Lanczos takes the valid neighbours alone, with weights that sum to one; cubic falls back to bilinear.
+    An average is that of the valid area, even if its own pixel is invalid.
     What is made as within the image is already rounded if the output is an integer.
     """
     if kernel == AVERAGE:
@@ -460,8 +462,9 @@ def row_with_edges(
         ):
             short += 1
             continue
+        by_area = False if kernel is None else kernel == AVERAGE
         for band in range(bands):
-            if masked and not valid[band, here_row - top, here_col - left]:
+            if masked and not by_area and not valid[band, here_row - top, here_col - left]:
                 out[band, k], out_valid[band, k] = fill, False
                 continue
             out_valid[band, k] = True
@@ -477,5 +480,8 @@ def row_with_edges(
                 value = _edge_value(
                     kernel, resampling, pixels[band], here, masked, col, line, left, top, full_width, full_height
                 )
+            if by_area and np.isnan(value):
+                out[band, k], out_valid[band, k] = fill, False
+                continue
             out[band, k] = min(max(np.floor(value + 0.5), low), high) if integer else value
     return short

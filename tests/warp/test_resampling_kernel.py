@@ -160,7 +160,9 @@ def test_rows_at_the_edge_of_the_image(name):
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_rows_with_invalid_neighbours(name):
+    """A point has a value where its own pixel is valid; an average where any of its area is."""
     valid = np.random.default_rng(6).random((2, HEIGHT, WIDTH)) > 0.2
+    valid[1, :5, :4] = False
     valid[0, :, 5:] = True  # room for the largest kernel
     images = np.stack([IMAGE, IMAGE[::-1] + 3])
     out, good, short = row(name, images, valid, COLUMNS, ROWS)
@@ -168,6 +170,12 @@ def test_rows_with_invalid_neighbours(name):
     own_column, own_row = np.minimum(COLUMNS.astype(int), WIDTH - 1), np.minimum(ROWS.astype(int), HEIGHT - 1)
     for band in range(2):
         own = valid[band, own_row, own_column]
+        if name == "average":
+            weights = [
+                np.outer(weights_of(name, y, HEIGHT), weights_of(name, x, WIDTH))
+                for x, y in zip(COLUMNS, ROWS, strict=True)
+            ]
+            own = np.array([(weight * valid[band]).sum() > 0 for weight in weights])
         np.testing.assert_array_equal(good[band], own)
         assert (out[band][~own] == -9.0).all()
         places = zip(COLUMNS[own], ROWS[own], strict=True)
@@ -231,6 +239,10 @@ def test_lanczos_without_valid_neighbours_has_no_value():
 def test_no_area_of_a_box_is_valid():
     nothing = np.zeros(IMAGE.shape, dtype=bool)
     assert np.isnan(resampling_kernel._average_valid(IMAGE, nothing, True, 4.2, 4.3, BOX))
+    nothing[:, 6] = True
+    for apart, known in ((1e-9, False), (1e-4, True)):
+        found = resampling_kernel._average_valid(IMAGE, nothing, True, 5.0 + apart, 4.5, (2.0, 1.0))
+        np.testing.assert_allclose(found, IMAGE[4, 6] if known else np.nan)
 
 
 def test_all_valid_looks_at_its_square_alone():

@@ -279,6 +279,7 @@ def test_a_block_of_a_plane(name, masked):
     inside = (x <= WIDTH) & (y <= HEIGHT)
     hole = (np.floor(x) == 7) & (np.floor(y) == 6) & masked
     assert hole.any() == masked
+    hole &= name != "average"  # its box is larger than the hole
     np.testing.assert_array_equal(good[0], inside)
     np.testing.assert_array_equal(good[1], inside & ~hole)
     assert (out[~good] == -1.0).all()
