@@ -94,6 +94,12 @@ class Profile:
             scales=tuple((band.GetScale() or 1.0, band.GetOffset() or 0.0, band.GetUnitType()) for band in bands),
         )
 
+    @property
+    def colours(self) -> list[int]:
+        """The bands, counted from 0, without alpha bands."""
+        kinds = self.interpretations or [gdal.GCI_Undefined] * self.count
+        return [band for band, kind in enumerate(kinds) if kind != gdal.GCI_AlphaBand]
+
     def mask_of(self, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which pixels ``(h, w)`` are valid, of what is valid in each band ``(bands, h, w)``."""
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.

@@ -80,13 +80,14 @@ def test_cells_are_means_of_sixteen_pixels_squared_that_are_all_valid():
     one, other = random.uniform(1, 9, (2, 40, 50)), random.uniform(1, 9, (2, 40, 50))
     valid = np.ones((40, 50), dtype=bool)
     valid[20, 5] = False
-    # The cell in the upper right is saturated in one band of one ortho; 40 x 50 px have 2 x 3 whole cells.
-    other[1, :16, 32:48] = 255.0
+    # 40 x 50 px have 2 x 3 whole cells. One in the first row is saturated in one band of one ortho, the next in both.
+    other[1, :16, 16:32], other[:, :16, 32:48] = 255.0, 255.0
     found = _cell_means(one, other, valid)
     expected = [
         [part[:, top : top + 16, left : left + 16].mean(axis=(1, 2)) for part in (one, other)]
         for top, left in ((0, 0), (0, 16), (16, 16), (16, 32))
     ]
+    expected[1] = [np.where([True, False], means, np.nan) for means in expected[1]]
     np.testing.assert_allclose(found, expected)
 
 

@@ -12,7 +12,7 @@ from osgeo import gdal
 
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.warp.mosaic import Ortho, lay_out, owners_of, write_cog
+from ortho_pipeline.warp.mosaic import Ortho, balanced, lay_out, overlaps, owners_of, write_cog
 
 UTM = pyproj.CRS("EPSG:32636")
 #: Three bands of a ground on which two orthos lie, the second 40 px right of the first.
@@ -68,3 +68,40 @@ def test_a_band_without_a_value_costs_the_other_bands_nothing(tmp_path, way, kin
         np.testing.assert_array_equal(values[known], truth[known])
     else:
         assert ((values == seen[0]) | (values == seen[1]))[known].all()
+
+
+# -- bands that tell nothing -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("last", ["alpha", "constant", "saturated"])
+def test_bands_are_balanced_beside_one_that_has_no_brightness(tmp_path, last):
+    """The second ortho is brighter by known gains and offsets; the last band of both says nothing of them."""
+    gains, offsets, orthos = np.array([2.0, 1.0, 3.0]), np.array([-10.0, 30.0, 5.0]), []
+    colours = gdal.GCI_RedBand, gdal.GCI_GreenBand, gdal.GCI_BlueBand
+    profile = Profile(
+        4, np.dtype("uint16"), "alpha" if last == "alpha" else "mask",
+        interpretations=(*colours, gdal.GCI_AlphaBand if last == "alpha" else gdal.GCI_Undefined),
+    )  # fmt: skip
+    for number, (name, left) in enumerate(LEFT.items()):
+        pixels = GROUND[:, :, left : left + 80]
+        pixels = pixels * gains[:, None, None] + offsets[:, None, None] if number else pixels
+        extra = {
+            "alpha": np.where(GROUND[0, :, left : left + 80] > 60, 65535, 20000 * (1 + number)),
+            "constant": np.full((60, 80), 7.0),
+            "saturated": np.full((60, 80), 65535.0),
+        }[last]
+        orthos.append(
+            Ortho(name, write(tmp_path / f"{name}.tif", np.concatenate([pixels, extra[None]]), left, profile))
+        )
+    placed = lay_out(orthos, "first-on-top")
+    balance = balanced(placed, overlaps(placed))
+    assert balance.cells == 6
+    np.testing.assert_allclose(balance.gains[:, :3], [2 * gains / (1 + gains), 2 / (1 + gains)], rtol=1e-3)
+    np.testing.assert_allclose(balance.after, 0.0, atol=0.01)
+    assert (balance.gains[:, 3], balance.offsets[:, 3]) == (pytest.approx(1.0, abs=0), pytest.approx(0.0, abs=0))
+    write_cog(placed, tmp_path / "m.tif", balance=balance)
+    values = gdal.Open(str(tmp_path / "m.tif")).ReadAsArray()
+    exact = balance.gains[0, :3, None, None] * GROUND + balance.offsets[0, :3, None, None]
+    np.testing.assert_allclose(values[:3], exact, rtol=0, atol=0.6)
+    seen = [gdal.Open(str(ortho.path)).ReadAsArray()[3] for ortho in orthos]
+    np.testing.assert_array_equal(values[3], np.concatenate([seen[0], seen[1][:, 40:]], axis=1))

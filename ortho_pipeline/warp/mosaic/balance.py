@@ -28,6 +28,7 @@ from scipy.sparse.linalg import spsolve
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.models.base import Array
+from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import MEMORY
 from ortho_pipeline.warp.mosaic.layout import Box, Mosaic, box_of, intersection
 from ortho_pipeline.warp.mosaic.overlaps import Overlap
@@ -92,27 +93,31 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
                 remedy="leave it out",
             )
     number = {id(layer): k for k, layer in enumerate(placed.layers)}
+    # An alpha band has no brightness.
+    bands = Profile.of(opened[0].source).colours
     ends, means = [], []
     for pair in pairs:
         first, second = number[id(pair.first)], number[id(pair.second)]
         box = intersection(box_of(pair.first), box_of(pair.second))
         for window in () if box is None else _windows(box):
             (values, valid), (others, also) = (opened[k].read_around(window) for k in (first, second))
-            cell_means = _cell_means(values, others, valid & also)
+            cell_means = _cell_means(values[bands], others[bands], valid & also)
             means.append(cell_means)
             ends.append(np.broadcast_to([first, second], (len(cell_means), 2)))
-    count, bands = len(placed.layers), opened[0].source.count
-    cells = np.concatenate(means) if means else np.zeros((0, 2, bands))
+    count, all_bands = len(placed.layers), opened[0].source.count
+    cells = np.concatenate(means) if means else np.zeros((0, 2, len(bands)))
     which = np.concatenate(ends) if ends else np.zeros((0, 2), dtype=int)
-    gains, offsets = np.ones((count, bands)), np.zeros((count, bands))
-    before, after, outlying = np.zeros(bands), np.zeros(bands), np.zeros(bands)
-    for band in range(bands if len(cells) else 0):
-        gains[:, band], offsets[:, band], good = _solved(which, cells[:, :, band], count)
-        balanced_means = cells[:, :, band] * gains[which, band] + offsets[which, band]
-        before[band], after[band] = (
-            _rms(np.diff(values[good], axis=1)) for values in (cells[:, :, band], balanced_means)
-        )
-        outlying[band] = 1.0 - good.mean()
+    gains, offsets = np.ones((count, all_bands)), np.zeros((count, all_bands))
+    before, after, outlying = np.zeros(all_bands), np.zeros(all_bands), []
+    for band, of_band in zip(bands, np.moveaxis(cells, 2, 0), strict=True):
+        known = np.isfinite(of_band[:, 0])
+        if not known.any():
+            continue
+        layers, seen = which[known], of_band[known]
+        gains[:, band], offsets[:, band], good = _solved(layers, seen, count)
+        balanced_means = seen * gains[layers, band] + offsets[layers, band]
+        before[band], after[band] = (_rms(np.diff(values[good], axis=1)) for values in (seen, balanced_means))
+        outlying.append(1.0 - float(good.mean()))
     wrong = np.argwhere(~((gains > 1 / _LARGEST_GAIN) & (gains < _LARGEST_GAIN)))
     if len(wrong):
         layer, band = wrong[0]
@@ -123,7 +128,7 @@ def balanced(placed: Mosaic, pairs: Sequence[Overlap], *, memory: int = MEMORY) 
             field="mosaic.balance",
             remedy="leave the option out, or combine only scenes of one kind",
         )
-    return Balance(gains, offsets, before, after, len(cells), float(outlying.mean()))
+    return Balance(gains, offsets, before, after, len(cells), sum(outlying) / max(len(outlying), 1))
 
 
 def _rms(values: Array) -> float:
@@ -143,15 +148,16 @@ def _windows(box: Box) -> list[Box]:
 def _cell_means(values: Array, other: Array, valid: NDArray[np.bool_]) -> Array:
     """Return the means of both ``(n, 2, bands)`` over the cells of a window that are valid in both.
 
-    A cell all of whose pixels are equal is saturated, or filled: it tells nothing.
+    A cell all of whose pixels are equal is saturated, or filled: it tells nothing. It is NaN in such a band, and left
+    out if all bands are so.
     """
     rows, columns = valid.shape[0] // _CELL, valid.shape[1] // _CELL
     cells = (..., slice(0, rows * _CELL), slice(0, columns * _CELL))
     full = valid[cells].reshape(rows, _CELL, columns, _CELL).all(axis=(1, 3))
     parts = [part[cells].reshape(len(part), rows, _CELL, columns, _CELL) for part in (values, other)]
-    for part in parts:
-        full &= (part.max(axis=(2, 4)) > part.min(axis=(2, 4))).all(axis=0)
-    return np.stack([part.mean(axis=(2, 4))[:, full].T for part in parts], axis=1)
+    varied = np.all([part.max(axis=(2, 4)) > part.min(axis=(2, 4)) for part in parts], axis=0)
+    full &= varied.any(axis=0)
+    return np.stack([np.where(varied, part.mean(axis=(2, 4)), np.nan)[:, full].T for part in parts], axis=1)
 
 
 def _solved(ends: NDArray[np.int_], cells: Array, count: int) -> tuple[Array, Array, NDArray[np.bool_]]:
