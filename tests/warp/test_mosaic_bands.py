@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pyproj
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.warp.mosaic import Ortho, balanced, lay_out, overlaps, owners_of, write_cog
@@ -105,3 +107,43 @@ def test_bands_are_balanced_beside_one_that_has_no_brightness(tmp_path, last):
     np.testing.assert_allclose(values[:3], exact, rtol=0, atol=0.6)
     seen = [gdal.Open(str(ortho.path)).ReadAsArray()[3] for ortho in orthos]
     np.testing.assert_array_equal(values[3], np.concatenate([seen[0], seen[1][:, 40:]], axis=1))
+
+
+# -- what bands have to share ----------------------------------------------------------------------------------------
+
+
+def table(*colours: tuple[int, int, int, int]) -> gdal.ColorTable:
+    made = gdal.ColorTable()
+    for value, colour in enumerate(colours):
+        made.SetColorEntry(value, colour)
+    return made
+
+
+BLUE, RED = (0, 0, 255, 255), (255, 0, 0, 255)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"scales": ((0.02, 0.0, ""),)},
+            "band 1 of b.tif has scale 0.02 and offset 0, but that of a.tif has 0.01 and 0",
+        ),
+        ({"scales": ((0.01, -1.0, ""),)}, "has scale 0.01 and offset -1, but"),
+        ({"color_table": table(RED, BLUE)}, "b.tif and a.tif have different colour tables"),
+        ({"color_table": None}, "different colour tables"),
+        ({}, ""),
+    ],
+)
+def test_equal_pixels_must_mean_the_same(tmp_path, changes, message):
+    one = Profile(1, np.dtype("uint8"), "mask", scales=((0.01, 0.0, ""),), color_table=table(BLUE, RED))
+    orthos = [
+        Ortho(name, write(tmp_path / f"{name}.tif", np.ones((1, 20, 80)), LEFT[name], profile))
+        for name, profile in (("a", one), ("b", dataclasses.replace(one, **changes)))
+    ]
+    if not changes:
+        assert len(lay_out(orthos).layers) == 2
+        return
+    with pytest.raises(InputError, match=message) as refused:
+        lay_out(orthos, "first-on-top")
+    assert refused.value.file == str(tmp_path / "b.tif")

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.files.shell import converted, typed
+from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.regridded import grid_of, warped_bounds
 from ortho_pipeline.raster.source import Grid, RasterSource
 
@@ -65,7 +67,8 @@ def lay_out(orthos: Sequence[Ortho], order: str = "best-view") -> Mosaic:
     Raises
     ------
     InputError
-        If they do not share a grid, or differ in bands, type or nodata; if one has no accuracy that would decide.
+        If they do not share a grid, or differ in bands, type, nodata, scale, offset or colour table; if one has no
+        accuracy that would decide.
     """
     if not orthos:
         raise InputError("a mosaic needs at least one ortho", field="mosaic")
@@ -186,6 +189,32 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
                     "another one. The copy has no report, so the order best-view puts it last"
                 )
             raise InputError(what, file=ortho.path, remedy=remedy)
+    _check_meaning(orthos)
+
+
+def _check_meaning(orthos: Sequence[Ortho]) -> None:
+    """Raise an `InputError` if equal pixels of two orthos mean different values or colours."""
+    profiles = [Profile.of(RasterSource(ortho.path)) for ortho in orthos]
+    first, name = profiles[0], orthos[0].path.name
+    for ortho, profile in zip(orthos, profiles, strict=True):
+        what = ""
+        for band, (one, other) in enumerate(zip(first.scales, profile.scales, strict=True), 1):
+            if one[:2] != other[:2]:
+                what = (
+                    f"band {band} of {ortho.path.name} has scale {other[0]:g} and offset {other[1]:g}, but that of "
+                    f"{name} has {one[0]:g} and {one[1]:g}"
+                )
+        if not _same_colours(first.color_table, profile.color_table):
+            what = f"{ortho.path.name} and {name} have different colour tables"
+        if what:
+            raise InputError(what, file=ortho.path, field="orthos", remedy="combine only orthos of one kind")
+
+
+def _same_colours(one: Any, other: Any) -> bool:
+    """Return whether two of GDAL's colour tables (None without) agree in the colours that both have."""
+    if one is None or other is None:
+        return one is other
+    return all(one.GetColorEntry(k) == other.GetColorEntry(k) for k in range(min(one.GetCount(), other.GetCount())))
 
 
 # -- windows ---------------------------------------------------------------------------------------------------------
