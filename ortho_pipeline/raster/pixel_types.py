@@ -20,9 +20,12 @@ def numpy_type(gdal_type: int) -> np.dtype[Any]:
 
 
 def nodata_of(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:
-    """Return the nodata value of a band, None if it has none that the pixel type can hold."""
-    value = band.GetNoDataValue()
-    return value if value is not None and holds(dtype, value) else None
+    """Return the nodata value of a band, None if it has none that the band and the pixel type can hold."""
+    value, own = band.GetNoDataValue(), numpy_type(band.DataType)
+    if value is None or not (holds(own, value) and holds(dtype, value)):
+        return None
+    # As its pixels have it: a header may state more digits, such as -9999.9 of Float32.
+    return float(own.type(value)) if own.kind == "f" else value
 
 
 def holds(dtype: np.dtype[Any], value: float) -> bool:

@@ -38,6 +38,10 @@ def test_a_nodata_value_that_no_pixel_can_have_is_none() -> None:
     band.SetNoDataValue(-9999.0)
     assert nodata_of(band, np.dtype("u1")) is None
     assert nodata_of(band, np.dtype("i2")) == -9999.0
+    dataset = gdal.GetDriverByName("MEM").Create("", 1, 1, 1, gdal.GDT_Float32)
+    band = dataset.GetRasterBand(1)
+    band.SetNoDataValue(1e300)
+    assert nodata_of(band, np.dtype("f8")) is None
 
 
 def test_types_have_the_names_of_gdal_whatever_their_case() -> None:

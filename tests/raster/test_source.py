@@ -7,6 +7,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.raster.ortho import Profile
 from ortho_pipeline.raster.source import RasterSource, open_dataset
 
 
@@ -59,6 +60,30 @@ def test_which_pixels_are_valid(tmp_path, written, bands, validity, invalid):
     np.testing.assert_array_equal(np.broadcast_to(valid, pixels.shape)[:1], expected[:1])
     if validity != "alpha":
         np.testing.assert_array_equal(valid, expected)
+
+
+@pytest.mark.parametrize("dtype", [None, "Float64", "Int32"])
+def test_nodata_with_more_digits_than_a_pixel_has_is_that_of_the_pixels(tmp_path, dtype):
+    """A VRT and the header of an ENVI file state -9999.9, and float32 holds -9999.900390625: GDAL's mask knows."""
+    made = gdal.GetDriverByName("ENVI").Create(str(tmp_path / "a.img"), 3, 2, 1, gdal.GDT_Float32)
+    made.WriteArray(np.array([[1.5, -9999.9, 3.0], [4.0, 5.0, -9999.9]], dtype=np.float32))
+    made.FlushCache()
+    gdal.Translate(str(tmp_path / "a.vrt"), made, format="VRT", noData=-9999.9).FlushCache()
+    del made
+    (tmp_path / "a.img.aux.xml").unlink(missing_ok=True)
+    header = tmp_path / "a.hdr"
+    header.write_text(header.read_text().rstrip() + "\ndata ignore value = -9999.9\n")
+    view = tmp_path / "a.vrt"
+    view.write_text(view.read_text().replace("-9999.900390625", "-9999.9").replace("-9999.90039062", "-9999.9"))
+    for name in ("a.img", "a.vrt"):
+        source = RasterSource(tmp_path / name, dtype=dtype)
+        assert source.bands[0].GetNoDataValue() == -9999.9
+        pixels = source.read(0, 0, 3, 2)
+        by_gdal = source.bands[0].GetMaskBand().ReadAsArray() > 0
+        np.testing.assert_array_equal(source.read_valid(0, 0, pixels)[0], by_gdal)
+        assert by_gdal.sum() == 4
+        written = Profile.of(source, dtype="Float64").nodata
+        assert written == np.float32(-9999.9).astype(float)
 
 
 def test_bands_of_several_files_are_valid_each_as_in_its_own(tmp_path):
