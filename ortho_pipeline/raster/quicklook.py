@@ -35,7 +35,8 @@ def preview_png(
     mask = bands[0].GetMaskBand().ReadAsArray(**reading) > 0
     # Without overviews an average has to look at every pixel, which takes as long as making them did.
     way = {"resample_alg": _AVERAGE} if bands[0].GetOverviewCount() else {}
-    return shaded_png(np.stack([np.abs(band.ReadAsArray(**way, **reading)) for band in bands]), mask)
+    pixels = np.stack([band.ReadAsArray(**way, **reading) for band in bands])
+    return shaded_png(np.abs(pixels) if np.iscomplexobj(pixels) else pixels, mask)
 
 
 def shaded_png(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> bytes:

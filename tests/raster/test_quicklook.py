@@ -80,3 +80,16 @@ def test_three_bands_are_colours_in_their_order(tmp_path: Path) -> None:
     assert (np.diff(red, axis=0)[2:-2] > 0).all()
     assert (np.diff(green, axis=1)[:, 2:-2] > 0).all()
     assert (np.diff(blue, axis=0)[2:-2] < 0).all()
+
+
+@pytest.mark.parametrize("kind", [gdal.GDT_Float32, gdal.GDT_Int16, gdal.GDT_CFloat32])
+def test_larger_values_are_brighter_and_complex_ones_by_their_magnitude(tmp_path: Path, kind: int) -> None:
+    """Backscatter in dB is negative."""
+    values = np.tile(np.linspace(-200, 94, 50), (20, 1))
+    dataset = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 50, 20, 1, kind)
+    dataset.GetRasterBand(1).WriteArray(values * 1j if kind == gdal.GDT_CFloat32 else values)
+    del dataset
+    seen = np.abs(values) if kind == gdal.GDT_CFloat32 else values
+    low, high = np.percentile(seen, (1, 99))
+    grey = picture(preview_png(tmp_path / "a.tif"))[0]
+    assert np.abs(grey - np.clip((seen - low) / (high - low), 0, 1) * 255).max() <= 1
