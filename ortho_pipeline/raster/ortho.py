@@ -82,7 +82,9 @@ class Profile:
         elif source.validity == "nodata" and len(values) == 1:
             validity, empty = "nodata", _kept_nodata(source.nodata[0], kind, source)
         else:
-            validity, empty = ("alpha" if source.validity == "alpha" else "mask"), None
+            # The range of alpha is that of its type, and GDAL knows none of floating point.
+            alpha = source.validity == "alpha" and kind == source.dtype and kind.kind != "f"
+            validity, empty = ("alpha" if alpha else "mask"), None
         return cls(
             count=source.count,
             dtype=kind,

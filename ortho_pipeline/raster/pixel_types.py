@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files.shell import typed
 from ortho_pipeline.options import PIXEL_TYPES
 
 
@@ -17,6 +19,20 @@ def numpy_type(gdal_type: int) -> np.dtype[Any]:
     from osgeo import gdal_array
 
     return np.dtype(gdal_array.GDALTypeCodeToNumericTypeCode(gdal_type))
+
+
+def check_types(bands: Sequence[gdal.Band], path: str) -> None:
+    """Raise an `InputError` if the pixels of a band cannot be read as numbers that can be resampled."""
+    if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
+        raise InputError("complex pixels cannot be resampled", file=path, remedy="split them into real bands first")
+    if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
+        # GDAL before 3.7 gives bytes with a sign as bytes without one.
+        raise InputError(
+            "this GDAL reads signed bytes wrongly, as 0 to 255",
+            file=path,
+            remedy=f"convert them to 16 bits: `gdal_calc.py -A {typed(path)} --type=Int16 "
+            "--calc='A.astype(int8).astype(int16)' --outfile=int16.tif`",
+        )
 
 
 def nodata_of(band: gdal.Band, dtype: np.dtype[Any]) -> float | None:

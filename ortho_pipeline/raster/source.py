@@ -26,11 +26,11 @@ from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
-from ortho_pipeline.files.shell import converted, typed
+from ortho_pipeline.files.shell import converted
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.opening.drivers import DRIVERS
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
-from ortho_pipeline.raster.pixel_types import nodata_of, numpy_type, read_type
+from ortho_pipeline.raster.pixel_types import check_types, nodata_of, numpy_type, read_type
 from ortho_pipeline.runtime.process_limits import require_memory
 
 gdal.UseExceptions()
@@ -287,29 +287,21 @@ class _RasterFile:
         self.numbers = tuple(numbers or range(1, dataset.RasterCount + 1))
         self.count = len(self.numbers)
         bands = self.bands
-        if any(gdal.DataTypeIsComplex(band.DataType) for band in bands):
-            raise InputError(
-                "complex pixels cannot be resampled", file=self.path, remedy="split them into real bands first"
-            )
-        if any(band.GetMetadataItem("PIXELTYPE", "IMAGE_STRUCTURE") == "SIGNEDBYTE" for band in bands):
-            # GDAL before 3.7 gives bytes with a sign as bytes without one.
-            raise InputError(
-                "this GDAL reads signed bytes wrongly, as 0 to 255",
-                file=self.path,
-                remedy=f"convert them to 16 bits: `gdal_calc.py -A {typed(self.path)} --type=Int16 "
-                "--calc='A.astype(int8).astype(int16)' --outfile=int16.tif`",
-            )
+        check_types(bands, self.path)
         self.dtype = np.result_type(*(numpy_type(band.DataType) for band in bands))
         self.nodata = tuple(nodata_of(band, self.dtype) for band in bands)
         self.palette = any(band.GetColorTable() is not None for band in bands)
-        flags = self._io(bands[0].GetMaskFlags)
+        every = [self._io(band.GetMaskFlags) for band in bands]
+        # The mask of alpha is that of the other bands: an alpha band has none itself.
+        lead = next((k for k, flags in enumerate(every) if flags & gdal.GMF_PER_DATASET), 0)
+        self._mask_numbers, flags = self.numbers[lead : lead + 1], every[lead]
         # GDAL's own order: a mask of the dataset counts in addition to nodata.
         self._masked = bool(flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA))
         if any(value is not None for value in self.nodata):
             self.validity = "nodata"
         elif flags & gdal.GMF_ALPHA:
-            # Without its alpha band the ortho needs a mask.
-            kept = any(band.GetColorInterpretation() == gdal.GCI_AlphaBand for band in bands)
+            # To GDAL alpha is the last of two or four bands; an ortho of other bands needs a mask.
+            kept = len(bands) in (2, 4) and bands[-1].GetColorInterpretation() == gdal.GCI_AlphaBand
             self.validity = "alpha" if kept else "mask"
         else:
             self.validity = "mask" if flags & gdal.GMF_PER_DATASET else "all"
@@ -341,7 +333,8 @@ class _RasterFile:
                 if value is not None and not math.isnan(value):
                     np.not_equal(pixels[band], pixels.dtype.type(value), out=valid[band])
         if self._masked or self.validity in ("mask", "alpha"):
-            mask = self._io(self.bands[0].GetMaskBand().ReadAsArray, left, top, width, height) != 0
+            masks = [self.dataset.GetRasterBand(number).GetMaskBand() for number in self._mask_numbers]
+            mask = np.stack([self._io(mask.ReadAsArray, left, top, width, height) != 0 for mask in masks])
             valid = np.broadcast_to(mask, pixels.shape).copy() if valid is None else valid & mask
         if pixels.dtype.kind == "f":
             numbers = ~np.isnan(pixels)
@@ -430,7 +423,7 @@ class RasterSource:
         self.palette = any(file.palette for file in self._files)
         self.block = sum(file.block for file in self._files)
         kinds = {file.validity for file in self._files}
-        self.validity = kinds.pop() if len(kinds) == 1 else "mask"
+        self.validity = kinds.pop() if len(kinds) == 1 and (len(self._files) == 1 or kinds != {"alpha"}) else "mask"
 
     def _chosen(self, bands: Sequence[int]) -> list[tuple[AnyPath, list[int]]]:
         """Return the files, in the order wanted, with the numbers of their bands; a file may come twice."""

@@ -90,10 +90,16 @@ class Transformer:
         """Largest error (px) with which it may represent a model."""
         return EXPRESSED if self.method.startswith("GCP") else REFUSE_ERROR
 
-    def source(self, dataset: gdal.Dataset, bands: tuple[int, ...] = (1,)) -> gdal.Dataset:
-        """Return a view of some bands of an image that has the georeferencing of this transformer and no other."""
+    def source(self, dataset: gdal.Dataset, bands: tuple[int, ...] = (1,), *, mask: str | None = None) -> gdal.Dataset:
+        """Return a view of some bands of an image that has the georeferencing of this transformer and no other.
+
+        `mask` is the band whose mask it has, by GDAL's name, instead of its own.
+        """
         # A geotransform cannot be taken away again; points keep Translate from copying it.
-        view = gdal.Translate("", dataset, format="VRT", bandList=list(bands), GCPs=[gdal.GCP()])
+        view = gdal.Translate("", dataset, format="VRT", bandList=list(bands), GCPs=[gdal.GCP()], maskBand=mask)
+        if mask:
+            # The warper would take an alpha band at the end for the mask, and not warp it.
+            view.GetRasterBand(view.RasterCount).SetColorInterpretation(gdal.GCI_Undefined)
         view.SetGCPs(list(self.gcps), self.gcp_crs)
         view.SetMetadata(dict(self.rpc), "RPC")
         view.SetMetadata({}, "GEOLOCATION")
@@ -197,7 +203,9 @@ def rectify(job: WarpJob, path: str | os.PathLike[str] | Hiding) -> WarpRecord:
         for temporary in (arrays, target):
             scratch.callback(temporary.unlink, missing_ok=True)
         transformer = _standing(exact, job.exported, source.dataset, arrays, scratch)
-        view = transformer.source(source.dataset, tuple(source.band_numbers))
+        # Alpha that is no alpha of the ortho.
+        alpha = source.dataset.GetRasterBand(1).GetMaskFlags() & gdal.GMF_ALPHA and profile.validity != "alpha"
+        view = transformer.source(source.dataset, tuple(source.band_numbers), mask="mask,1" if alpha else None)
         with written(_create(target, profile, grid)) as ortho:
             _describe(ortho, profile)
             transformer.georeference(ortho, grid)

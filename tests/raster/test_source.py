@@ -43,6 +43,7 @@ def raster(path, count=2, nodata=None, alpha=False, masked=False) -> str:
         ({"nodata": 7}, None, "nodata", [(0, 0, 0), (1, 0, 0), (1, 0, 1)]),
         ({"alpha": True}, None, "alpha", [(0, 0, 0)]),
         ({"alpha": True}, [1], "mask", [(0, 0, 0)]),
+        ({"alpha": True}, [2, 1], "mask", [(0, 0, 0), (1, 0, 0)]),
         ({"masked": True}, None, "mask", [(0, 1, 2), (1, 1, 2)]),
         ({"masked": True, "nodata": 7}, None, "nodata", [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 1, 2), (1, 1, 2)]),
     ],

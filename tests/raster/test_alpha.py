@@ -1,0 +1,70 @@
+"""Images with an alpha band: where it is 0 an ortho has no value, whatever bands it has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from osgeo import gdal, osr
+
+from ortho_pipeline.cli.program import cli
+from ortho_pipeline.raster.source import RasterSource
+
+SIDE = 40
+
+
+def write(path: Path) -> np.ndarray:
+    """Write an image of red, green, blue and alpha; return its bands."""
+    pixels = np.random.default_rng(3).integers(1, 255, (4, SIDE, SIDE)).astype(np.uint8)
+    pixels[3] = 255
+    pixels[:, 5:15], pixels[3, 20:30] = 0, 128
+    made = gdal.GetDriverByName("GTiff").Create(str(path), SIDE, SIDE, 4, options=["PHOTOMETRIC=RGB", "ALPHA=YES"])
+    made.SetGeoTransform((500000.0, 10.0, 0.0, 4100000.0, 0.0, -10.0))
+    utm = osr.SpatialReference()
+    utm.ImportFromEPSG(32636)
+    made.SetProjection(utm.ExportToWkt())
+    made.WriteArray(pixels)
+    return pixels
+
+
+def rectified(folder: Path, *options: str) -> gdal.Dataset:
+    grid = ["-tr", 10, 10, "-te", 500000, 4099600, 500400, 4100000]
+    asked = [folder / "image.tif", "-o", folder / "o", "--ortho", "--height", 0, *grid, "-r", "nearest", *options]
+    done = CliRunner().invoke(cli, ["rectify", *map(str, asked)])
+    assert done.exit_code == 0, done.output
+    return gdal.Open(str(folder / "o" / "image_ortho.tif"))
+
+
+@pytest.mark.parametrize("engine", ["ortho", "gdal"])
+@pytest.mark.parametrize("bands", [(3, 1), (4, 1), (2, 1, 4), (1, 4), (1, 4, 2, 3), (1, 2, 3, 4)])
+def test_transparent_pixels_have_no_value_in_any_choice_of_bands(tmp_path, engine, bands):
+    pixels = write(tmp_path / "image.tif")
+    ortho = rectified(tmp_path, "-b", ",".join(map(str, bands)), "--engine", engine)
+    valid = ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+    np.testing.assert_array_equal(valid, pixels[3] > 0)
+    # To GDAL alpha is the last of two or four bands.
+    flags = gdal.GMF_PER_DATASET | (gdal.GMF_ALPHA if bands in ((1, 4), (1, 2, 3, 4)) else 0)
+    assert ortho.GetRasterBand(1).GetMaskFlags() == flags
+    chosen = pixels[np.array(bands) - 1]
+    np.testing.assert_array_equal(ortho.ReadAsArray()[:, valid], chosen[:, valid])
+
+
+@pytest.mark.parametrize("engine", ["ortho", "gdal"])
+@pytest.mark.parametrize("kind", ["UInt16", "Int16", "Float32"])
+def test_an_ortho_of_another_type_has_a_mask_and_keeps_the_values_of_alpha(tmp_path, engine, kind):
+    pixels = write(tmp_path / "image.tif")
+    ortho = rectified(tmp_path, "-ot", kind, "--engine", engine)
+    valid = ortho.GetRasterBand(1).GetMaskBand().ReadAsArray() > 0
+    np.testing.assert_array_equal(valid, pixels[3] > 0)
+    np.testing.assert_array_equal(ortho.ReadAsArray()[:, valid], pixels[:, valid])
+
+
+def test_two_files_with_an_alpha_band_each_have_a_mask(tmp_path):
+    pixels = write(tmp_path / "a.tif")
+    write(tmp_path / "b.tif")
+    source = RasterSource(tmp_path / "a.tif", tmp_path / "b.tif")
+    assert source.validity == "mask"
+    valid = source.read_valid(0, 0, source.read(0, 0, SIDE, SIDE))
+    np.testing.assert_array_equal(valid, np.broadcast_to(pixels[3] > 0, (8, SIDE, SIDE)))
