@@ -266,6 +266,8 @@ _LAYOUT = frozenset(
         """,
     )
 )
+#: Values of options with others of which GDAL writes a part of the metadata to a second file, or not at all.
+_COMPLETE = {"PROFILE": ("GDALGEOTIFF",), "TFW": ("NO", "FALSE", "OFF", "0")}
 _PLAIN_VALUE = re.compile(r"[\w.,+-]{1,80}")
 
 
@@ -298,6 +300,12 @@ def checked_options(driver: str, chosen: dict[str, str], threads: int, side: int
                 f"{value[:60]!r} is not a value of the creation option {key}",
                 field="creation option",
                 remedy=f"{key} takes: {values}",
+            )
+        if key in _COMPLETE and value.upper() not in _COMPLETE[key]:
+            raise InputError(
+                f"the creation option {key}={value} is not allowed: the ortho has all metadata in its own file",
+                field="creation option",
+                remedy=f"leave out {key}",
             )
     defaults = {"BIGTIFF": "IF_SAFER"}
     if driver == "GTiff":

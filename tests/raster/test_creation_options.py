@@ -49,6 +49,23 @@ def test_what_changes_more_than_the_layout_is_refused(chosen: dict[str, str], sa
 
 
 @pytest.mark.parametrize(
+    ("option", "allowed", "refused"),
+    [
+        ("PROFILE", ("GDALGeoTIFF", "gdalgeotiff"), ("GeoTIFF", "BASELINE", "baseline")),
+        ("tfw", ("NO", "off"), ("YES", "true", "1")),
+    ],
+)
+def test_metadata_stay_in_the_file(option: str, allowed: tuple[str, ...], refused: tuple[str, ...]) -> None:
+    """A second file would have the temporary name of the ortho, and be lost."""
+    for value in allowed:
+        assert checked_options("GTiff", {option: value}, 1)[option.upper()] == value
+    for value in refused:
+        with pytest.raises(InputError, match=f"{option.upper()}={value} is not allowed") as caught:
+            checked_options("GTiff", {option: value}, 1)
+        assert caught.value.remedy == f"leave out {option.upper()}"
+
+
+@pytest.mark.parametrize(
     ("option", "good", "bad"),
     [
         ('type="int" min="1" max="9"', ("1", "9", "+5"), ("0", "10", "1.5", "many")),
