@@ -422,6 +422,11 @@ def test_what_cannot_be_is_refused(tmp_path):
             mosaic(paths, tmp_path / "m.vrt", MosaicOptions(format="VRT", **{field: True}))
         assert caught.value.field == f"mosaic.{field}"
         assert not (tmp_path / "m.vrt").exists()
+    with pytest.raises(InputError, match="orthos in its folder or below") as caught:
+        mosaic(paths, tmp_path / "elsewhere" / "m.vrt", MosaicOptions(format="VRT"))
+    assert caught.value.file == str(one.path)
+    assert "a folder that contains all orthos" in str(caught.value.remedy)
+    assert not (tmp_path / "elsewhere").exists()
     with pytest.raises(InputError, match="listed twice"):
         mosaic([*paths, one.path], tmp_path / "m.tif")
     with pytest.raises(InputError, match="both input and output"):

@@ -76,7 +76,7 @@ def mosaic(
     paths = [place(located(ortho, allow_network=allow_network)) for ortho in orthos]
     options, path = options or MosaicOptions(format="COG"), Path(path)
     if options.format == "VRT":
-        _refuse_far(paths)
+        _refuse_far(paths, path)
     files = mosaic_files(path)
     _check_paths(paths, files)
     layers = [_ortho(ortho, name) for ortho, name in zip(paths, _names(paths), strict=True)]
@@ -93,14 +93,17 @@ def mosaic_files(path: Path) -> dict[str, Path]:
     return {"mosaic": path, "seams": path.with_suffix(".json"), "page": path.with_suffix(".html")}
 
 
-def _refuse_far(orthos: Sequence[Path]) -> None:
+def _refuse_far(orthos: Sequence[Path], path: Path) -> None:
+    folder = path.parent.resolve()
     for ortho in orthos:
-        if Location(ortho).is_far:
+        far = Location(ortho).is_far
+        if far or not ortho.resolve().is_relative_to(folder):
+            name = "use a name of the mosaic that ends in .tif"
             raise InputError(
                 "a VRT can only refer to orthos in its folder or below",
                 file=ortho,
                 field="output",
-                remedy="use a name of the mosaic that ends in .tif",
+                remedy=name if far else f"write the mosaic to a folder that contains all orthos, or {name}",
             )
 
 
