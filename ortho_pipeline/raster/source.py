@@ -294,9 +294,11 @@ class _RasterFile:
         every = [self._io(band.GetMaskFlags) for band in bands]
         # The mask of alpha is that of the other bands: an alpha band has none itself.
         lead = next((k for k, flags in enumerate(every) if flags & gdal.GMF_PER_DATASET), 0)
-        self._mask_numbers, flags = self.numbers[lead : lead + 1], every[lead]
+        flags, own = every[lead], 0 in every  # 0: a mask of this band alone
+        self._mask_numbers = self.numbers if own else self.numbers[lead : lead + 1]
         # GDAL's own order: a mask of the dataset counts in addition to nodata.
-        self._masked = bool(flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA))
+        masked = flags & gdal.GMF_PER_DATASET and not flags & (gdal.GMF_NODATA | gdal.GMF_ALPHA)
+        self._masked = own or bool(masked)
         if any(value is not None for value in self.nodata):
             self.validity = "nodata"
         elif flags & gdal.GMF_ALPHA:
@@ -304,7 +306,7 @@ class _RasterFile:
             kept = len(bands) in (2, 4) and bands[-1].GetColorInterpretation() == gdal.GCI_AlphaBand
             self.validity = "alpha" if kept else "mask"
         else:
-            self.validity = "mask" if flags & gdal.GMF_PER_DATASET else "all"
+            self.validity = "mask" if own or flags & gdal.GMF_PER_DATASET else "all"
 
     @property
     def dataset(self) -> gdal.Dataset:

@@ -240,6 +240,13 @@ def _check(job: WarpJob) -> None:
             field="engine",
             remedy="use the default engine",
         )
+    if any(band.GetMaskFlags() == 0 for band in job.source.bands):
+        raise InputError(
+            "GDAL's warper ignores masks of single bands",
+            file=job.source.path,
+            field="engine",
+            remedy="use the default engine",
+        )
 
 
 # -- transformers that represent a model -------------------------------------------------------------------------------

@@ -63,6 +63,28 @@ def test_which_pixels_are_valid(tmp_path, written, bands, validity, invalid):
         np.testing.assert_array_equal(valid, expected)
 
 
+@pytest.mark.parametrize("nodata", [None, 4])
+@pytest.mark.parametrize("bands", [None, [2], [3, 1]])
+def test_a_mask_of_each_band_is_that_of_its_band(tmp_path, monkeypatch, bands, nodata):
+    pixels, path = np.arange(18, dtype=np.uint8).reshape(3, 2, 3), tmp_path / "a.tif"
+    masks = np.random.default_rng(1).random((3, 2, 3)) > 0.4
+    made = gdal.GetDriverByName("GTiff").Create(str(path), 3, 2, 3)
+    made.WriteArray(pixels)
+    monkeypatch.setenv("GDAL_TIFF_INTERNAL_MASK", "NO")
+    for band, mask in enumerate(masks, 1):
+        made.GetRasterBand(band).CreateMaskBand(0)
+        made.GetRasterBand(band).GetMaskBand().WriteArray(mask.astype(np.uint8) * 255)
+    if nodata is not None:
+        made.GetRasterBand(1).SetNoDataValue(nodata)
+    del made
+    source = RasterSource(path, bands=bands)
+    chosen = np.array(bands or [1, 2, 3]) - 1
+    assert {band.GetMaskFlags() for band in source.bands} == {0}
+    assert source.validity == ("mask" if nodata is None else "nodata")
+    valid = source.read_valid(0, 0, source.read(0, 0, 3, 2))
+    np.testing.assert_array_equal(valid, (masks & (pixels != nodata))[chosen])
+
+
 @pytest.mark.parametrize("dtype", [None, "Float64", "Int32"])
 def test_nodata_with_more_digits_than_a_pixel_has_is_that_of_the_pixels(tmp_path, dtype):
     """A VRT and the header of an ENVI file state -9999.9, and float32 holds -9999.900390625: GDAL's mask knows."""

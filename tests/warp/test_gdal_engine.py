@@ -154,6 +154,16 @@ def test_gdals_warper_refuses_to_look_for_what_terrain_hides(tmp_path):
     assert not (tmp_path / "ortho.tif").exists()
 
 
+def test_gdals_warper_refuses_masks_of_single_bands(tmp_path, monkeypatch):
+    monkeypatch.setenv("GDAL_TIFF_INTERNAL_MASK", "NO")
+    image = gdal.Open(ramp(tmp_path).path, gdal.GA_Update)
+    image.GetRasterBand(2).CreateMaskBand(0)
+    del image
+    job = WarpJob(frame(), RasterSource(tmp_path / "ramp.tif"), FlatSurface(500.0), GRID)
+    with pytest.raises(InputError, match="ignores masks of single bands"):
+        engine_of("gdal").rectify(job, tmp_path / "ortho.tif")
+
+
 def has_homography() -> bool:
     dataset = gdal.GetDriverByName("MEM").Create("", 100, 100, 1)
     corners = ((0.0, 0.0), (0.0, 90.0), (80.0, 0.0), (80.0, 90.0), (30.0, 20.0))
