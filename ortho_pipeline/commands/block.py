@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ortho_pipeline import host
 from ortho_pipeline.block.adjustment import adjust as adjust_block
 from ortho_pipeline.block.fit import BlockFit, ObjectRms
 from ortho_pipeline.block.intersection import Intersection
@@ -52,9 +51,8 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Text, counted
 from ortho_pipeline.estimation.records import Rmse
 from ortho_pipeline.exchange import rpc
-from ortho_pipeline.exchange.model_file import SavedModel, read_model_file, write_model_file
+from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.files import together, write_json, write_text
-from ortho_pipeline.files.locations import located
 from ortho_pipeline.models import ImageCorrection, SensorModel
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import (
@@ -215,11 +213,8 @@ def intersect(
     _check_paths(files, images, points, scenes, *models)
     table, notes = read_points(images, labels, points, scenes[0].allow_network)
     if models:
-        host.Host.discover()  # model families of plugins, which a file may name
-        files_of = dict(zip(labels, models, strict=True))
         chosen = {
-            label: read_model_file(located(path, allow_network=scenes[0].allow_network)).model
-            for label, path in files_of.items()
+            label: inputs.open_scene(image, own).model for label, image, own in zip(labels, images, scenes, strict=True)
         }
     else:
         scenes, placed = settled_scenes(images, labels, scenes, points)

@@ -231,7 +231,7 @@ def adjust(resolved: Resolved) -> Adjusted:
     scene, request = resolved.scene, resolved.request
     options, match, surface = request.points, request.match, resolved.surface
     points, matched = control_of(resolved)
-    is_delivered = request.scene.model is None
+    is_delivered = request.scene.model is None or scene.adjusted is None
     notes: tuple[Notice, ...] = ()
     if matched is not None and options.correction is options.fit_model is None and is_delivered:
         correction, note = by_matches(scene, matched.matches.points)

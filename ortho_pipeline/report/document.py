@@ -54,7 +54,7 @@ from ortho_pipeline.report.records import (
     SceneReport,
 )
 from ortho_pipeline.report.summary import summary_text
-from ortho_pipeline.report.wording import corrected, headline, refuted
+from ortho_pipeline.report.wording import corrected, headline, points_again, refuted
 from ortho_pipeline.surface.flat import FlatSurface
 
 if TYPE_CHECKING:
@@ -135,13 +135,14 @@ def build_report(
     covariance = analyse_fit(fit, near=near)
     noted = to_document([*warnings, *doubts, *patterns(covariance)])
     adjustment, rmse_m = _adjustment(fit, noted), rmse_metres(fit)
+    untested = refuted(noted["notices"]) or points_again(adjustment, scene.adjusted)
     return SceneReport(
         scene=_scene(scene, seen),
         adjustment=adjustment,
         rmse_m=rmse_m,
         view_rmse=_view_rmse(fit),
         covariance=covariance,
-        map_scale=None if refuted(noted["notices"]) else _map_scale(fit, seen, grid),
+        map_scale=None if untested else _map_scale(fit, seen, grid),
         control_hull=control_hull(fit.points.image[fit.used], (scene.width, scene.height)),
         comparison=comparison,
         matching=matching,
@@ -154,9 +155,7 @@ def build_report(
         warnings=tuple(noted["warnings"]),
         notices=tuple(noted["notices"]),
         headline=corrected(
-            headline(
-                adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted is not None, matching=matching
-            ),
+            headline(adjustment, rmse_m, accuracy_before(scene), adjusted=scene.adjusted, matching=matching),
             noted["notices"],
         ),
     )

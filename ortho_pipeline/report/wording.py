@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeGuard
 
 from ortho_pipeline.display.notices import Notice
@@ -54,12 +54,16 @@ def few_check_points(count: int) -> Notice:
     return Notice("few-check-points", text, count=count, enough=ENOUGH_CHECK_POINTS)
 
 
+#: Measurements that are nearer to each other (px) are one point: files round.
+_SAME_PLACE = 1e-3
+
+
 def headline(
     adjustment: Adjustment,
     rmse_m: RmsesOnGround | None,
     before: Headline | None = None,
     *,
-    adjusted: bool = False,
+    adjusted: Mapping[str, Any] | None = None,
     matching: MatchingRecord | None = None,
 ) -> Headline:
     """Say how accurate the result is, in words, from the best evidence that there is.
@@ -70,28 +74,33 @@ def headline(
         The accuracy on the ground, where it is known.
     before : Headline, optional
         What is said where there are no points (`delivered.accuracy_before`).
-    adjusted : bool
-        Whether the model was adjusted before.
+    adjusted : mapping, optional
+        How the model was adjusted before; a point that took part then is no test now.
     matching : MatchingRecord, optional
         Where points were matched: their figures are relative to the reference.
     """
-    if not adjustment.points:
-        return before or Headline(figure=UNKNOWN, metres=None, what="there are no points", notes=())
+    again = points_again(adjustment, adjusted)
+    if not adjustment.points or again:
+        what = f"this model was adjusted to {again} of these points" if again else "there are no points"
+        nothing = Headline(figure=UNKNOWN, metres=None, what=what, notes=())
+        return nothing if again or before is None else before
     rmse, ground = adjustment.rmse, rmse_m or RmsesOnGround(control=None, check=None, loo=None)
     notes = [*_left_out_notes(adjustment), *fit_notes(adjustment), *_outlying_notes(adjustment)]
     if matching is not None and matching.relative is not None:
         return _of_matches(matching, matching.relative, notes)
     evidence, to = evidence_of(adjustment), ", relative to the reference" if is_relative(adjustment) else ""
+    perhaps = "of a model that was adjusted before; a test only if it was adjusted to other points"
     if evidence == "check" and rmse.check:
-        what = f"RMSE at {counted(rmse.check.n, 'check point')} that took no part in the adjustment{to}"
+        apart = f"that took no part in the adjustment{to}" if adjusted is None or adjusted.get("points") else perhaps
+        what = f"RMSE at {counted(rmse.check.n, 'check point')} {apart}"
         if rmse.check.n < ENOUGH_CHECK_POINTS:
             notes.append(FEW)
         return _headline(rmse.check, ground.check, what, notes)
     if evidence == "delivered" and rmse.control:
         points = counted(rmse.control.n, "point")
         what = (
-            f"RMSE at {points} of a model that was adjusted before; a test only if it was adjusted to other points"
-            if adjusted
+            f"RMSE at {points} {perhaps}"
+            if adjusted is not None
             else f"RMSE at {points} of the model as delivered, which was not adjusted to them"
         )
         return _headline(rmse.control, ground.control, what, notes)
@@ -101,6 +110,20 @@ def headline(
         what = f"RMSE of {counted(rmse.loo.n, 'control point')}, each left out in turn{to}"
         return _headline(rmse.loo, ground.loo, what, notes)
     return Headline(figure=UNKNOWN, metres=None, what=NOTHING_LEFT, notes=tuple(notes))
+
+
+def points_again(adjustment: Adjustment, adjusted: Mapping[str, Any] | None) -> int:
+    """Return how many points that a test would be from took part when the model was adjusted before."""
+    before = [one["image"] for one in (adjusted or {}).get("points") or () if one.get("used")]
+    if not before or adjustment.parameters:
+        return 0
+    role = "check" if adjustment.rmse.check else "control"
+    tests = [one.image for one in adjustment.points if one.role == role and one.image is not None]
+    return sum(any(_is_near(one, other) for other in before) for one in tests)
+
+
+def _is_near(one: Sequence[float | None], other: Sequence[float | None]) -> bool:
+    return all(a is not None and b is not None and abs(a - b) < _SAME_PLACE for a, b in zip(one, other, strict=True))
 
 
 def evidence_of(adjustment: Adjustment, matching: MatchingRecord | None = None) -> Evidence | None:
