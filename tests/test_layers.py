@@ -88,6 +88,7 @@ GDAL_MODULES = {
     "raster.opening.references",
     "raster.caching.block_cache",
     "raster.source",
+    "raster.stored_crs",
     "raster.intensity",
     "raster.verified_writing",
     "raster.pixel_types",

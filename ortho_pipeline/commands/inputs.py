@@ -8,15 +8,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ortho_pipeline import host
 from ortho_pipeline.commands.orthos.opening import open_ortho
 from ortho_pipeline.commands.resolved.request import Request
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange import crop
-from ortho_pipeline.exchange.model_file import read_model_file
-from ortho_pipeline.files import allowed
+from ortho_pipeline.exchange.model_file import SavedModel, read_model_file
+from ortho_pipeline.files import allowed, sha256
 from ortho_pipeline.files.locations import Location, located
+from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import families
 from ortho_pipeline.options import PathLike, SceneOptions
@@ -25,6 +28,8 @@ from ortho_pipeline.raster.verified_writing import ATTACHED
 
 #: Sidecar files that GDAL attaches to an image of this stem, whatever the image itself contains.
 SIDE_CARS = ("_RPC.TXT", "_rpc.txt", ".RPB", ".rpb", "_metadata.txt", ".IMD")
+#: The own model of an image contradicts a saved one if it is off by this part of the shorter side, and so many px.
+_ANOTHER, _LEAST_ANOTHER = 0.1, 100.0
 #: Name of the "sensor" of an image that has no model of its own.
 POINTS_ONLY = "points only"
 
@@ -119,6 +124,8 @@ def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model
                 Setting("scene.crop_offset", "COL,ROW"),
             ),
         )
+    if offset is None:
+        _refuse_another(image, options, saved, model, size)
     scene = Scene(
         sensor=saved.sensor or "model file",
         path=image,
@@ -130,6 +137,37 @@ def _with_model_file(image: str | os.PathLike[str], options: SceneOptions, model
         adjusted=saved.adjusted,
     )
     return scene if offset is None else crop.placed(scene, dataset, offset)
+
+
+def _refuse_another(
+    image: str | os.PathLike[str], options: SceneOptions, saved: SavedModel, model: PathLike, size: tuple[int, int]
+) -> None:
+    """Refuse the model of another image of the same size, such as another photo of the camera.
+
+    The image's own model contradicts it by far, and it was not saved for a file with this content.
+    """
+    middle = np.array([[size[0] / 2, size[1] / 2]])
+    try:
+        own = host.open_scene(image, None, {}, **options.access).model
+        ground = saved.model.image_to_ground(middle, saved.model.reference_height)
+        seen = own.ground_to_image(ground_transform(saved.model.crs, own.crs)(ground))
+    except OrthoError:
+        return
+    if np.hypot(*(seen - middle)[0]) < max(_ANOTHER * min(size), _LEAST_ANOTHER) or not Path(image).is_file():
+        return
+    inputs = saved.provenance.get("inputs")
+    files = [one for one in inputs if isinstance(one, dict)] if isinstance(inputs, list) else []
+    known = {one.get("sha256") for one in files if one.get("role") == "image"}
+    if known and sha256(image) not in known:
+        raise InputError(
+            "this model was saved for another image; the model of this one places it elsewhere",
+            file=model,
+            field="scene.model",
+            remedy=Text(
+                "give the model file of this image; if it is a copy of the other, add ",
+                Setting("scene.crop_offset", "0,0"),
+            ),
+        )
 
 
 def open_image(image: str | os.PathLike[str], options: SceneOptions, *, needs_model: bool) -> Scene:

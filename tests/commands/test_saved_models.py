@@ -75,6 +75,34 @@ def test_a_model_that_was_saved_as_delivered_is_adjusted_like_the_delivered_one(
     assert "already adjusted" in again.output
 
 
+def test_a_model_of_another_image_of_the_same_size_is_refused(fitted: Path, tmp_path: Path) -> None:
+    """It put an image hundreds of metres off, with the accuracy of the image that it was adjusted for."""
+    model = fitted / "adjusted/scene_model.json"
+    other = tmp_path / "other.tif"
+    gdal.Translate(str(other), str(fitted / "scene.tif"))
+    rpc = gdal.Open(str(fitted / "scene.tif")).GetMetadata("RPC")
+
+    def place(shift: float) -> None:
+        for beside in tmp_path.glob("other*.xml"):
+            beside.unlink()
+        gdal.Open(str(other), gdal.GA_Update).SetMetadata(
+            rpc | {"LONG_OFF": str(float(rpc["LONG_OFF"].split()[0]) + shift)}, "RPC"
+        )
+
+    words = "info", other, "--model", model
+    place(0.0)
+    assert ortho(*words).exit_code == 0
+    place(0.004)
+    refused = ortho(*words)
+    assert refused.exit_code == 2
+    assert "saved for another image" in refused.output
+    # It is a copy: the person says so. And an image without a model of its own contradicts nothing.
+    assert ortho(*words, "--crop-offset", "0,0").exit_code == 0
+    bare = tmp_path / "bare.tif"
+    gdal.GetDriverByName("GTiff").Create(str(bare), 1000, 1000, 1).WriteArray(gdal.Open(str(other)).ReadAsArray())
+    assert ortho("info", bare, "--model", model).exit_code == 0
+
+
 def test_rays_need_models_of_their_own_images(sample: Path, tmp_path: Path) -> None:
     """A crop with the model of the whole image gave points ten kilometres off, without an error."""
     names = "BANDF", "BANDA"
