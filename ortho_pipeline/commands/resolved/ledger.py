@@ -34,7 +34,7 @@ from ortho_pipeline.surface.base import Surface
 
 #: Roles of files that have pixels, and of those among them whose side-cars are entered too.
 RASTERS = ("image", "DEM", "DEM accuracy", "reference", "other ortho")
-_ATTACHING = ("image", "DEM", "reference", "other ortho", "grid")
+_ATTACHING = ("image", "DEM", "DEM accuracy", "reference", "other ortho", "grid")
 #: The order of a record, by role; files that open a scene have roles of their sensor's and follow its image.
 _ORDER = {
     "image": 0,

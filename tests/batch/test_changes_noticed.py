@@ -1,0 +1,72 @@
+"""`ortho run` makes a scene again when something changes behind the files that the pipeline file names."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.exchange.rpc import rpc_metadata
+
+FILE = """
+defaults:
+  surface: {dem: dem.tif, vertical: ellipsoid}
+  output: {crs: "EPSG:32734", resolution: 5}
+scenes:
+  - images: raw/*.tif
+"""
+ALL_DONE = dict.fromkeys(("s0", "s1"), "done")
+UNCHANGED = dict.fromkeys(("s0", "s1"), "unchanged")
+
+
+@dataclasses.dataclass
+class Block:
+    """A folder with a pipeline file, two overlapping scenes and their DEM."""
+
+    folder: Path
+
+    def write(self, text: str) -> None:
+        (self.folder / "pipeline.yaml").write_text(text)
+
+    def run(self, **options: Any) -> dict[str, str]:
+        """Run in this process and return the state of each scene."""
+        result = batch.run(self.folder / "pipeline.yaml", executor="sequential", **options)
+        return {scene.name: scene.status for scene in result.scenes}
+
+
+@pytest.fixture
+def block(tiny: Any, tmp_path: Path) -> Block:
+    """Make a block of two scenes."""
+    (tmp_path / "raw").mkdir()
+    for number in range(2):
+        shift = 20 * number
+        model = dataclasses.replace(tiny.model, col_off=tiny.model.col_off - shift, row_off=tiny.model.row_off - shift)
+        scene = gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"raw/s{number}.tif"), 96, 80, 1, gdal.GDT_UInt16)
+        scene.SetMetadata(rpc_metadata(model), "RPC")
+        scene.WriteArray(gdal.Open(str(tiny.image)).ReadAsArray(shift, shift, 96, 80))
+        scene = None
+    (tmp_path / "dem.tif").write_bytes(tiny.dem.read_bytes())
+    made = Block(tmp_path)
+    made.write(FILE)
+    return made
+
+
+def test_a_changed_source_of_a_vrt_with_the_accuracy_of_the_dem(block: Block) -> None:
+    def write_sigma(value: float) -> None:
+        dem = gdal.Open(str(block.folder / "dem.tif"))
+        copy = gdal.GetDriverByName("GTiff").CreateCopy(str(block.folder / "sigma.tif"), dem)
+        copy.WriteArray(np.full((dem.RasterYSize, dem.RasterXSize), value, np.float32))
+        copy = None
+
+    write_sigma(2.0)
+    gdal.Translate(str(block.folder / "sigma.vrt"), str(block.folder / "sigma.tif"))
+    block.write(FILE.replace("vertical: ellipsoid", "vertical: ellipsoid, sigma: ./sigma.vrt"))
+    assert block.run() == ALL_DONE
+    assert block.run() == UNCHANGED
+    write_sigma(4.0)
+    assert block.run() == ALL_DONE
