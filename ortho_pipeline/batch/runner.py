@@ -46,6 +46,8 @@ from ortho_pipeline.report.stac import write_catalog
 from ortho_pipeline.runtime.process_limits import Progress
 from ortho_pipeline.warp.mosaic import Ortho, Overlap, measure_seam
 
+#: The record of the mosaic within the output folder.
+MOSAIC_RECORD = Path(STATE, "mosaic", "record.json")
 #: A larger file is not a report on a mosaic.
 _REPORT_BYTES = 50_000_000
 #: Seams from which on they are measured by several processes.
@@ -89,6 +91,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             mine = bool(job.run) and good.run == job.run
             seconds = good.seconds if mine else time.monotonic() - begin
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
+        _remove_mosaic_of(job)
         if record is not None:
             RunRecord(name=job.name, key="", status="started", outputs=before).write(job.record)
         result = _rectified(job)
@@ -152,6 +155,18 @@ def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: boo
     return fresh
 
 
+def _remove_mosaic_of(job: Job) -> None:
+    """Remove the mosaic if it has the ortho of this scene: a VRT would show the new ortho at the old place.
+
+    The next run of all scenes makes it again. The record goes last: a killed process leaves what the next one removes.
+    """
+    place = job.output / MOSAIC_RECORD
+    record = RunRecord.at(place)
+    if record is not None and any(state.role == job.name for state in record.inputs):
+        _remove(job.output, {state.path for state in record.outputs})
+        place.unlink(missing_ok=True)
+
+
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
     """Return outputs of unchanged content with their present dates."""
     return tuple(state.replaced(mtime_ns=(folder / state.path).stat().st_mtime_ns) for state in outputs)
@@ -208,8 +223,9 @@ def run(
     scheduler : str, optional
         Address of a dask scheduler.
     only, shard : optional
-        Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes. In a shared
-        `store` a worker that has finished its part goes on with what is left of the other parts of `only`.
+        Names of scenes, or (k, n) for the k-th of n parts. The mosaic is made by a run of all scenes; a part that
+        makes one of its scenes again removes it. In a shared `store` a worker that has finished its part goes on with
+        what is left of the other parts of `only`.
     checksums : bool
         Take all checksums again.
     allow_network : bool
@@ -373,7 +389,7 @@ class _Mosaic:
         self.output, self.settings = planned.output, planned.mosaic
         self.path = planned.output / f"mosaic.{'vrt' if self.settings.format == 'VRT' else 'tif'}"
         self.report, self.page = planned.output / RUN_FILES["seams"], planned.output / RUN_FILES["page"]
-        self.record = planned.output / STATE / "mosaic" / "record.json"
+        self.record = planned.output / MOSAIC_RECORD
         self.orthos = [
             Ortho(
                 job.name,
@@ -402,15 +418,24 @@ class _Mosaic:
                 document = read_json(self.report, _REPORT_BYTES, "run again")
                 if isinstance(document, dict):
                     return {**document, "status": "unchanged"}
-        self.record.unlink(missing_ok=True)
         files = {"mosaic": self.path, "seams": self.report, "page": self.page}
+        # Whoever makes one of these scenes again removes also the mosaic of a run that was killed before it ended.
+        before, made_from = ((), ()) if record is None else (record.outputs, record.inputs)
+        planned = [FileState(role=role, path=path.name, bytes=0, mtime_ns=0, sha256="") for role, path in files.items()]
+        started = RunRecord(
+            name="mosaic",
+            key="",
+            status="started",
+            inputs=tuple({state.path: state for state in (*made_from, *self.inputs)}.values()),
+            outputs=tuple({state.path: state for state in (*before, *planned)}.values()),
+        )
+        started.write(self.record)
         with together(self.output, "mosaic"):
             document, failure = assemble(
                 self.orthos, files, self.settings, measure=lambda pairs: self._seams(pairs, crew)
             )
             write_json(self.report, document)
-            if record is not None:
-                retire({self.output / state.path for state in record.outputs} - set(files.values()))
+            retire({self.output / state.path for state in before} - set(files.values()))
         if failure is not None:
             return {**document, "status": "done", "error": error_document(failure)}
         outputs = tuple(FileState.of(role, path, name=path.name) for role, path in files.items())

@@ -11,6 +11,7 @@ import pytest
 from osgeo import gdal
 
 from ortho_pipeline.batch import runner as batch
+from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.exchange.rpc import rpc_metadata
 
 FILE = """
@@ -32,6 +33,12 @@ class Block:
 
     def write(self, text: str) -> None:
         (self.folder / "pipeline.yaml").write_text(text)
+
+    def change_dem(self) -> None:
+        """Let all heights be 900 m."""
+        dem = gdal.Open(str(self.folder / "dem.tif"), gdal.GA_Update)
+        dem.WriteArray(np.full((dem.RasterYSize, dem.RasterXSize), 900.0, np.float32))
+        dem = None
 
     def run(self, **options: Any) -> dict[str, str]:
         """Run in this process and return the state of each scene."""
@@ -70,3 +77,56 @@ def test_a_changed_source_of_a_vrt_with_the_accuracy_of_the_dem(block: Block) ->
     assert block.run() == UNCHANGED
     write_sigma(4.0)
     assert block.run() == ALL_DONE
+
+
+def mosaic_files(block: Block) -> list[str]:
+    return sorted(path.name for path in (block.folder / "out").glob("mosaic.*"))
+
+
+MOSAIC = ["mosaic.html", "mosaic.json", "mosaic.vrt"]
+
+
+@pytest.mark.parametrize("part", [{"only": ["s1"]}, {"shard": (2, 2)}])
+def test_a_part_removes_a_mosaic_that_no_longer_fits_and_a_full_run_makes_it_again(block: Block, part: Any) -> None:
+    block.write(FILE + "mosaic: {}\n")
+    block.run()
+    assert mosaic_files(block) == MOSAIC
+    assert block.run(**part) == {"s1": "unchanged"}
+    assert mosaic_files(block) == MOSAIC  # it fits
+    block.change_dem()
+    assert block.run(**part) == {"s1": "done"}
+    assert mosaic_files(block) == []
+    assert block.run() == {"s0": "done", "s1": "unchanged"}
+    assert mosaic_files(block) == MOSAIC
+
+
+@pytest.mark.parametrize("killed", ["while a scene is made", "before the record of the mosaic is written"])
+def test_a_killed_run_leaves_no_mosaic_that_does_not_fit(
+    block: Block, monkeypatch: pytest.MonkeyPatch, killed: str
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    def written(record: RunRecord, path: Path) -> None:
+        if record.name == "mosaic" and record.status == "done":
+            raise KeyboardInterrupt
+        write(record, path)
+
+    write = RunRecord.write
+    block.write(FILE + "mosaic: {}\n")
+    with monkeypatch.context() as patch:
+        if killed == "before the record of the mosaic is written":
+            patch.setattr(RunRecord, "write", written)
+            with pytest.raises(KeyboardInterrupt):
+                block.run()
+        else:
+            block.run()
+    assert mosaic_files(block) == MOSAIC
+    block.change_dem()
+    with monkeypatch.context() as patch:
+        patch.setattr(batch, "_rectified", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            block.run()
+    assert mosaic_files(block) == []
+    assert block.run() == ALL_DONE
+    assert mosaic_files(block) == MOSAIC
