@@ -8,12 +8,13 @@ Checksums are taken again only of files whose size or time of change differ from
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import json
 import logging
 import os
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -206,14 +207,20 @@ def key_of(inputs: Sequence[FileState], configuration: Mapping[str, Any], versio
 
 
 def siblings(paths: Sequence[str | os.PathLike[str]], cache: dict[Path, Sequence[str]] | None = None) -> str:
-    """Return a digest of the names in the folders of some files; `cache` holds listings of this run."""
+    """Return a digest of the names in the folders of some files or patterns; `cache` holds listings of this run."""
     listed: dict[Path, Sequence[str]] = {} if cache is None else cache
     digest = hashlib.sha256()
-    for folder in sorted({Path(path).parent for path in paths}):
+    for folder in sorted({folder for path in paths for folder in _folders_of(Path(path).parent)}):
         if folder not in listed:
             listed[folder] = listing(folder).names if folder.is_dir() else ()
         digest.update("\0".join([str(folder), *listed[folder], ""]).encode(errors="surrogateescape"))
     return digest.hexdigest()
+
+
+def _folders_of(folder: Path) -> Iterable[Path]:
+    """Return a folder, or the folders that match a pattern such as ``dem/*``."""
+    pattern = glob.has_magic(str(folder)) and not folder.is_dir()
+    return map(Path, glob.iglob(str(folder))) if pattern else (folder,)
 
 
 class Digests(files.Checksums):

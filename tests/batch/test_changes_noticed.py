@@ -130,3 +130,16 @@ def test_a_killed_run_leaves_no_mosaic_that_does_not_fit(
     assert mosaic_files(block) == []
     assert block.run() == ALL_DONE
     assert mosaic_files(block) == MOSAIC
+
+
+@pytest.mark.parametrize("new", ["dem/a/east.tif", "dem/b/east.tif"])
+def test_new_dem_files_of_a_pattern_with_a_wildcard_in_a_folder_name(block: Block, new: str) -> None:
+    (block.folder / "dem/a").mkdir(parents=True)
+    (block.folder / "dem.tif").rename(block.folder / "dem/a/dem.tif")
+    block.write(FILE.replace("dem: dem.tif", 'dem: "dem/*/*.tif"'))
+    assert block.run() == ALL_DONE
+    assert block.run() == UNCHANGED
+    (block.folder / new).parent.mkdir(exist_ok=True)
+    (block.folder / new).write_bytes((block.folder / "dem/a/dem.tif").read_bytes())
+    assert block.run() == ALL_DONE
+    assert block.run() == UNCHANGED
