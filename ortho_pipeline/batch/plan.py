@@ -28,6 +28,7 @@ from ortho_pipeline.options import (
     SceneOptions,
     SurfaceOptions,
 )
+from ortho_pipeline.surface.cells.sources import address_of
 from ortho_pipeline.surface.dem_mosaic import matching_files
 
 #: Folder of records and locks within the output folder.
@@ -89,12 +90,21 @@ class Job:
         return self.output / STATE / f"{self.name}.lock"
 
     @property
+    def dem_source(self) -> str | None:
+        """Address or absolute path of the source of `dem: auto`, also if the environment names it; None without."""
+        if self.request.surface.dem != AUTO:
+            return None
+        source = address_of(self.request.surface.source)
+        return source if Location(source).is_address else os.path.abspath(source)
+
+    @property
     def configuration(self) -> dict[str, Any]:
         """The request as JSON values, without the budget of the machine."""
         groups = {"scene": "scene", "points": "points", "surface": "surface", "ortho": "output"}
         options = {name: dataclasses.asdict(getattr(self.request, group)) for name, group in groups.items()}
         for budget in ("memory", "threads"):
             del options["ortho"][budget]
+        options["surface"]["source"] = self.dem_source or options["surface"]["source"]
         options["scene"]["allow_network"] = False  # leave to reach a file is no part of what is made of it
         if self.request.match.reference:
             options["match"] = dataclasses.asdict(self.request.match)

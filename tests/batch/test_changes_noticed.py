@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dem_cells import small_cells, write_cell, write_geoid
 from osgeo import gdal
 
 from ortho_pipeline.batch import runner as batch
 from ortho_pipeline.batch.records import RunRecord
 from ortho_pipeline.exchange.rpc import rpc_metadata
+from ortho_pipeline.surface.cells.copernicus import Cell
 
 FILE = """
 defaults:
@@ -22,6 +24,7 @@ scenes:
   - images: raw/*.tif
 """
 ALL_DONE = dict.fromkeys(("s0", "s1"), "done")
+HERE = [Cell(lon, lat) for lon in (19, 20) for lat in (-31, -30)]
 UNCHANGED = dict.fromkeys(("s0", "s1"), "unchanged")
 
 
@@ -141,5 +144,20 @@ def test_new_dem_files_of_a_pattern_with_a_wildcard_in_a_folder_name(block: Bloc
     assert block.run() == UNCHANGED
     (block.folder / new).parent.mkdir(exist_ok=True)
     (block.folder / new).write_bytes((block.folder / "dem/a/dem.tif").read_bytes())
+    assert block.run() == ALL_DONE
+    assert block.run() == UNCHANGED
+
+
+def test_another_source_of_cells_in_the_environment(block: Block, monkeypatch: pytest.MonkeyPatch) -> None:
+    small_cells(monkeypatch)
+    write_geoid(block.folder / "geoid.gtx")
+    for source in ("a", "b"):
+        for cell in HERE:
+            write_cell(block.folder / source, cell)
+    block.write(FILE.replace("dem: dem.tif, vertical: ellipsoid", "dem: auto, vertical: ./geoid.gtx"))
+    monkeypatch.setenv("ORTHO_DEM_SOURCE", str(block.folder / "a"))
+    assert block.run() == ALL_DONE
+    assert block.run() == UNCHANGED
+    monkeypatch.setenv("ORTHO_DEM_SOURCE", str(block.folder / "b"))
     assert block.run() == ALL_DONE
     assert block.run() == UNCHANGED

@@ -43,6 +43,11 @@ class Source(ABC):
         """Return all existing cells: every other one is sea. None if that is unknown."""
 
 
+def address_of(chosen: str | os.PathLike[str] | None) -> str:
+    """Return the address that is given, that of the environment variable, or the public bucket."""
+    return os.fspath(chosen or os.environ.get(VARIABLE) or PUBLIC)
+
+
 def source_of(chosen: str | os.PathLike[str] | None, *, allow_network: bool) -> Source:
     """Return the source that is given, that of the environment variable, or the public bucket.
 
@@ -51,7 +56,7 @@ def source_of(chosen: str | os.PathLike[str] | None, *, allow_network: bool) -> 
     InputError
         If there is no such folder, or the network is not allowed.
     """
-    text = os.fspath(chosen or os.environ.get(VARIABLE) or PUBLIC)
+    text = address_of(chosen)
     if Location(text).is_collection:
         return _Catalogue(text, allow_network)
     if Location(text).is_address:
