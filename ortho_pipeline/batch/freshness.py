@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ortho_pipeline.batch.plan import Job
-from ortho_pipeline.batch.records import Digests, FileState, RunRecord, key_of, siblings
+from ortho_pipeline.batch.records import MISSING, Digests, FileState, RunRecord, key_of, siblings
 from ortho_pipeline.commands.resolved.ledger import Ledger, versions
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, OrthoError
@@ -20,6 +20,8 @@ from ortho_pipeline.files import clear_up, confined
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import Location, VsiPath
 from ortho_pipeline.stores.objects import Objects
+from ortho_pipeline.surface.cells.copernicus import LIST
+from ortho_pipeline.surface.cells.sources import places_of
 
 #: Larger files next to an image are not metadata.
 _COMPANION_BYTES = 5_000_000
@@ -79,23 +81,35 @@ def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> 
     roles = Ledger.of(job.request).roles
     read = (
         *_local_states(job, {**{str(path): role for path, role in roles.items()}, **known}),
+        *(state for state in record.inputs if state.role == MISSING and state.untouched()),
         *far_states(job.request),
     )
     return read if record.key == key_of(read, job.configuration, job.versions) else None
 
 
 def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
-    """Return the files that a report was made from; a changed file is an error."""
+    """Return the files that a report was made from, and DEM cells that were missing; a changed file is an error."""
     used = {entry["path"]: entry for entry in report["provenance"]["inputs"]}
     roles = {path: entry["role"] for path, entry in used.items()}
     source = str(report["scene"]["model_source"])
     if os.path.isfile(source):
         roles.setdefault(os.path.abspath(source), "model source")
+    sought = _sought_of_cells(job, report)
+    roles.update((str(path), "DEM") for path in sought if path.name == LIST and path.is_file())
     states = _local_states(job, roles)
     for state in states:
         if state.path in used and used[state.path]["sha256"] != state.sha256:
             raise InputError("this file changed during the run", file=state.path, remedy="run again")
-    return states
+    return (*states, *(FileState.missing(path) for path in sought if str(path) not in roles))
+
+
+def _sought_of_cells(job: Job, report: Mapping[str, Any]) -> list[Path]:
+    """Return what a folder of DEM cells lacks for a scene, and its list of cells, which then decides what is sea."""
+    surface, source = report["provenance"]["surface"] or {}, job.dem_source
+    names = (*surface.get("sea_cells", ()), *surface.get("missing_cells", ()))
+    if not names or source is None or not os.path.isdir(source):
+        return []
+    return [Path(source, LIST), *(path for name in names for path in places_of(source, name))]
 
 
 def as_recorded(record: RunRecord, job: Job) -> bool:

@@ -34,10 +34,14 @@ _log = logging.getLogger(__name__)
 MAX_BYTES = 50_000_000
 
 
+#: Role of a file that was looked for, and was not there.
+MISSING = "missing"
+
+
 class FileState(Record):
     """A file at the time of its checksum; `role` is its role in the scene.
 
-    An object in a store has no date. Its `tag` identifies the version in the store.
+    An object in a store has no date. Its `tag` identifies the version in the store. A `MISSING` file has a path only.
     """
 
     role: str
@@ -55,10 +59,17 @@ class FileState(Record):
             role=role, path=name or str(path), bytes=stat.st_size, mtime_ns=stat.st_mtime_ns, sha256=digest(path)
         )
 
+    @classmethod
+    def missing(cls, path: Path) -> FileState:
+        """Return the state of a file that was looked for, and was not there."""
+        return cls(role=MISSING, path=str(path), bytes=0, mtime_ns=0, sha256="")
+
     def untouched(self, folder: Path | None = None) -> bool:
         """Return whether size and time of change are as recorded; `folder` is the base of a relative path."""
         if self.tag:
             return False  # only its store can tell
+        if self.role == MISSING and folder is None:
+            return not os.path.exists(self.path)
         try:
             stat = os.stat(folder / self.path if folder else self.path)
         except (OSError, ValueError):

@@ -152,9 +152,10 @@ class Dem(Record):
     #: How far a block moved the DEM to the east and north, and raised it, metres.
     moved_m: Pair | None = None
     raised_m: float | None = None
-    #: Of heights that were found: the cells that have land, and those that have none.
+    #: Of heights that were found: the cells that have land, those that have none, and those that the source lacks.
     cells: tuple[str, ...] = ()
     sea_cells: tuple[str, ...] = ()
+    missing_cells: tuple[str, ...] = ()
     #: Of a STAC collection: the items' ids, the documents that lead to them, and what declares the height datum.
     items: tuple[str, ...] = ()
     documents: tuple[str, ...] = ()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dem_cells import small_cells, write_cell, write_geoid
+from dem_cells import small_cells, write_cell, write_geoid, write_list
 from osgeo import gdal
 
 from ortho_pipeline.batch import runner as batch
@@ -160,4 +160,31 @@ def test_another_source_of_cells_in_the_environment(block: Block, monkeypatch: p
     assert block.run() == UNCHANGED
     monkeypatch.setenv("ORTHO_DEM_SOURCE", str(block.folder / "b"))
     assert block.run() == ALL_DONE
+    assert block.run() == UNCHANGED
+
+
+def test_a_new_cell_or_another_list_in_the_folder_of_cells(block: Block, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cell elsewhere changes nothing; one that a scene lacked does, whether it counted as sea or as a gap."""
+    small_cells(monkeypatch)
+    write_geoid(block.folder / "geoid.gtx")
+    cells = block.folder / "cells"
+    first, second, third, fourth = HERE[1], HERE[0], HERE[2], HERE[3]  # the scenes are mainly in the first
+    write_cell(cells, first)
+    write_list(cells, [first, second, third])
+    surface = "dem: auto, source: cells, fill: 500, vertical: ./geoid.gtx"
+    block.write(FILE.replace("dem: dem.tif, vertical: ellipsoid", surface))
+    assert block.run() == ALL_DONE
+    write_cell(cells, Cell(25, -30))
+    assert block.run() == UNCHANGED
+    assert block.run(checksums=True) == UNCHANGED
+    for cell in (second, fourth):
+        write_cell(cells, cell)
+        assert block.run() == ALL_DONE
+        assert block.run() == UNCHANGED
+    write_list(cells, [first, second])
+    assert block.run() == ALL_DONE
+    (cells / "tileList.txt").unlink()
+    assert block.run() == ALL_DONE
+    write_list(cells, [first, second])
+    assert block.run(checksums=True) == ALL_DONE
     assert block.run() == UNCHANGED

@@ -108,7 +108,8 @@ def open_cells(
         )
     mosaic = laid_out(source.address, sorted(placed, key=lambda part: part[0].path))
     surface = dem_of(mosaic, vertical, override, parse_fill(fill), memory)
-    cells = {"cells": [cell.name for cell in sorted(there)], "sea_cells": [cell.name for cell in sorted(sea)]}
+    named = {"cells": there, "sea_cells": sea, "missing_cells": set(absent) - set(sea)}
+    cells = {key: [cell.name for cell in sorted(some)] for key, some in named.items()}
     return replace(surface, record={**surface.record, **cells})
 
 

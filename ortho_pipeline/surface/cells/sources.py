@@ -43,6 +43,11 @@ class Source(ABC):
         """Return all existing cells: every other one is sea. None if that is unknown."""
 
 
+def places_of(folder: str, name: str) -> tuple[Path, Path]:
+    """Return where a folder may have the file of a cell: in it, or as the bucket in a folder of the cell's name."""
+    return Path(folder) / f"{name}.tif", Path(folder) / name / f"{name}.tif"
+
+
 def address_of(chosen: str | os.PathLike[str] | None) -> str:
     """Return the address that is given, that of the environment variable, or the public bucket."""
     return os.fspath(chosen or os.environ.get(VARIABLE) or PUBLIC)
@@ -79,7 +84,7 @@ class _Folder(Source):
     def files(self, cells: list[Cell]) -> dict[Cell, str]:
         found = {}
         for cell in cells:
-            for place in (Path(self.address) / f"{cell.name}.tif", Path(self.address) / cell.name / f"{cell.name}.tif"):
+            for place in places_of(self.address, cell.name):
                 if place.is_file():
                     found[cell] = str(place)
         return found
