@@ -320,7 +320,7 @@ class _Run:
         """Make the mosaic of the finished scenes; its document has the error, if any."""
         present = [job for job in jobs if self.outcomes[job.name].status != "failed"]
         try:
-            document = _Mosaic(self.planned, present, self.outcomes).make(crew)
+            document = _Mosaic(self.planned, present, self.outcomes).make(crew, self.checksums)
         except OrthoError as error:
             document = {"error": error_document(error)}
         missing = [job.name for job in jobs if job not in present]
@@ -410,9 +410,9 @@ class _Mosaic:
         order = {ortho.name: ortho.relief_displacement for ortho in self.orthos}
         self.key = key_of(self.inputs, {**asdict(self.settings), "order": list(order.items())}, versions())
 
-    def make(self, crew: Crew) -> dict[str, Any]:
+    def make(self, crew: Crew, checksums: bool = False) -> dict[str, Any]:
         record = RunRecord.at(self.record)
-        if record is not None and record.key == self.key and record.intact(self.output):
+        if record is not None and record.key == self.key and record.intact(self.output, checksums):
             # A record may be wrong: its files are read like any other, and made again if they are not reports.
             with contextlib.suppress(InputError):
                 document = read_json(self.report, _REPORT_BYTES, "run again")

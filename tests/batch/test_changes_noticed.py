@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -188,3 +189,14 @@ def test_a_new_cell_or_another_list_in_the_folder_of_cells(block: Block, monkeyp
     write_list(cells, [first, second])
     assert block.run(checksums=True) == ALL_DONE
     assert block.run() == UNCHANGED
+
+
+def test_checksums_see_a_changed_mosaic_whose_size_and_date_are_as_before(block: Block) -> None:
+    block.write(FILE + "mosaic: {}\n")
+    block.run()
+    mosaic = block.folder / "out" / "mosaic.vrt"
+    before, stat = mosaic.read_bytes(), mosaic.stat()
+    mosaic.write_bytes(before.replace(b"VRTDataset", b"XXXDataset"))
+    os.utime(mosaic, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    block.run(checksums=True)
+    assert mosaic.read_bytes() == before
