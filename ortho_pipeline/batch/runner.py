@@ -39,7 +39,7 @@ from ortho_pipeline.commands.mosaic.assembly import assemble
 from ortho_pipeline.commands.resolved.ledger import versions
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, OrthoError, ReportError, error_document
-from ortho_pipeline.files import append_line, clear_up, confined, read_json, retire, together, write_json
+from ortho_pipeline.files import allowed, append_line, clear_up, confined, read_json, retire, together, write_json
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.report.page.run import write_run_page
 from ortho_pipeline.report.stac import write_catalog
@@ -91,7 +91,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
             mine = bool(job.run) and good.run == job.run
             seconds = good.seconds if mine else time.monotonic() - begin
             return Outcome(job.name, "done" if mine else "unchanged", seconds, paths_of(good, job), good.facts)
-        _remove_mosaic_of(job)
+        _remove_mosaic(job.output, job.name)
         if record is not None:
             RunRecord(name=job.name, key="", status="started", outputs=before).write(job.record)
         result = _rectified(job)
@@ -155,16 +155,16 @@ def _still_good(record: RunRecord | None, job: Job, listing: str, checksums: boo
     return fresh
 
 
-def _remove_mosaic_of(job: Job) -> None:
-    """Remove the mosaic if it has the ortho of this scene: a VRT would show the new ortho at the old place.
+def _remove_mosaic(output: Path, scene: str | None = None) -> None:
+    """Remove the mosaic, or only one that has the ortho of a scene: a VRT would show the new ortho at the old place.
 
     The next run of all scenes makes it again. The record goes last: a killed process leaves what the next one removes.
     """
-    place = job.output / MOSAIC_RECORD
+    place = output / MOSAIC_RECORD
     record = RunRecord.at(place)
-    if record is not None and any(state.role == job.name for state in record.inputs):
-        _remove(job.output, {state.path for state in record.outputs})
-        place.unlink(missing_ok=True)
+    if record is not None and (scene is None or any(state.role == scene for state in record.inputs)):
+        _remove(output, {state.path for state in record.outputs})
+        allowed(place).unlink(missing_ok=True)
 
 
 def _restated(outputs: Sequence[FileState], folder: Path) -> tuple[FileState, ...]:
@@ -310,14 +310,17 @@ class _Run:
             work = _with_checksums if self.checksums else make_scene
             for job, future in completed(crew, work, changed):
                 self._note(_outcome(job, future), len(jobs))
-            mosaic = None if self.part or self.planned.mosaic is None else self._mosaic(crew, jobs)
+            mosaic = None if self.part else self._mosaic(crew, jobs)
         except KeyboardInterrupt:
             self.log("run interrupted", finished=len(self.outcomes), scenes=len(jobs))
             raise
         return self._finish(jobs, mosaic)
 
-    def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any]:
-        """Make the mosaic of the finished scenes; its document has the error, if any."""
+    def _mosaic(self, crew: Crew, jobs: Sequence[Job]) -> dict[str, Any] | None:
+        """Make the mosaic of the finished scenes; its document has the error, if any. Remove one no longer wanted."""
+        if self.planned.mosaic is None:
+            _remove_mosaic(self.planned.output)
+            return None
         present = [job for job in jobs if self.outcomes[job.name].status != "failed"]
         try:
             document = _Mosaic(self.planned, present, self.outcomes).make(crew, self.checksums)

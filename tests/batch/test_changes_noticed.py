@@ -200,3 +200,15 @@ def test_checksums_see_a_changed_mosaic_whose_size_and_date_are_as_before(block:
     os.utime(mosaic, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     block.run(checksums=True)
     assert mosaic.read_bytes() == before
+
+
+def test_a_mosaic_that_is_no_longer_in_the_file_is_removed(block: Block) -> None:
+    block.write(FILE + "mosaic: {}\n")
+    block.run()
+    block.write(FILE)
+    own = block.folder / "out" / "mosaic.txt"
+    own.write_text("a file of the user")
+    assert block.run(only=["s0"]) == {"s0": "unchanged"}
+    assert mosaic_files(block) == sorted([*MOSAIC, own.name])
+    assert block.run() == UNCHANGED
+    assert mosaic_files(block) == [own.name]
