@@ -131,15 +131,22 @@ class Regridded:
         return pixels, valid
 
     def _resampled(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        count = self._source.count
+        source, grid = self._source, self._grid
+        pixels = np.zeros((source.count, height, width), dtype=source.dtype)
+        valid = np.zeros(pixels.shape, dtype=bool)
+        # GDAL reads no window that reaches outside of the grid.
+        first, last = max(left, 0), min(left + width, grid.width)
+        upper, lower = max(top, 0), min(top + height, grid.height)
+        if first >= last or upper >= lower:
+            return pixels, valid
         try:
-            stack = self._warped.ReadAsArray(left, top, width, height)
+            stack = self._warped.ReadAsArray(first, upper, last - first, lower - upper)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
             ) from error
-        pixels = stack[:count]
-        valid = np.broadcast_to(stack[-1] >= _ENOUGH, pixels.shape).copy()
+        part = (slice(None), slice(upper - top, lower - top), slice(first - left, last - left))
+        pixels[part], valid[part] = stack[:-1], stack[-1] >= _ENOUGH
         if pixels.dtype.kind == "f":
             valid &= ~np.isnan(pixels)
         return pixels, valid

@@ -20,6 +20,7 @@ from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.control.matching import match_scene
 from ortho_pipeline.commands.orthos import measuring
 from ortho_pipeline.commands.orthos.datums import datum_of
+from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.measuring import measure_ortho
 from ortho_pipeline.commands.orthos.requirement import Requirement
 from ortho_pipeline.commands.orthos.statistics import Accuracy
@@ -210,6 +211,23 @@ def test_clouds_are_masked_by_their_classes(tmp_path):
     assert result.document["matches"]["tried"] < 300
     with pytest.raises(InputError, match="not a list of mask classes"):
         verify(ortho, match=MatchOptions(reference=[str(reference)]), masks=[f"{classes}=clouds"])
+
+
+@pytest.mark.parametrize("warped", [{"xRes": 20, "yRes": 20}, {"dstSRS": "EPSG:4326"}], ids=["coarser", "degrees"])
+def test_a_mask_may_have_another_grid(shifted, tmp_path, warped):
+    ortho, reference = shifted
+    source = gdal.Open(str(ortho))
+    same = gdal.GetDriverByName("MEM").Create("", source.RasterXSize, source.RasterYSize, 1)
+    same.SetProjection(source.GetProjection())
+    same.SetGeoTransform(source.GetGeoTransform())
+    classes = np.full((source.RasterYSize, source.RasterXSize), 4, np.uint8)
+    classes[:, :100] = 9
+    same.GetRasterBand(1).WriteArray(classes)
+    gdal.Warp(str(tmp_path / "scl.tif"), same, resampleAlg="nearest", **warped)
+    match = MatchOptions(reference=[str(reference)], points=100)
+    measured = measure_ortho(ortho, match, masks=[ClassMask.parse(f"{tmp_path / 'scl.tif'}=9")])
+    assert measured.image[:, 0].min() > 95
+    assert len(measured.image) > 20
 
 
 def test_a_folder_gives_one_table(shifted, tmp_path):
