@@ -197,7 +197,7 @@ class Regridded:
             )
 
 
-def part_of(grid: Grid, left: int, top: int, width: int, height: int) -> Grid:
+def part_of(grid: Grid, left: float, top: float, width: int, height: int) -> Grid:
     """Return a window of a grid, which may reach outside."""
     return Grid(grid.crs, grid.left + left * grid.dx, grid.top - top * grid.dy, grid.dx, grid.dy, width, height)
 

@@ -63,6 +63,27 @@ def test_a_shifted_ortho_is_aligned_by_a_shift(shifted, tmp_path):
     assert np.abs(left_by(SHIFTED, tmp_path)).max() < 0.05
 
 
+@pytest.mark.parametrize("words", [("--shift-only",), ("--no-resample",)], ids=["resampled", "moved"])
+def test_what_a_mask_hides_does_not_count_after_the_alignment(shifted, tmp_path, words):
+    source = gdal.Open(str(shifted[0]))
+    pixels = source.ReadAsArray()
+    # A part of the ortho shows the ground elsewhere.
+    pixels[:, :130] = np.roll(pixels, (-40, 50), (0, 1))[:, :130]
+    ortho = gdal.GetDriverByName("GTiff").CreateCopy(str(tmp_path / "ortho.tif"), source)
+    ortho.GetRasterBand(1).WriteArray(pixels)
+    mask = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "mask.tif"), *pixels.shape[::-1], 1)
+    mask.SetProjection(source.GetProjection())
+    mask.SetGeoTransform(source.GetGeoTransform())
+    mask.GetRasterBand(1).WriteArray((np.indices(pixels.shape)[1] < 130).astype(np.uint8))
+    ortho = mask = None
+    hidden = "--mask", tmp_path / "mask.tif"
+    document = aligned(tmp_path / "ortho.tif", shifted[1], tmp_path / "out", *hidden, *words)
+    np.testing.assert_allclose(document["correction"]["shift_px"], np.array(SHIFTED.shift) * (1, -1), atol=0.05)
+    assert document["relative"]["ce90_m"]["value"] < 1.0
+    reached = min(one["image"][0] for one in document["field"]["cells"])
+    assert reached > 100
+
+
 def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
     source = gdal.Open(str(shifted[0]))
     pixels = source.ReadAsArray()

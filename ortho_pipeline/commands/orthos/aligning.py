@@ -120,9 +120,11 @@ def align(
         write_resampled(measured.scene, chosen.model, _output_grid(measured), files["ortho"], output, scene, progress)
     else:
         dataset = open_dataset(ortho, **scene.access)
-        moved = moved_geotransform(_grid_of(measured).geotransform, chosen.shift)
-        write_moved(dataset, moved, files["ortho"])
-    document = _after(files["ortho"], measured, match, scene, output, band) | {"before": before}
+        write_moved(dataset, moved_geotransform(_grid_of(measured).geotransform, chosen.shift), files["ortho"])
+    # The masks show the ground where the ortho showed it before.
+    column, row = chosen.shift.tolist()
+    moved = [dataclasses.replace(mask, shift=(column, row)) for mask in hidden]
+    document = _after(files["ortho"], measured, match, scene, output, moved, band) | {"before": before}
     document["correction"] = _described(chosen)
     document["resampled"] = resample
     document["provenance"] = record
@@ -257,13 +259,14 @@ def _after(
     match: MatchOptions,
     scene: SceneOptions,
     output: OutputOptions,
+    masks: Sequence[ClassMask],
     band: int | None,
 ) -> dict[str, Any]:
     """Return the document of the aligned ortho, measured in its own pixels."""
     opened = dataclasses.replace(scene, roots=(Path(measured.scene.path).parent, *scene.roots))
     # What is left is small.
     again = dataclasses.replace(match, search=min(match.search or np.inf, 30.0 * measured.pixel), search_rotation=None)
-    found = measure_ortho(path, again, scene=opened, band=band or measured.band, output=output)
+    found = measure_ortho(path, again, scene=opened, masks=masks, band=band or measured.band, output=output)
     return document_of(found, match)
 
 

@@ -14,16 +14,23 @@ from numpy.typing import NDArray
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.intensity import Intensity
-from ortho_pipeline.raster.regridded import Regridded, coarser, grid_of
+from ortho_pipeline.raster.regridded import Regridded, coarser, grid_of, part_of
 from ortho_pipeline.raster.source import RasterSource
 
 
 @dataclass(frozen=True)
 class ClassMask:
-    """A raster of classes, and those that hide the ground; all but 0 without values."""
+    """A raster of classes, and those that hide the ground; all but 0 without values.
+
+    Parameters
+    ----------
+    shift : (float, float)
+        How far (pixels of the ortho along columns and rows) the raster shows the ground displaced from the ortho.
+    """
 
     path: str
     values: frozenset[int] = frozenset()
+    shift: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def parse(cls, text: str | os.PathLike[str]) -> ClassMask:
@@ -82,8 +89,9 @@ class Masked(Intensity):
         with self._lock:
             if factor not in self._reduced_masks:
                 size = -(-grid.width // factor), -(-grid.height // factor)
-                coarse = coarser(grid, factor, *size)
+                shown = [part_of(grid, *mask.shift, grid.width, grid.height) for mask in self._masks]
                 self._reduced_masks[factor] = [
-                    Regridded(mask.path, coarse, resampling="nearest", **self._opened.access) for mask in self._masks
+                    Regridded(mask.path, coarser(one, factor, *size), resampling="nearest", **self._opened.access)
+                    for mask, one in zip(self._masks, shown, strict=True)
                 ]
             return self._reduced_masks[factor]
