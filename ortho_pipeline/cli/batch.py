@@ -24,7 +24,15 @@ from ortho_pipeline.cli.options import (
     workers_option,
 )
 from ortho_pipeline.cli.parsing import Command, Megabytes
-from ortho_pipeline.cli.printing import PARTLY_DONE, checked_text, print_files, print_json, print_result, progress
+from ortho_pipeline.cli.printing import (
+    FAILED,
+    PARTLY_DONE,
+    checked_text,
+    print_files,
+    print_json,
+    print_result,
+    progress,
+)
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.options import MosaicOptions, SceneOptions
@@ -33,7 +41,6 @@ if TYPE_CHECKING:
     from ortho_pipeline.batch.plan import Plan
     from ortho_pipeline.batch.results import BatchResult, Outcome
 
-FAILED = 1
 #: More scenes than this are only counted, except for those that failed.
 _SHOWN = 60
 

@@ -18,7 +18,7 @@ from ortho_pipeline.cli.options import (
     surface_options,
 )
 from ortho_pipeline.cli.parsing import Command
-from ortho_pipeline.cli.printing import print_result
+from ortho_pipeline.cli.printing import FAILED, PARTLY_DONE, print_result
 from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.options.option import RESAMPLING
 
@@ -93,8 +93,13 @@ def verify(
         **groups,
     )
     print_result(result, as_json)
-    if not all(requirement["met"] for requirement in result.document["requirements"]):
+    # In a folder, an ortho that could not be compared is a row with an error: it meets no requirement.
+    rows = result.document.get("orthos", [])
+    failed = result.document.get("failed", 0)
+    if (require and failed) or not all(requirement["met"] for requirement in result.document["requirements"]):
         click.get_current_context().exit(NOT_MET)
+    if failed:
+        click.get_current_context().exit(FAILED if failed == len(rows) else PARTLY_DONE)
 
 
 @click.command(cls=Command)

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from ortho_pipeline.estimation.records import Rmse, RmseOnGround
     from ortho_pipeline.runtime.process_limits import Progress
 
-#: Exit code of a command that made only a part of its outputs.
-PARTLY_DONE = 3
+#: Exit codes of a command that made none, or only a part, of its outputs.
+FAILED, PARTLY_DONE = 1, 3
 #: More points than this are not all printed, but so many of them.
 _PRINTED, _WORST = 60, 20
 

@@ -236,7 +236,8 @@ def test_a_folder_gives_one_table(shifted, tmp_path):
     shutil.copy(shifted[0], folder / "a.tif")
     (folder / "b.tif").write_bytes(b"no raster")
     done = run("verify", folder, "--reference", shifted[1], "-o", tmp_path / "out", "--require", "ce90<4", *FEW)
-    assert done.exit_code == 0, done.output
+    # An ortho that could not be compared meets no requirement, although the other one does.
+    assert done.exit_code == 4, done.output
     table = json.loads((tmp_path / "out" / "verify.json").read_text())
     assert [Path(row["ortho"]).name for row in table["orthos"]] == ["a.tif", "b.tif"]
     assert table["failed"] == 1
@@ -249,6 +250,14 @@ def test_a_folder_gives_one_table(shifted, tmp_path):
     assert made["inputs"] == own["inputs"][1:]
     assert [one["path"] for one in made["inputs"]] == [str(shifted[1])]
     assert [" verify " in page, made["inputs"][0]["sha256"] in page] == [True, True]
+
+
+def test_a_folder_with_orthos_that_cannot_be_compared_has_the_exit_codes_of_a_run(shifted, tmp_path):
+    (tmp_path / "b.tif").write_bytes(b"no raster")
+    assert run("verify", tmp_path, "--reference", shifted[1], "--require", "ce90<4").exit_code == 4
+    assert run("verify", tmp_path, "--reference", shifted[1]).exit_code == 1
+    shutil.copy(shifted[0], tmp_path / "a.tif")
+    assert run("verify", tmp_path, "--reference", shifted[1], *FEW).exit_code == 3
 
 
 def test_a_folder_reads_what_its_orthos_have_in_common_once_for_checksums(shifted, tmp_path, monkeypatch):
