@@ -244,6 +244,12 @@ def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
         run(made[0], tmp_path / "out", StackOptions(datum="1999-01-01"))
     with pytest.raises(InputError, match="no reference"):
         run(made[0], tmp_path / "out", StackOptions(datum="reference"))
+    reference = StackOptions(datum="reference")
+    match = MatchOptions(points=120, reference=[str(made[0][0])])
+    shutil.copy(made[0][1], tmp_path / "Reference.tif")
+    # Its pairs would have the names of those with the reference.
+    with pytest.raises(InputError, match="an image is called Reference"):
+        run([*made[0][2:], tmp_path / "Reference.tif"], tmp_path / "out", reference, match=match)
     other = tmp_path / "other_20210101.tif"
     gdal.Warp(str(other), str(made[0][0]), dstSRS="EPSG:32734")
     with pytest.raises(CrsError, match="another CRS"):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ortho_pipeline.batch.executors import Crew, crew_of
+from ortho_pipeline.batch.paths import key_of_name
 from ortho_pipeline.batch.records import locked
 from ortho_pipeline.batch.stack.dates import Dated, dated_orthos, placed_at, time_of
 from ortho_pipeline.batch.stack.document import record_of
@@ -44,6 +45,8 @@ _EDGES, _ALIGNED, _RAW = "pairs", "aligned", "raw"
 _DAYS_A_YEAR = 365.25
 #: What the items are called together in object storage.
 _ITEMS = "items"
+#: The name of a reference in the records of pairs.
+_REFERENCE = "reference"
 
 
 @one_blas_thread()
@@ -330,9 +333,10 @@ def _with_datum(
     if datum == "mean":
         return list(dates), None
     if datum == "reference":
+        _refuse_reference(dates)
         path = placed_at(match.reference[0], scene)
         last = dates[-1].time
-        return [*dates, Dated("reference", path, last, "", open_ortho(path, scene))], len(dates)
+        return [*dates, Dated(_REFERENCE, path, last, "", open_ortho(path, scene))], len(dates)
     for number, one in enumerate(dates):
         if one.name == datum:
             return list(dates), number
@@ -343,6 +347,18 @@ def _with_datum(
     raise InputError(
         f"no ortho is of {wanted}", field="stack.datum", remedy=f"give mean, or a date such as {dates[0].time.date()}"
     )
+
+
+def _refuse_reference(dates: Sequence[Dated]) -> None:
+    """Refuse a date whose records would have the names of those of the reference."""
+    same = next((one for one in dates if key_of_name(one.name) == _REFERENCE), None)
+    if same is not None:
+        raise InputError(
+            f"an image is called {same.name}, as the reference is in the records of a stack",
+            file=same.image,
+            field="orthos",
+            remedy="rename this image",
+        )
 
 
 def _adjusted(
