@@ -239,6 +239,15 @@ def test_corrections_only_keep_the_pixels(made, tmp_path):
         result.to_xarray()
 
 
+def test_a_stack_in_which_no_date_can_be_corrected_is_refused(made, tmp_path):
+    # The reference shows another place.
+    gdal.Translate(str(tmp_path / "far.tif"), str(made[0][0]), outputBounds=[612_000, 7_123_000, 612_240, 7_122_760])
+    match = MatchOptions(points=120, reference=[str(tmp_path / "far.tif")])
+    with pytest.raises(InputError, match="no accepted pair connects a date with the datum"):
+        run(made[0][:2], tmp_path / "out", StackOptions(datum="reference"), match=match)
+    assert not (tmp_path / "out" / "aligned").exists()
+
+
 def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
     with pytest.raises(InputError, match="no ortho is of 1999-01-01"):
         run(made[0], tmp_path / "out", StackOptions(datum="1999-01-01"))
@@ -250,6 +259,9 @@ def test_a_datum_that_is_no_date_and_another_crs_are_refused(made, tmp_path):
     # Its pairs would have the names of those with the reference.
     with pytest.raises(InputError, match="an image is called Reference"):
         run([*made[0][2:], tmp_path / "Reference.tif"], tmp_path / "out", reference, match=match)
+    two = MatchOptions(points=120, reference=[str(path) for path in made[0][:2]])
+    with pytest.raises(InputError, match="a stack has one reference, not 2"):
+        run(made[0][2:], tmp_path / "out", reference, match=two)
     other = tmp_path / "other_20210101.tif"
     gdal.Warp(str(other), str(made[0][0]), dstSRS="EPSG:32734")
     with pytest.raises(CrsError, match="another CRS"):

@@ -333,7 +333,7 @@ def _with_datum(
     if datum == "mean":
         return list(dates), None
     if datum == "reference":
-        _refuse_reference(dates)
+        _refuse_reference(dates, match)
         path = placed_at(match.reference[0], scene)
         last = dates[-1].time
         return [*dates, Dated(_REFERENCE, path, last, "", open_ortho(path, scene))], len(dates)
@@ -349,8 +349,14 @@ def _with_datum(
     )
 
 
-def _refuse_reference(dates: Sequence[Dated]) -> None:
-    """Refuse a date whose records would have the names of those of the reference."""
+def _refuse_reference(dates: Sequence[Dated], match: MatchOptions) -> None:
+    """Refuse more than one reference, and a date whose records would have the names of those of the reference."""
+    if len(match.reference) > 1:
+        raise InputError(
+            f"a stack has one reference, not {len(match.reference)}",
+            field="match.reference",
+            remedy="give one file, such as a VRT of all of them",
+        )
     same = next((one for one in dates if key_of_name(one.name) == _REFERENCE), None)
     if same is not None:
         raise InputError(
@@ -367,11 +373,12 @@ def _adjusted(
 ) -> AdjustedStack:  # fmt: skip
     """Return the adjustment of matched pairs."""
     matched = [pair for pair in pairs if pair.matches is not None]
+    remedy = Text("check that all images show one place, or search farther with ", Setting("match.search"))
     if not matched:
         raise InputError(
             f"none of {counted(len(pairs), 'pair')} could be matched: {pairs[0].reason if pairs else ''}",
             field="orthos",
-            remedy=Text("check that the orthos show one place, or search farther with ", Setting("match.search")),
+            remedy=remedy,
         )
     cells = Cells.over(*placed.covered(dates))
     years = [one.days / _DAYS_A_YEAR for one in nodes]
@@ -381,6 +388,10 @@ def _adjusted(
         # Where an ortho shows the ground displaced, it was made with the height of another place.
         edges = _edges(nodes, placed, cells, matched, Levelled.of(dates, placed, solved))
         solved = adjust(cells, edges, years, datum, affine=affine)
+    # The datum itself needs no correction.
+    if solved.determined.sum() < 2:
+        other = "others" if datum is None else "datum"
+        raise InputError(f"no accepted pair connects a date with the {other}", field="orthos", remedy=remedy)
     return solved
 
 
