@@ -200,6 +200,15 @@ def test_a_changed_ortho_is_matched_again(made, tmp_path, counted):
     assert all(made[0][1].name in pair for pair in counted)
 
 
+def test_orthos_that_are_no_part_of_the_result_go(made, tmp_path):
+    output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
+    run(made[0], tmp_path / "out", output=output)
+    run(made[0][:3], tmp_path / "out")
+    endings = "_aligned.tif", "_model.json", ".record.json"
+    left = {path.name for path in (tmp_path / "out" / "aligned").iterdir() if path.is_file()}
+    assert left == {f"{path.stem}{ending}" for path in made[0][:3] for ending in endings}
+
+
 def test_a_killed_run_resumes_to_the_same_result(made, tmp_path):
     words = ["stack", str(made[0][0].parent), "-o", str(tmp_path / "out"), "--match-points", "120", "--threads", "1"]
     killed = subprocess.Popen([sys.executable, "-m", "ortho_pipeline", *words], stderr=subprocess.DEVNULL)

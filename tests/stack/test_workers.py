@@ -156,6 +156,12 @@ def test_a_bucket_gets_complete_files(made: tuple[Path, dict[str, bytes]], bucke
     assert "6 (6 from an earlier run)" in again.summary
     assert dict.fromkeys(store.names()) == before
     assert fetched(store, tmp_path / "b") == made[1]
+    # An ortho that is no longer part of the stack goes.
+    *paths, last = (one.path for one in result.dates)
+    stack(paths, bucket, **FAR)
+    left = [name for name, _ in store.names() if name.startswith("aligned/")]
+    assert [name for name in left if Path(last).stem in name] == []
+    assert len(left) == 4 * len(paths)
 
 
 def fetched(store: Objects, folder: Path) -> dict[str, bytes]:

@@ -274,17 +274,19 @@ def _made(planned: _Planned, crew: Crew) -> StackResult:
     solved = _adjusted(nodes, dates, placed, pairs, planned.fixed, not options.shift_only)
     aligned = planned.part(_ALIGNED)
     writer = Writer(aligned, placed, scene, planned.output, options.corrections_only)
-    names = writer.write(dates, solved, crew, lambda share: told("writing", share))
+    names, outdated = writer.write(dates, solved, crew, lambda share: told("writing", share))
     outputs = {name: f"{_ALIGNED}/{file}" for name, file in names.items()}
     groups = {"stack": options, "match": planned.match, "surface": planned.surface, "output": planned.output}
     record = record_of(dates, placed, pairs, solved, outputs, groups)
-    files = _documents(planned, dates, record)
+    files = _documents(planned, dates, record, outdated)
     said = summary(record, sum(pair.fresh for pair in pairs))
     return StackResult(files, record.to_json(), said, record=record, access=scene.access)
 
 
-def _documents(planned: _Planned, dates: Sequence[Dated], record: StackRecord) -> dict[str, Any]:
-    """Write items, record and page; return the files of the stack."""
+def _documents(
+    planned: _Planned, dates: Sequence[Dated], record: StackRecord, outdated: Sequence[str]
+) -> dict[str, Any]:
+    """Write items, record and page, and remove outdated files of orthos; return the files of the stack."""
     aligned, allowed = planned.part(_ALIGNED), planned.scene.allow_network
     items = {path.name for path in items_of(Path(), dates)}
     files: dict[str, Any] = {"aligned": Path(aligned.place) if not aligned.is_far else aligned.place}
@@ -292,12 +294,12 @@ def _documents(planned: _Planned, dates: Sequence[Dated], record: StackRecord) -
         within = Path(aligned.place)
         with together(within, "items of a stack"):
             # Items of an earlier run would state its sigmas.
-            retire(within / name for name in sorted(items))
+            retire(within / name for name in (*sorted(items), *outdated))
             if planned.output.stac:
                 files["stac"] = write_items(aligned, within, dates, record)
         with together(planned.folder, "stack"):
             return files | _write_documents(record, Path(planned.folder))
-    _retire_items(Objects(planned.folder, allow_network=allowed), items)
+    _retire(Objects(planned.folder, allow_network=allowed), [*sorted(items), *outdated])
     if planned.output.stac:
         with delivered(planned.folder, _ITEMS, allow_network=allowed, keep=lambda path: path.name in items) as upload:
             within = upload.folder / _ALIGNED
@@ -315,10 +317,10 @@ def _write_documents(record: StackRecord, folder: Path) -> dict[str, Path]:
     return files
 
 
-def _retire_items(store: Objects, names: set[str]) -> None:
-    """Remove the items of an earlier run from object storage: they would state its sigmas."""
+def _retire(store: Objects, names: Sequence[str]) -> None:
+    """Remove files of an earlier run from object storage: items would state its sigmas."""
     # Without the record of their delivery some may be there, too: an upload was interrupted.
-    for name in (f"{_ITEMS}_delivery.json", *(f"{_ALIGNED}/{name}" for name in sorted(names))):
+    for name in (f"{_ITEMS}_delivery.json", *(f"{_ALIGNED}/{name}" for name in names)):
         store.delete(name)
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ortho_pipeline.batch.executors import Crew, completed
 from ortho_pipeline.batch.freshness import DIGESTS, change_in_store, recorded_at, require_versions
+from ortho_pipeline.batch.paths import key_of_name
 from ortho_pipeline.batch.plan import STATE
 from ortho_pipeline.batch.records import MAX_BYTES, FileState, RunRecord, key_of, locked
 from ortho_pipeline.commands.resolved.ledger import versions
@@ -27,6 +28,8 @@ from ortho_pipeline.stores.objects import Objects
 
 #: No file of a stack is larger (bytes).
 LARGEST = 1 << 42
+#: How the names of records end.
+_RECORD = ".record.json"
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,23 @@ class RecordedFolder:
         store.put(name, record.text().encode())
         return Made(record, False)
 
+    def names(self) -> set[str]:
+        """Return the names of all files in the folder."""
+        if self.is_far:
+            return {name for name, _ in self.store.names()}
+        return set(os.listdir(self.place)) if os.path.isdir(self.place) else set()
+
+    def others(self, names: Iterable[str]) -> dict[str, list[str]]:
+        """Return the files of recorded sets that have none of some names, by name of set; the record is the last."""
+        known, found = {key_of_name(_record_of(name)) for name in names}, {}
+        for name in sorted(self.names()):
+            if not name.endswith(_RECORD) or key_of_name(name) in known:
+                continue
+            record = _record_in(self.store, name) if self.is_far else RunRecord.at(Path(self.place) / name)
+            if record is not None:
+                found[name.removesuffix(_RECORD)] = [*(state.path for state in record.outputs), name]
+        return found
+
     @contextlib.contextmanager
     def local(self, *names: str, folder: Path | None = None) -> Iterator[Path]:
         """Yield a folder on this machine with some of the files; of object storage, with copies for the block.
@@ -238,7 +258,7 @@ def recorded_in(folder: str | os.PathLike[str], name: str, allow_network: bool, 
 
 
 def _record_of(name: str) -> str:
-    return f"{name}.record.json"
+    return f"{name}{_RECORD}"
 
 
 def _record_in(store: Objects, name: str) -> RunRecord | None:

@@ -27,6 +27,8 @@ from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.options import OutputOptions, SceneOptions
 from ortho_pipeline.raster.source import Grid, open_dataset
 
+#: How the names of corrected images end.
+_TIF, _VRT = "_aligned.tif", "_aligned.vrt"
 #: Writes the image of a date with a name into a folder.
 WriteImage = Callable[[str, Path], None]
 
@@ -61,11 +63,19 @@ class Writer:
 
     def write(
         self, dates: Sequence[Dated], solved: AdjustedStack, crew: Crew, told: Callable[[float], None]
-    ) -> dict[str, str]:
-        """Return the names of files of dates."""
+    ) -> tuple[dict[str, str], list[str]]:
+        """Return the names of files of dates, and those of files of earlier runs that are no part of the result."""
         sets = [self._set(one, solved, number) for number, one in enumerate(dates) if solved.determined[number]]
         self.folder.make_all(crew, sets, told)
-        return {one.name: next(iter(one.files.values())) for one in sets}
+        return {one.name: next(iter(one.files.values())) for one in sets}, self._outdated(sets)
+
+    def _outdated(self, sets: Sequence[FileSet]) -> list[str]:
+        """Return the names of files of dates that are not in the result."""
+        found: list[str] = []
+        for name, files in self.folder.others(one.name for one in sets).items():
+            found += [f"{name}_stac.json", f"{name}_delivery.json", *files]
+        there = self.folder.names()
+        return [name for name in found if name in there]
 
     def _set(self, one: Dated, solved: AdjustedStack, number: int) -> FileSet:
         self.folder.learn(one.name)
@@ -94,7 +104,7 @@ class Writer:
         )
         saved = SavedModel(model, scene.sensor, scene.model_source, (scene.width, scene.height), {})
         inputs = (one.state(access.allow_network),)
-        return _Part(inputs, saved, "_aligned.vrt" if self.corrections_only else "_aligned.tif", write)
+        return _Part(inputs, saved, _VRT if self.corrections_only else _TIF, write)
 
     def _raw(self, raw: RawScene, placement: Placement, model: ImageCorrection) -> _Part:
         scene = placement.scene
@@ -102,13 +112,13 @@ class Writer:
         if not self.corrections_only:
             corrected = placement._replace(model=model, grid=self.placed.grid)
             write: WriteImage = functools.partial(write_in, corrected)
-            return _Part(raw.inputs, saved, "_aligned.tif", write, json_value(placement.surface.provenance))
+            return _Part(raw.inputs, saved, _TIF, write, json_value(placement.surface.provenance))
         try:
             exported = export_rpc(model).rpc
         except InputError:
             # No RPC represents it: the model file is the only output.
             return _Part(raw.inputs, saved)
-        return _Part(raw.inputs, saved, "_aligned.vrt", functools.partial(_write_rpc, scene, exported, self.scene))
+        return _Part(raw.inputs, saved, _VRT, functools.partial(_write_rpc, scene, exported, self.scene))
 
     def _configuration(self, part: _Part) -> dict[str, Any]:
         return {
