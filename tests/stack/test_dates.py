@@ -72,13 +72,26 @@ def test_an_ortho_without_a_date_is_an_error(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "pattern", "day"),
-    [("x_2020-061.tif", "%Y-%j", "2020-03-01"), ("S2A_20240503T101201_B04.jp2", "_%Y%m%dT%H%M%S", "2024-05-03")],
+    [
+        ("x_2020-061.tif", "%Y-%j", "2020-03-01"),
+        ("S2A_20240503T101201_B04.jp2", "_%Y%m%dT%H%M%S", "2024-05-03"),
+        ("LC81750322024123LGN00.tif", "%Y%j", "2024-05-02"),
+        # A number with another valid date within it: the whole number is meant.
+        ("x9201201011_20240503.tif", "%Y%m%d", "2024-05-03"),
+        ("20240503_to_20240503.tif", "%Y%m%d", "2024-05-03"),
+    ],
 )
 def test_patterns(name, pattern, day):
     assert by_pattern(name, pattern).date().isoformat() == day
 
 
-@pytest.mark.parametrize(("name", "pattern"), [("a.tif", "%Y"), ("a_2020.tif", "%q"), ("a_20201399.tif", "%Y%m%d")])
+@pytest.mark.parametrize(
+    ("name", "pattern"),
+    [
+        ("a.tif", "%Y"), ("a_2020.tif", "%q"), ("a_20201399.tif", "%Y%m%d"), ("a_81750322.tif", "%Y%m%d"),
+        ("a_20200101_20200113.tif", "%Y%m%d"),
+    ],
+)  # fmt: skip
 def test_patterns_that_do_not_fit_are_refused(name, pattern):
     with pytest.raises(InputError):
         by_pattern(name, pattern)

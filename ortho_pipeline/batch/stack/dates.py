@@ -46,6 +46,8 @@ _ITEMS = (
 )
 _PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "%j": r"(?P<j>\d{3})",
           "%H": r"(?P<H>\d{2})", "%M": r"(?P<M>\d{2})", "%S": r"(?P<S>\d{2})", "%%": "%"}  # fmt: skip
+#: Numbers in names that are years of other times are no dates.
+_YEARS = range(1900, 2101)
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,19 +381,38 @@ def by_pattern(name: str, pattern: str) -> datetime:
         raise InputError(
             f"{pattern!r} is not a pattern of a date", field="stack.date_pattern", remedy="such as %Y%m%d or %Y-%j"
         )
-    found = re.search("".join(_PARTS.get(part, re.escape(part)) for part in parts), name)
-    if found is None:
+    place = "".join(_PARTS.get(part, re.escape(part)) for part in parts)
+    # A lookahead finds places that overlap, too.
+    matches = list(re.finditer(f"(?=(?P<whole>{place}))", name))
+    if not matches:
         raise InputError(
             f"the name {name} does not have the date pattern {pattern}",
             field="stack.date_pattern",
             remedy="change the pattern, or give a CSV file with the columns file and date",
         )
-    numbers = found.groupdict()
-    whole = "".join(numbers.values())
-    code = "".join(f"%{key}" for key in numbers)
-    try:
-        return datetime.strptime(whole, code).replace(tzinfo=UTC)
-    except ValueError as error:
+    found = {match.span("whole"): _time_in(match) for match in matches}
+    dates = {time for time in found.values() if time is not None and time.year in _YEARS}
+    alone = {time for (first, last), time in found.items() if time in dates and not _is_within(name, first, last)}
+    times = alone if len(dates) > 1 and alone else dates
+    if len(times) != 1:
+        what = f"{len(times)} dates" if times else "no valid date"
         raise InputError(
-            f"the name {name} has no valid date", field="stack.date_pattern", remedy="change the pattern"
-        ) from error
+            f"the name {name} has {what} of the pattern {pattern}",
+            field="stack.date_pattern",
+            remedy="add more characters of the name to the pattern, or give a CSV file with the columns file and date",
+        )
+    return times.pop()
+
+
+def _time_in(match: re.Match[str]) -> datetime | None:
+    """Return the time at a place of a pattern; None if there is no such time."""
+    numbers = {key: text for key, text in match.groupdict().items() if key != "whole"}
+    try:
+        return datetime.strptime("".join(numbers.values()), "".join(f"%{key}" for key in numbers)).replace(tzinfo=UTC)
+    except ValueError:
+        return None
+
+
+def _is_within(name: str, first: int, last: int) -> bool:
+    """Return whether a digit is directly before or after a part of a name."""
+    return name[first - 1 : first].isdigit() or name[last : last + 1].isdigit()
