@@ -200,6 +200,38 @@ def test_a_changed_ortho_is_matched_again(made, tmp_path, counted):
     assert all(made[0][1].name in pair for pair in counted)
 
 
+def test_a_changed_source_or_side_car_is_matched_again(made, tmp_path, counted):
+    folder, source = tmp_path / "in", tmp_path / "in" / "sources" / "source.tif"
+    source.parent.mkdir(parents=True)
+    shutil.copy(made[0][0], folder)
+    shutil.copy(made[0][1], source)
+    # The date is a VRT of a VRT.
+    gdal.BuildVRT(str(source.with_suffix(".vrt")), [str(source)])
+    gdal.BuildVRT(str(folder / "b.vrt"), [str(source.with_suffix(".vrt"))])
+    (folder / "list.csv").write_text(f"file,date\n{made[0][0].name},2020-01-01\nb.vrt,2020-02-01\n")
+    run([folder / "list.csv"], tmp_path / "out")
+    run([folder / "list.csv"], tmp_path / "out")
+    assert len(counted) == 1
+    shutil.copy(made[0][2], source)
+    changed = run([folder / "list.csv"], tmp_path / "out")
+    assert len(counted) == 2
+    true = np.diff(RASTERS.shifts()[[0, 2]], axis=0)[0]
+    np.testing.assert_allclose(np.subtract(*(one.shift_px for one in changed.dates[::-1])), true, atol=0.05)
+    image = gdal.Open(str(folder / made[0][0].name))
+    gdal.SetConfigOption("GDAL_TIFF_INTERNAL_MASK", "NO")
+    image.CreateMaskBand(gdal.GMF_PER_DATASET)
+    gdal.SetConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+    mask = np.full((image.RasterYSize, image.RasterXSize), 255, np.uint8)
+    mask[:40] = 0
+    image.GetRasterBand(1).GetMaskBand().WriteArray(mask)
+    image = None
+    assert (folder / f"{made[0][0].name}.msk").exists()
+    run([folder / "list.csv"], tmp_path / "out")
+    assert len(counted) == 3
+    aligned = gdal.Open(str(tmp_path / "out" / "aligned" / f"{made[0][0].stem}_aligned.tif"))
+    assert not aligned.GetRasterBand(1).GetMaskBand().ReadAsArray()[:30].any()
+
+
 def test_orthos_that_are_no_part_of_the_result_go(made, tmp_path):
     output = OutputOptions(resampling="cubic", threads=1, format="GTiff", stac=True)
     run(made[0], tmp_path / "out", output=output)

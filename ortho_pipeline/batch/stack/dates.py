@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.batch.freshness import state_of
+from ortho_pipeline.batch.freshness import DIGESTS, state_of
 from ortho_pipeline.batch.paths import PipelinePaths, Place, key_of_name
 from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
@@ -22,6 +22,8 @@ from ortho_pipeline.commands.heights.opening import GIVE_HEIGHTS, dem_files, has
 from ortho_pipeline.commands.orthos.opening import ORTHO, open_ortho
 from ortho_pipeline.commands.orthos.verifying import RASTERS
 from ortho_pipeline.commands.placement import Placement, place_scene
+from ortho_pipeline.commands.resolved.ledger import Ledger
+from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.stac.given import resolved
 from ortho_pipeline.errors import InputError, reads
@@ -97,9 +99,14 @@ class Dated:
         """The file that was given."""
         return self.path if self.raw is None else place(self.raw.resolved.scene.path)
 
-    def state(self, allow_network: bool) -> FileState:
-        """Return the state of the ortho."""
-        return self.made or state_of("ortho", self.path, allow_network=allow_network)
+    def states(self, options: SceneOptions) -> tuple[FileState, ...]:
+        """Return the states of the ortho, of its side-cars and of the sources of a VRT, if they are on this machine."""
+        if self.made is not None:
+            return (self.made,)
+        if Location(self.path).is_far:
+            return (state_of("ortho", self.path, allow_network=options.allow_network),)
+        files = Ledger.of(Request(self.path, options), self.scene).roles
+        return tuple(FileState.of("ortho", file.absolute(), DIGESTS) for file in sorted(files))
 
     @property
     def days(self) -> float:

@@ -73,16 +73,16 @@ class Matcher:
         """Return all pairs, matched now or before; `told` hears the finished share."""
         for one, other in wanted:
             self.folder.learn(_name_of(dates[one], dates[other]))
-        allowed = self.scene.allow_network
-        state = {node: dates[node].state(allowed) for node in {node for pair in wanted for node in pair}}
-        sets = [self._set(dates, state, one, other) for one, other in wanted]
+        states = {node: dates[node].states(self.scene) for node in {node for pair in wanted for node in pair}}
+        sets = [self._set(dates, states, one, other) for one, other in wanted]
         made = self.folder.make_all(crew, sets, told)
         return [self._pair(one, other, made[of_pair.name]) for (one, other), of_pair in zip(wanted, sets, strict=True)]
 
-    def _set(self, dates: Sequence[Dated], state: Mapping[int, FileState], one: int, other: int) -> FileSet:
+    def _set(self, dates: Sequence[Dated], states: Mapping[int, Sequence[FileState]], one: int, other: int) -> FileSet:
         first, second = dates[one], dates[other]
         name = _name_of(first, second)
-        inputs = state[one].replaced(role="later ortho"), state[other].replaced(role="earlier ortho")
+        roles = {one: "later ortho", other: "earlier ortho"}
+        inputs = tuple(state.replaced(role=role) for node, role in roles.items() for state in states[node])
         write = functools.partial(self._write, replace(first, raw=None), replace(second, raw=None), _file_of(name))
         return FileSet(name, inputs, self._configuration(), {"matches": _file_of(name)}, write, may_fail=True)
 

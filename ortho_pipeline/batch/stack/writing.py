@@ -103,8 +103,7 @@ class Writer:
             else functools.partial(_write_resampled, scene, model, self.placed.grid, self.output, access)
         )
         saved = SavedModel(model, scene.sensor, scene.model_source, (scene.width, scene.height), {})
-        inputs = (one.state(access.allow_network),)
-        return _Part(inputs, saved, _VRT if self.corrections_only else _TIF, write)
+        return _Part(one.states(access), saved, _VRT if self.corrections_only else _TIF, write)
 
     def _raw(self, raw: RawScene, placement: Placement, model: ImageCorrection) -> _Part:
         scene = placement.scene

@@ -157,10 +157,17 @@ class Ledger:
 
 
 def _files_of(path: str | os.PathLike[str], scene: SceneOptions) -> list[str]:
-    try:
-        return files_of(raster.open_dataset(path, **scene.access))
-    except OrthoError:
-        return []
+    """Return the files of a raster by GDAL, and those of VRTs among them."""
+    found: dict[str, None] = {}
+    left = [os.fspath(path)]
+    while left:
+        try:
+            files = files_of(raster.open_dataset(left.pop(), **scene.access))
+        except OrthoError:
+            continue
+        left += [file for file in files if file not in found and file.lower().endswith(".vrt")]
+        found |= dict.fromkeys(files)
+    return list(found)
 
 
 @functools.cache
