@@ -160,13 +160,13 @@ def register(
     return stack, tuple(registrations)
 
 
-def resample(band: Array, transform: Transform) -> Array:
-    """Return a band on the pixels of the reference, by cubic splines; NaN outside the band."""
+def resample(band: Array, transform: Transform, order: int = 3) -> Array:
+    """Return a band on the pixels of the reference, by splines of an order; NaN outside the band."""
     from scipy.ndimage import map_coordinates
 
     rows, columns = np.indices(band.shape)
     there = transform(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5) - 0.5
-    return map_coordinates(band, there.T[::-1], order=3, cval=np.nan).reshape(band.shape)
+    return map_coordinates(band, there.T[::-1], order=order, cval=np.nan).reshape(band.shape)
 
 
 def measure(fixed: Array, moving: Array, guess: Any, *, patch: int, spacing: int) -> tuple[Array, Array]:
