@@ -79,6 +79,8 @@ def test_an_ortho_without_a_date_is_an_error(tmp_path):
         # A number with another valid date within it: the whole number is meant.
         ("x9201201011_20240503.tif", "%Y%m%d", "2024-05-03"),
         ("20240503_to_20240503.tif", "%Y%m%d", "2024-05-03"),
+        # The day of acquisition is before that of processing.
+        ("LC08_L2SP_175032_20240123_20240201_02_T1.tif", "%Y%m%d", "2024-01-23"),
     ],
 )
 def test_patterns(name, pattern, day):
@@ -89,7 +91,7 @@ def test_patterns(name, pattern, day):
     ("name", "pattern"),
     [
         ("a.tif", "%Y"), ("a_2020.tif", "%q"), ("a_20201399.tif", "%Y%m%d"), ("a_81750322.tif", "%Y%m%d"),
-        ("a_20200101_20200113.tif", "%Y%m%d"),
+        ("a_920200101920210101.tif", "%Y%m%d"),
     ],
 )  # fmt: skip
 def test_patterns_that_do_not_fit_are_refused(name, pattern):

@@ -398,9 +398,10 @@ def by_pattern(name: str, pattern: str) -> datetime:
             remedy="change the pattern, or give a CSV file with the columns file and date",
         )
     found = {match.span("whole"): _time_in(match) for match in matches}
-    dates = {time for time in found.values() if time is not None and time.year in _YEARS}
-    alone = {time for (first, last), time in found.items() if time in dates and not _is_within(name, first, last)}
-    times = alone if len(dates) > 1 and alone else dates
+    valid = [(span, time) for span, time in found.items() if time is not None and time.year in _YEARS]
+    # Archives put the day of acquisition before that of processing.
+    alone = [time for span, time in valid if not _is_within(name, *span)]
+    times = alone[:1] or list(dict.fromkeys(time for _, time in valid))
     if len(times) != 1:
         what = f"{len(times)} dates" if times else "no valid date"
         raise InputError(
@@ -408,7 +409,7 @@ def by_pattern(name: str, pattern: str) -> datetime:
             field="stack.date_pattern",
             remedy="add more characters of the name to the pattern, or give a CSV file with the columns file and date",
         )
-    return times.pop()
+    return times[0]
 
 
 def _time_in(match: re.Match[str]) -> datetime | None:
