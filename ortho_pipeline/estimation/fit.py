@@ -61,7 +61,7 @@ class Fit:
 
     - `raw_residuals`: of the model as delivered; NaN if the model comes from the points alone.
     - `loo_residuals`: leave-one-out; NaN for points that did not take part.
-    - `sigma0`: None without redundancy.
+    - `sigma0`: of the image points; None without redundancy, or with priors and a redundancy below 4.
     - `points`: with the model's reference height where a 2D model needs no heights and the points have none.
     - `rejected`: control points that were left out as gross errors, each with the reason.
     - `outlying`: points that contradict the fit but still count.

@@ -30,8 +30,8 @@ _INVERSE_STEPS = 25
 class Constraints:
     """Pseudo-observations of a model: knowledge of its parameters beyond image measurements.
 
-    An adjustment weights them by their sigma like any other observation. Measured ones count in the redundancy.
-    Fictitious ones (soft constraints with a chosen sigma) do not, because their residuals do not test measurements.
+    An adjustment weights measured ones by their sigma, like any other observation. The sigma of fictitious ones (soft
+    constraints) is chosen, and their residuals test no measurements.
 
     Parameters
     ----------
