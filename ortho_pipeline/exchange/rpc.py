@@ -152,7 +152,10 @@ def _in_tile(dataset: gdal.Dataset, model: RPC, path: str) -> RPC:
     fields = _fields_beside(dataset)
     if not fields or path not in {os.path.realpath(file) for file in _sidecar_files(dataset)}:
         return model
-    used = rpc_of_fields(fields, path)
+    try:
+        used = rpc_of_fields(fields, path)
+    except InputError:
+        return model
     shift = np.array([model.col_off - used.col_off, model.row_off - used.row_off])
     same = np.allclose([*model.row_num, *model.col_num], [*used.row_num, *used.col_num], rtol=1e-12, atol=0.0)
     return used if same and np.abs(shift - np.round(shift)).max() < 1e-6 else model
