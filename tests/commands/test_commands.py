@@ -13,7 +13,7 @@ from osgeo import gdal
 
 import ortho_pipeline
 from ortho_pipeline import commands, host
-from ortho_pipeline.commands import results
+from ortho_pipeline.commands import inputs, results
 from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import CoverageError, DatumError, DegeneratePoints, InputError, PluginError
 from ortho_pipeline.exchange.model_file import read_model_file
@@ -488,12 +488,18 @@ def test_provenance_has_the_checksum_of_every_input_and_the_command(tiny, tmp_pa
 
 
 def test_model_files_may_name_model_families_of_plugins(tiny, tmp_path, monkeypatch):
-    called = []
-    monkeypatch.setattr(host.Host, "discover", classmethod(called.append))
+    called, discover, read = [], host.Host.discover, inputs.read_model_file
+
+    def families_are_known(path):
+        assert called
+        return read(path)
+
+    monkeypatch.setattr(host.Host, "discover", lambda: called.append(1) or discover())
+    monkeypatch.setattr(inputs, "read_model_file", families_are_known)
     path = tmp_path / "m_model.json"
     ortho_pipeline.save_model(tiny.model, path)
-    open_scene(tiny.image, SceneOptions(model=path))
-    assert called
+    called.clear()
+    assert open_scene(tiny.image, SceneOptions(model=path)).sensor == "model file"
 
 
 def test_a_model_of_another_place_is_a_warning(tiny):
