@@ -246,7 +246,9 @@ def test_statistics_overviews_and_masks_go_with_the_raster_that_is_replaced(tmp_
         with RasterWriter(path, grid, profile, driver=driver) as writer:
             writer.write(0, 0, np.full((1, 48, 64), value, dtype="u1"), None)
         dataset = gdal.Open(str(path))
-        assert dataset.GetRasterBand(1).GetStatistics(False, False)[:2] in ([0.0, 0.0], [value, value])
+        # GDAL before 3.13 returns zeros if there are none.
+        stored = dataset.GetRasterBand(1).GetStatistics(False, False) or [0.0, 0.0]
+        assert stored[:2] in ([0.0, 0.0], [value, value])
         overview = dataset.GetRasterBand(1).GetOverview(0)
         assert overview is None or (overview.ReadAsArray() == value).all()
         assert [one.name for one in tmp_path.iterdir()] == ["a.tif"]

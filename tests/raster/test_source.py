@@ -85,6 +85,7 @@ def test_a_mask_of_each_band_is_that_of_its_band(tmp_path, monkeypatch, bands, n
     np.testing.assert_array_equal(valid, (masks & (pixels != nodata))[chosen])
 
 
+@pytest.mark.driver("ENVI")
 @pytest.mark.parametrize("dtype", [None, "Float64", "Int32"])
 def test_nodata_with_more_digits_than_a_pixel_has_is_that_of_the_pixels(tmp_path, dtype):
     """A VRT and the header of an ENVI file state -9999.9, and float32 holds -9999.900390625: GDAL's mask knows."""

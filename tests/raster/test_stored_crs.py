@@ -40,16 +40,30 @@ def test_a_file_has_the_place_of_its_grid(tmp_path: Path, crs: str, lon: float, 
     size = 1e-4 if crs == "EPSG:4326" else 10.0
     write(tmp_path / "a.tif", grid_at(crs, lon, lat, size), driver)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
-    dataset = gdal.Open(str(tmp_path / "a.tif"))
+    np.testing.assert_allclose(corner(tmp_path / "a.tif"), (lon, lat), atol=1e-6)
+
+
+def corner(path: Path) -> tuple[float, float]:
+    """Return longitude and latitude of the first corner of a file, by PROJ."""
+    dataset = gdal.Open(str(path))
     left, _, _, top, _, _ = dataset.GetGeoTransform()
     found = pyproj.CRS.from_wkt(dataset.GetProjection())
-    place = pyproj.Transformer.from_crs(found, "EPSG:4326", always_xy=True).transform(left, top)
-    np.testing.assert_allclose(place[:2], (lon, lat), atol=1e-6)
+    lon, lat, *_ = pyproj.Transformer.from_crs(found, "EPSG:4326", always_xy=True).transform(left, top)
+    return lon, lat
 
 
 @pytest.mark.parametrize(("crs", "lon", "lat"), [("EPSG:8857", 10.0, 50.0), ("EPSG:9311", -100.0, 40.0)])
 def test_a_crs_that_no_file_gives_back_is_refused(tmp_path: Path, crs: str, lon: float, lat: float) -> None:
-    with pytest.raises(CrsError, match=crs) as caught:
+    """GDAL 3.6 stores none of them; later ones may."""
+    refused: CrsError | None = None
+    try:
         write(tmp_path / "a.tif", grid_at(crs, lon, lat), "GTiff")
-    assert caught.value.field == "output.crs"
-    assert not [*tmp_path.iterdir()]
+    except CrsError as error:
+        refused = error
+    if refused is None:
+        assert int(gdal.VersionInfo()) >= 3070000
+        np.testing.assert_allclose(corner(tmp_path / "a.tif"), (lon, lat), atol=1e-6)
+    else:
+        assert crs in str(refused)
+        assert refused.field == "output.crs"
+        assert not [*tmp_path.iterdir()]
