@@ -115,41 +115,39 @@ class Regridded:
 
     def read(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return pixels and which are valid ``(bands, height, width)`` of a window of the grid."""
-        if self._offset is None:
-            return self._resampled(left, top, width, height)
-        count, source = self._source.count, self._source
-        pixels = np.zeros((count, height, width), dtype=source.dtype)
-        valid = np.zeros(pixels.shape, dtype=bool)
-        west, north = left - self._offset[0], top - self._offset[1]
-        first, last = max(west, 0), min(west + width, source.width)
-        upper, lower = max(north, 0), min(north + height, source.height)
-        if first < last and upper < lower:
-            part = (slice(None), slice(upper - north, lower - north), slice(first - west, last - west))
-            pixels[part] = values = source.read(first, upper, last - first, lower - upper)
-            good = source.read_valid(first, upper, values)
-            valid[part] = True if good is None else good
-        return pixels, valid
-
-    def _resampled(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         source, grid = self._source, self._grid
         pixels = np.zeros((source.count, height, width), dtype=source.dtype)
         valid = np.zeros(pixels.shape, dtype=bool)
-        # GDAL reads no window that reaches outside of the grid.
-        first, last = max(left, 0), min(left + width, grid.width)
-        upper, lower = max(top, 0), min(top + height, grid.height)
-        if first >= last or upper >= lower:
-            return pixels, valid
+        if self._offset is None:
+            west, north, inside, read = left, top, (grid.width, grid.height), self._resampled
+        else:
+            west, north = left - self._offset[0], top - self._offset[1]
+            inside, read = (source.width, source.height), self._copied
+        # Neither GDAL nor a source reads a window that reaches outside.
+        first, last = max(west, 0), min(west + width, inside[0])
+        upper, lower = max(north, 0), min(north + height, inside[1])
+        if first < last and upper < lower:
+            part = (slice(None), slice(upper - north, lower - north), slice(first - west, last - west))
+            pixels[part], valid[part] = read(first, upper, last - first, lower - upper)
+        return pixels, valid
+
+    def _copied(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return pixels and validity of a window of the ortho itself."""
+        pixels = self._source.read(left, top, width, height)
+        valid = self._source.read_valid(left, top, pixels)
+        return pixels, np.ones(pixels.shape, dtype=bool) if valid is None else valid
+
+    def _resampled(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return pixels and validity of a window within the grid."""
         try:
-            stack = self._warped.ReadAsArray(first, upper, last - first, lower - upper)
+            stack = self._warped.ReadAsArray(left, top, width, height)
         except RuntimeError as error:
             raise InputError(
                 f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
             ) from error
-        part = (slice(None), slice(upper - top, lower - top), slice(first - left, last - left))
-        pixels[part], valid[part] = stack[:-1], stack[-1] >= _ENOUGH
-        if pixels.dtype.kind == "f":
-            valid &= ~np.isnan(pixels)
-        return pixels, valid
+        pixels = stack[:-1]
+        valid = np.broadcast_to(stack[-1] >= _ENOUGH, pixels.shape)
+        return pixels, valid & ~np.isnan(pixels) if pixels.dtype.kind == "f" else valid
 
     @property
     def _warped(self) -> gdal.Dataset:

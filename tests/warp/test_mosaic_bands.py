@@ -77,7 +77,7 @@ def test_a_band_without_a_value_costs_the_other_bands_nothing(tmp_path, way, kin
 
 @pytest.mark.parametrize("last", ["alpha", "constant", "saturated"])
 def test_bands_are_balanced_beside_one_that_has_no_brightness(tmp_path, last):
-    """The second ortho is brighter by known gains and offsets; the last band of both says nothing of them."""
+    """The second ortho is brighter by known gains and offsets. The last band of both orthos does not show them."""
     gains, offsets, orthos = np.array([2.0, 1.0, 3.0]), np.array([-10.0, 30.0, 5.0]), []
     colours = gdal.GCI_RedBand, gdal.GCI_GreenBand, gdal.GCI_BlueBand
     profile = Profile(

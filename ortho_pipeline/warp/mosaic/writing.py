@@ -98,8 +98,10 @@ def write_cog(
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """A window of the mosaic in the making: its pixels, which are valid, and where it is chosen pixel by pixel whose
-    they shall be and the ranks ``(bands, h, w)`` of those that there are.
+    """A window of the mosaic in the making: its pixels, and which of them are valid.
+
+    Where an ortho is chosen for each pixel, it also has the wanted ortho of each pixel, and the rank ``(bands, h, w)``
+    of the ortho that each pixel is from.
     """
 
     left: int
