@@ -167,7 +167,7 @@ def _mark_of(ortho: Ortho) -> str:
 
 
 def _check_bands(orthos: Sequence[Ortho]) -> None:
-    first = None
+    first, profiles = None, list[Profile]()
     for ortho in orthos:
         source = RasterSource(ortho.path)
         nodata = tuple(None if value is None else str(value) for value in source.nodata)
@@ -189,12 +189,12 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
                     "another one. The copy has no report, so the order best-view puts it last"
                 )
             raise InputError(what, file=ortho.path, remedy=remedy)
-    _check_meaning(orthos)
+        profiles.append(Profile.of(source))
+    _check_meaning(orthos, profiles)
 
 
-def _check_meaning(orthos: Sequence[Ortho]) -> None:
+def _check_meaning(orthos: Sequence[Ortho], profiles: Sequence[Profile]) -> None:
     """Raise an `InputError` if equal pixels of two orthos mean different values or colours."""
-    profiles = [Profile.of(RasterSource(ortho.path)) for ortho in orthos]
     first, name = profiles[0], orthos[0].path.name
     for ortho, profile in zip(orthos, profiles, strict=True):
         what = ""
