@@ -217,8 +217,8 @@ class Fit:
             "condition": json_value(self.condition),
             "corner_ratio": json_value(self.corner_ratio),
         }
-        if self.common_error is not None:
-            statistics["common_error"] = CommonErrorRecord.of(self.common_error)
+        if (common := self.common_error) is not None:
+            statistics["common_error"] = CommonErrorRecord.of(common, common.gain)
         return (
             Statistics(**statistics)
             if self.shared_errors is None

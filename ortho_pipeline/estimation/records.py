@@ -130,18 +130,21 @@ class CommonError(Record):
     """An error common to many points, such as the error of a reference for its matches: metres true east and north.
 
     `estimate_m` is its estimate from other points, and `estimate_sigma_m` the standard deviation of the estimate.
+    `per_sigma` is the error of each parameter per standard deviation of what remains; a block does not state it.
     """
 
     points: Count
     sigma_m: float
     estimate_m: Pair
     estimate_sigma_m: Pair
+    per_sigma: tuple[Pair, ...] | None = None
 
     @classmethod
-    def of(cls, common: CommonGroundError) -> Self:
-        """Return the published record of the unknown."""
+    def of(cls, common: CommonGroundError, gain: Array | None = None) -> Self:
+        """Return the published record of the unknown, with the gain ``(P, 2)`` of the parameters of one image."""
         estimate, left = common.value * common.sigma, np.sqrt(np.diag(common.left)) * common.sigma
-        return cls(points=common.points, sigma_m=common.sigma, estimate_m=tuple(estimate), estimate_sigma_m=tuple(left))
+        found = {"points": common.points, "sigma_m": common.sigma, "estimate_m": estimate, "estimate_sigma_m": left}
+        return cls.model_validate({**found, **({} if gain is None else {"per_sigma": gain})})
 
 
 class Statistics(Record):

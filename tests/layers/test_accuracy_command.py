@@ -123,3 +123,16 @@ def test_a_run_without_the_layer_removes_that_of_an_earlier_one(tiny, points, tm
     rectified(tiny, tmp_path / "out", points=points, output=dataclasses.replace(OUTPUT, accuracy_raster=False))
     assert not first.files["accuracy"].exists()
     assert not first.files["accuracy_style"].exists()
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_few_points_do_not_enlarge_the_error_of_their_reference(tiny, tmp_path, count):
+    """Exact points whose reference is accurate to 5 m: 5 m on either axis, whatever their number tells of sigma0."""
+    header = "id,col,row,x,y,h,sigma_image,sigma_common"
+    tiny.write(tiny.gcps, [(*row, 0.01, 5.0) for row in tiny.points(count)], header=header)
+    point = PointOptions(gcps=tiny.gcps, crs="EPSG:4979", vertical="ellipsoid", correction="shift")
+    first = rectified(tiny, tmp_path / "first", points=point, sigma=0.01)
+    again = rectified(tiny, tmp_path / "again", scene=SceneOptions(model=first.files["model"]), sigma=0.01)
+    for result in (first, again):
+        found = ce90(result)
+        np.testing.assert_allclose(found[np.isfinite(found)], 5.0 * math.sqrt(2 * math.log(10)), rtol=0.03)

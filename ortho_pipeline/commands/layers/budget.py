@@ -110,33 +110,42 @@ def budget_of(placed: Placement) -> tuple[Known | None, list[Notice]]:
 
 
 def _covariance(placed: Placement) -> Array | None:
-    """Return the covariance of the model's parameters, now or before; None where nothing was adjusted."""
+    """Return the covariance of the model's parameters, now or before; None where nothing was adjusted.
+
+    Residuals do not estimate the common error of points, so few of them do not enlarge it.
+    """
     from ortho_pipeline.warp.quality.accuracy import predictive
 
     fit, before = placed.adjusted.fit, placed.scene.adjusted
     if len(fit.param_names) and fit.used.any():
-        return predictive(fit.covariance, math.inf if fit.sigma0 is None else fit.degrees_of_freedom)
+        freedom, common = fit.degrees_of_freedom, fit.covariance - fit.relative_covariance
+        return predictive(fit.relative_covariance, math.inf if fit.sigma0 is None else freedom) + common
     if before is None or not placed.model.param_names:
         return None
-    covariance = _of_record(before, placed.model.param_names)
-    return (
-        None if covariance is None else predictive(covariance, _number(before.get("statistics"), "degrees_of_freedom"))
-    )
+    found = _of_record(before, placed.model.param_names)
+    if found is None:
+        return None
+    covariance, common = found
+    freedom = math.inf if before.get("sigma0") is None else _number(before["statistics"], "degrees_of_freedom")
+    return predictive(covariance - common, freedom) + common
 
 
-def _of_record(adjusted: Mapping[str, Any], names: tuple[str, ...]) -> Array | None:
-    """Return the covariance of parameters in a model file; None if it is incomplete."""
+def _of_record(adjusted: Mapping[str, Any], names: tuple[str, ...]) -> tuple[Array, Array] | None:
+    """Return the covariance of parameters in a model file, and its part from a common error; None if incomplete."""
     try:
         parameters = adjusted["parameters"]
         sigmas = np.array([float(parameters[name]["sigma"]) for name in names])
         correlation = np.array(adjusted["statistics"]["correlation"], dtype=float)
-    except (KeyError, TypeError, ValueError):
+        per_sigma = (adjusted["statistics"].get("common_error") or {}).get("per_sigma")
+        gain = np.array(per_sigma or np.zeros((len(names), 2)), dtype=float)
+    except (AttributeError, KeyError, TypeError, ValueError):
         return None
-    if list(parameters) != list(names) or correlation.shape != (len(names),) * 2:
+    if list(parameters) != list(names) or correlation.shape != (len(names),) * 2 or gain.shape != (len(names), 2):
         return None
     # A parameter that a prior holds has no correlation to speak of.
     correlation = np.where(np.isfinite(correlation), correlation, np.eye(len(names)))
-    return np.asarray(sigmas[:, None] * correlation * sigmas) if np.isfinite(sigmas).all() else None
+    covariance = np.asarray(sigmas[:, None] * correlation * sigmas)
+    return (covariance, gain @ gain.T) if np.isfinite(sigmas).all() and np.isfinite(gain).all() else None
 
 
 def _number(statistics: Any, name: str) -> float:
