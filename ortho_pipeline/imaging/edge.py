@@ -361,9 +361,9 @@ def _binned(fitted: _Fitted) -> tuple[Array, Array, Array]:
     if not counts[core].all():
         angle = abs(math.degrees(math.atan(fitted.b)))
         raise InputError(
-            f"the edge is too parallel to a pixel axis: {angle:.1f} degrees",
+            f"an edge at {angle:.1f} degrees to a pixel axis has pixels at too few distances from it",
             field="edge",
-            remedy="give an edge at 3 to 40 degrees to the pixel axes, or a longer one",
+            remedy="give an edge at 3 to 15 degrees to a pixel axis, or a longer one",
         )
     # Residuals of the model, so positions within a bin do not matter.
     left = fitted.values[inside] - fitted.model(fitted.distance[inside])

@@ -156,10 +156,12 @@ def test_nodata_beside_the_edge_is_left_out():
         analyse_edge(holed, segment)
 
 
-@pytest.mark.parametrize("angle", [0.0, 90.0, 45.0, 0.2])
+@pytest.mark.parametrize("angle", [0.0, 90.0, 45.0, 0.2, 26.565])
 def test_an_edge_along_the_pixel_grid_is_refused(angle):
-    with pytest.raises(InputError, match="too parallel to a pixel axis"):
+    """A row of an edge with a slope of 1/2 repeats the distances of the row above it."""
+    with pytest.raises(InputError, match="pixels at too few distances") as caught:
         analyse_edge(*edge_image(0.5, angle))
+    assert "3 to 15 degrees" in caught.value.remedy
 
 
 def test_what_is_no_edge_is_refused():
