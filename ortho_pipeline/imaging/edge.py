@@ -35,6 +35,8 @@ BIN = 0.25
 APERTURE = math.sqrt(1 / 12)
 #: Least step of an edge, in standard deviations of the noise.
 _CONTRAST = 5.0
+#: Largest share of saturated pixels.
+_SATURATED = 0.05
 _NO_EDGE_REMEDY = Text("give an edge between two even areas with ", Setting("edge", "x1,y1,x2,y2"))
 
 
@@ -88,7 +90,9 @@ class Edge:
 # -- one edge --------------------------------------------------------------------------------------------------------
 
 
-def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WIDTH) -> Edge:
+def analyse_edge(
+    pixels: Array, segment: Segment, *, half_width: float = HALF_WIDTH, limits: tuple[float, ...] = ()
+) -> Edge:
     """Measure the spread of one straight edge.
 
     Parameters
@@ -99,12 +103,14 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
         (column, row) of its ends, to a few pixels; the outer corner of the first pixel is (0, 0).
     half_width : float
         Width (px) of the even area on each side.
+    limits : tuple of float
+        Values of saturated pixels, which make an edge look sharper than it is.
 
     Raises
     ------
     InputError
-        If it is outside the pixels, too short, too faint, or no edge; or if the pixel grid samples it at too few
-        distances (along a pixel axis, or at 45 degrees).
+        If it is outside the pixels, too short, too faint, saturated, or no edge; or if the pixel grid samples it at too
+        few distances (along a pixel axis, or at 45 degrees).
     """
     (x1, y1), (x2, y2) = segment
     if not all(map(math.isfinite, (x1, y1, x2, y2))):
@@ -128,6 +134,7 @@ def analyse_edge(pixels: Array, segment: Segment, *, half_width: float = HALF_WI
         area = _Area.around(view, fitted.ends(area), reach)
         fitted = _Fitted.to(area, (fitted.a, fitted.b))
     _require_step(fitted)
+    _require_unsaturated(area, limits)
     distance, left, error = _binned(fitted)
     esf = fitted.model(distance) + left
     lsf, fwhm = _line_spread(fitted, distance, left)
@@ -330,6 +337,16 @@ def _require_step(fitted: _Fitted) -> None:
             f"the width of the edge is too uncertain: {fitted.sigma:.2g} ± {fitted.sigma_error:.2g} px",
             field="edge",
             remedy="give a longer or a sharper edge, between even areas",
+        )
+
+
+def _require_unsaturated(area: _Area, limits: tuple[float, ...]) -> None:
+    share = float(np.isin(area.values, limits).mean())
+    if share > _SATURATED:
+        raise InputError(
+            f"{share:.0%} of the pixels next to the edge are saturated: they have the lowest or highest possible value",
+            field="edge",
+            remedy="give an edge between areas that are neither black nor white",
         )
 
 

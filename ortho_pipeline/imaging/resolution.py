@@ -39,13 +39,15 @@ _NONE = 0.1
 # -- finding edges ---------------------------------------------------------------------------------------------------
 
 
-def find_edges(pixels: Array) -> list[Edge]:
+def find_edges(pixels: Array, limits: tuple[float, ...] = ()) -> list[Edge]:
     """Find straight edges between even areas, clearest first, and measure them.
 
     Parameters
     ----------
     pixels : (H, W)
         NaN where there is no value.
+    limits : tuple of float
+        Values of saturated pixels.
 
     Returns
     -------
@@ -55,7 +57,7 @@ def find_edges(pixels: Array) -> list[Edge]:
     clear: list[Edge] = []
     for segment in _candidates(pixels):
         try:
-            edge = analyse_edge(pixels, segment, half_width=_NARROW)
+            edge = analyse_edge(pixels, segment, half_width=_NARROW, limits=limits)
         except InputError:
             continue
         if edge.contrast < _CLEAR * edge.noise or edge.misfit > _MISFIT or edge.sigma_error > _UNSURE * edge.sigma:
@@ -154,11 +156,11 @@ def measure(
         return [_given(source, edge, band)]
     edges: list[Edge] = []
     for left, top, width, height in _windows(source.width, source.height):
-        inside = find_edges(_pixels(source, band, left, top, width, height))
+        inside = find_edges(_pixels(source, band, left, top, width, height), _limits(source))
         edges += [_moved(part, left, top) for part in inside]
     if not edges:
         raise InputError(
-            "no suitable edge found: it must be straight, between even areas, and oblique to the pixel axes",
+            "no suitable edge found: it must be straight, between even unsaturated areas, and oblique",
             file=source.path,
             remedy=Text("give one with ", Setting("edge", "x1,y1,x2,y2")),
         )
@@ -169,8 +171,8 @@ def _given(source: RasterSource, edge: Segment, band: int) -> Edge:
     (x1, y1), (x2, y2) = edge
     reach = 2 * HALF_WIDTH + 2
     numbers = np.array([x1, y1, x2, y2])
-    inside = np.isfinite(numbers).all() and (numbers >= 0).all()
-    if not (inside and max(x1, x2) <= source.width and max(y1, y2) <= source.height):
+    known = np.isfinite(numbers).all() and (numbers >= 0).all()
+    if not (known and max(x1, x2) <= source.width and max(y1, y2) <= source.height):
         raise InputError(
             f"the edge {said(edge)} is outside the image of {source.width} x {source.height} pixels",
             file=source.path,
@@ -189,7 +191,8 @@ def _given(source: RasterSource, edge: Segment, band: int) -> Edge:
     bottom = min(source.height, math.ceil(max(y1, y2) + reach))
     pixels = _pixels(source, band, left, top, right - left, bottom - top)
     try:
-        return _moved(analyse_edge(pixels, ((x1 - left, y1 - top), (x2 - left, y2 - top))), left, top)
+        inside = (x1 - left, y1 - top), (x2 - left, y2 - top)
+        return _moved(analyse_edge(pixels, inside, limits=_limits(source)), left, top)
     except InputError as error:
         raise InputError(error.message, file=source.path, field=error.field, remedy=error.remedy) from error
 
@@ -214,6 +217,14 @@ def _pixels(source: RasterSource, band: int, left: int, top: int, width: int, he
     if valid is not None:
         pixels[~valid[band - 1]] = np.nan
     return pixels
+
+
+def _limits(source: RasterSource) -> tuple[float, ...]:
+    """Return the values of saturated pixels: the ends of an integer type."""
+    if source.dtype.kind not in "iu":
+        return ()
+    ends = np.iinfo(source.dtype)
+    return float(ends.min), float(ends.max)
 
 
 def _moved(edge: Edge, left: int, top: int) -> Edge:

@@ -270,6 +270,20 @@ def test_command_says_what_to_correct(tmp_path, arguments, said):
     assert error["remedy"]
 
 
+@pytest.mark.parametrize("levels", [(20.0, 280.0), (-30.0, 200.0)])
+def test_saturated_edges_are_refused(tmp_path, levels):
+    """Pixels of an 8-bit image that are clipped at 0 or 255 make an edge of 1 px look like one of 0.85 px."""
+    pixels, segment = edge_image(1.0, 8.0, levels=levels, noise=2.0)
+    path = tmp_path / "bright.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), *pixels.shape[::-1], 1)
+    dataset.WriteArray(np.clip(np.rint(pixels), 0, 255).astype(np.uint8))
+    del dataset
+    with pytest.raises(InputError, match="next to the edge are saturated"):
+        resolution.measure(path, edge=segment)
+    with pytest.raises(InputError, match="no suitable edge"):
+        resolution.measure(path)
+
+
 def test_an_image_without_edges_is_an_error(tmp_path):
     flat = np.random.default_rng(0).normal(500.0, 5.0, (100, 100))
     for pixels in (flat, np.full((100, 100), 3.0), np.zeros((3, 3))):
