@@ -335,6 +335,12 @@ class DemSurface(Surface):
             window = column * TILE, row * TILE, TILE + 1, TILE + 1
             tile = self._tiles.get((row, column, filled), functools.partial(self._window, *window, filled))
             out[these] = _bilinear(tile, u[these] - column * TILE, v[these] - row * TILE)
+        x, a, *_ = self.grid.crs_from_pixel
+        seam = np.flatnonzero((u < 0) | (u > columns - 1))
+        turned = self.around(x - a / 2) if len(seam) else self
+        if turned is not self:  # positions between the last and the first column of a global DEM
+            shift = turned.grid.first_column - self.grid.first_column
+            out[seam] = turned._interpolated((u[seam] - shift) % columns, v[seam], filled)
         return out
 
     # -- windows -----------------------------------------------------------------------------------------------------

@@ -246,6 +246,9 @@ def test_the_seam_of_a_global_dem(tmp_path: Path) -> None:
     assert here.heights(where) == pytest.approx(1000 + 500 * np.cos(np.radians(where[:, 0])), abs=0.1)
     assert np.ptp(here.samples_at(where)[:, 0]) < 6
     assert here.heights([[10.5, 5.0]]) == pytest.approx(surface.heights([[10.5, 5.0]]))
+    # Single positions need no turned grid.
+    assert surface.heights(where) == pytest.approx(here.heights(where))
+    assert surface.coverage(where) == 1.0
     corner = here.samples_at(np.array([[179.5, 0.5]]))[0].astype(int)
     assert here.window(*corner, 2, 1)[0] == pytest.approx(heights[0, [-1, 0]])
 
