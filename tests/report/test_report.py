@@ -569,3 +569,16 @@ def test_import_is_light():
     code = "import sys, ortho_pipeline.report.document; print(int('matplotlib' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "0"
+
+
+def test_one_control_point_has_no_scatter_and_check_points_still_test_it(tmp_path):
+    measured = points()
+    alone = measured.select(measured.check | (np.arange(len(measured)) == int(np.flatnonzero(measured.control)[0])))
+    made = document(adjusted(alone))
+    assert (made.adjustment.redundancy, made.adjustment.raw_bias.n, made.adjustment.rmse.check.n) == (0, 1, 6)
+    report.write_report_html(made, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Redundancy 0: the control points do not test the model" in page
+    assert "The model as delivered was off by" in page
+    assert "scatter of measured minus predicted" not in page
+    assert "nothing is tested" not in page
