@@ -214,6 +214,9 @@ def summary(document: dict[str, Any]) -> str:
             name = f"over {low:g}°" if high is None else f"{low:g}-{high:g}°"
             lines.append(f"{name:<12}{cells(row)}")
     lines.append(f"{'all':<12}{cells(document['overall'])}")
+    unknown = document["overall"]["count"] - sum(row["count"] for row in document["by_slope"])
+    if unknown:
+        lines.append(f"next to the edge or a gap of the DEM, so without a slope: {unknown} (only in the row of all)")
     lines.append("DEM minus check height; slopes without points have no row")
     if document["without_height"]:
         lines.append(f"without a height in the DEM, or of their own: {document['without_height']}")

@@ -134,6 +134,13 @@ def test_the_summary_counts_what_has_no_height():
     assert lines[3].split()[2:] == ["-0.50", "1.58", "-0.50", "-", "-", "-2.00"]
     whole = summary(DemAccuracy(["a"], np.ones(1), np.ones(1)).to_json())
     assert "without a height" not in whole
+    assert "without a slope" not in whole
+
+
+def test_the_summary_counts_what_has_no_slope():
+    """Otherwise the rows of slopes have fewer points than that of all."""
+    text = summary(DemAccuracy(["a", "b", "c"], np.array([1.0, 2.0, -2.0]), np.array([3.0, np.nan, 40.0])).to_json())
+    assert "so without a slope: 1 (only in the row of all)" in text
 
 
 def test_slopes_are_those_of_the_terrain(made):
