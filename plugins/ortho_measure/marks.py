@@ -38,6 +38,7 @@ class RayMark(Record):
     image: tuple[float, float]
     sigma_image: float | None = None
     covariance: tuple[float, float, float] | None = None
+    group: int | None = None
     how: Literal["manual", "matched", "file"] = "manual"
     score: float | None = None
 
@@ -156,8 +157,6 @@ def checked(mark: Mark) -> Mark:
     for key in ("sigma_xy", "sigma_h", "sigma_common", "sigma_alike"):
         if not 0 <= getattr(mark, key) <= 1e6:
             raise InputError("a standard deviation must not be negative", field=key, remedy="give 0 or more")
-    if mark.group is not None and not 0 <= mark.group < _GROUPS:
-        raise InputError("this is not a group number", field="group", remedy=f"give 0 to {_GROUPS - 1}")
     return mark
 
 
@@ -175,6 +174,8 @@ def _check_measurement(mark: Mark | RayMark, where: str) -> None:
         # Use a root: a power of a float can overflow 1e308.
         if not (possible and abs(both) < math.sqrt(column * row * (1 - 1e-9))):
             raise InputError("this is not a covariance", field=f"{where}covariance")
+    if mark.group is not None and not 0 <= mark.group < _GROUPS:
+        raise InputError("this is not a group number", field=f"{where}group", remedy=f"give 0 to {_GROUPS - 1}")
 
 
 def mark_of(document: Any) -> Mark:

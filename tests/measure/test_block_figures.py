@@ -10,6 +10,8 @@ import pytest
 from ortho_measure.block.left_out import LeftOutResiduals
 from ortho_measure.block.planning import BlockGrid, next_of_block
 from ortho_measure.block.solution import figures, solve
+from ortho_measure.block.table import block_points, document, marks_of_block
+from ortho_measure.marks import Marks
 from ortho_studies.simulation.scanner import LineScanner
 
 from ortho_pipeline.block.adjustment import adjust
@@ -106,6 +108,25 @@ def test_a_control_point_left_out_is_as_if_it_had_checked(cameras: Any, sigma: A
     checks = table.roles == "check"
     np.testing.assert_allclose(without.ground[checks], fit.object_residuals[checks])
     assert np.isnan(without.ground[table.roles == "tie"]).all()
+
+
+def test_points_of_a_file_keep_what_they_have_in_common() -> None:
+    """Common errors of ground, and of neighbouring matches: `ortho adjust` reads them from the saved file again."""
+    rng = np.random.default_rng(2)
+    count, rays = 4, 12
+    points = BlockPoints(
+        tuple("abcd"), ground_of(count), np.full(count, "control"), np.full((count, 3), 0.2),
+        horizontal(parse_crs("EPSG:4979")), LABELS, np.repeat(np.arange(count), 3), np.tile(np.arange(3), count),
+        rng.uniform(0, 1000, (rays, 2)), np.full(rays, 0.3), sigma_common=np.array([2.0, 2.0, 0.0, 3.0]),
+        groups=np.array([-1, 0, 0, 1, 1, 1, 2, 2, 2, -1, -1, 5]),
+    )  # fmt: skip
+    marks = Marks({mark.id: mark for mark in marks_of_block(points, "now")})
+    again = block_points(marks, LABELS, "p")
+    np.testing.assert_array_equal(again.sigma_common, points.sigma_common)
+    np.testing.assert_array_equal(again.grouped, points.grouped)
+    written = document(marks, dict.fromkeys(LABELS, "x.tif"), "p")["features"]
+    assert [one["properties"].get("group", -1) for one in written] == points.grouped.tolist()
+    assert [one["properties"].get("sigma_common", 0.0) for one in written[::3]] == points.sigma_common.tolist()
 
 
 def test_a_ray_left_out_is_where_the_others_put_it_and_of_two_only_across_the_other(cameras: Any) -> None:

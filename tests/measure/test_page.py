@@ -21,6 +21,17 @@ def test_every_element_that_a_script_names_is_in_the_page() -> None:
     assert len(named) > 40
 
 
+def test_the_page_sends_back_every_field_of_a_point() -> None:
+    """A point of a file keeps its errors when its role, name or position changes."""
+    from ortho_measure.marks import Mark, RayMark
+
+    lists = re.findall(r"only\((?:mark|ray), \[(.*?)\]\)", SCRIPTS["app.js"])
+    several, ray, single = (set(re.findall(r"'(\w+)'", fields)) for fields in lists)
+    assert single == set(Mark.model_fields) - {"rays", "at"}
+    assert ray == set(RayMark.model_fields)
+    assert several == single - {"image", "sigma_image", "sigma_alike", "covariance", "group", "score"}
+
+
 def test_everything_that_the_page_asks_is_answered() -> None:
     from ortho_measure.serving.server import ASKED
 

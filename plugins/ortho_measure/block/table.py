@@ -32,6 +32,8 @@ def block_points(marks: Marks, labels: Sequence[str], source: str) -> BlockPoint
         sigma_image=sigma,
         source=source,
         shape_image=shape_of(covariance),
+        sigma_common=np.array([mark.sigma_common for mark in used], dtype=float),
+        groups=np.array([-1 if ray.group is None else ray.group for _, _, ray in rays], dtype=np.int64),
     )
 
 
@@ -92,6 +94,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
                 how="file",
                 sigma_image=None if more[ray] else float(points.sigma_image[ray]),
                 covariance=(column, row, both) if more[ray] else None,
+                group=int(points.grouped[ray]) if points.grouped[ray] >= 0 else None,
             )
         known = bool(np.isfinite(ground[k]).all())
         marks.append(
@@ -102,6 +105,7 @@ def marks_of_block(points: BlockPoints, at: str) -> list[Mark]:
                     role=str(points.roles[k]),  # type: ignore[arg-type]
                     sigma_xy=float(points.sigma_ground[k, :2].max()),
                     sigma_h=float(points.sigma_ground[k, 2]),
+                    sigma_common=float(points.sigma_common[k]),
                     how="file",
                     ground_from="file" if known else None,
                     rays=rays,

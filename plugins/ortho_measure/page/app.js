@@ -303,9 +303,9 @@ const decimal = (id) => {
 /** The members of a mark that the server knows. */
 const only = (object, keys) => Object.fromEntries(keys.filter((key) => object[key] !== undefined).map((key) => [key, object[key]]));
 const plain = (mark) => (facts.labels ? {
-  ...only(mark, ['id', 'ground', 'role', 'off', 'sigma_xy', 'sigma_h', 'how', 'ground_from', 'note']),
-  rays: Object.fromEntries(Object.entries(mark.rays).map(([label, ray]) => [label, only(ray, ['image', 'sigma_image', 'covariance', 'how', 'score'])])),
-} : only(mark, ['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'sigma_common', 'group', 'how', 'ground_from', 'score', 'note']));
+  ...only(mark, ['id', 'ground', 'role', 'off', 'sigma_xy', 'sigma_h', 'sigma_common', 'how', 'ground_from', 'note']),
+  rays: Object.fromEntries(Object.entries(mark.rays).map(([label, ray]) => [label, only(ray, ['image', 'sigma_image', 'covariance', 'group', 'how', 'score'])])),
+} : only(mark, ['id', 'image', 'ground', 'role', 'off', 'sigma_image', 'covariance', 'sigma_xy', 'sigma_h', 'sigma_common', 'sigma_alike', 'group', 'how', 'ground_from', 'score', 'note']));
 
 const act = safely(async (action) => { const next = await ask('act', { action }); show(next); return next; });
 

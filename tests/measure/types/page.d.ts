@@ -11,6 +11,7 @@ interface Ray {
   image: Pair;
   sigma_image?: number | null;
   covariance?: number[] | null;
+  group?: number | null;
   how: 'manual' | 'matched' | 'file';
   score?: number | null;
 }
