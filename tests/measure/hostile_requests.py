@@ -203,6 +203,8 @@ def check(opening: Callable[[], Project], count: int, seed: int, between: int) -
                 else:
                     answer = client.post(f"/{entry.folder}/{path}", content=body)
                 answered[answer.status_code] += 1
+                if path == "api/leave":  # a page that is loaded again
+                    client.post(f"/{entry.folder}/api/begin", json={"window": WINDOW})
                 assert answer.status_code < 500, (path, None if body is None else body[:600])
                 stored = len(session.journal.actions) - before
                 assert stored == (path == "api/act" and answer.status_code == 200), (path, body, answer.text[:600])

@@ -172,6 +172,8 @@ def test_the_second_window_reads_until_it_takes_over(client: TestClient) -> None
     assert ask("act", "window-two", action=action).status_code == 200
     assert ask("act", WINDOW, action=action).status_code == 409
     ask("leave", "window-two")
+    # This window still shows the points from before: it must load them again.
+    assert ask("act", WINDOW, action={"do": "undo"}).status_code == 409
     assert ask("begin", WINDOW).json()["writes"]
     assert ask("act", WINDOW, action={"do": "undo"}).status_code == 200
 

@@ -21,6 +21,8 @@ async function ask(what, given = {}) {
   const response = await fetch(`api/${what}`, { method: 'POST', headers: { 'content-type': 'application/json' }, body: JSON.stringify({ window: windowName, ...given }) });
   const answer = await response.json().catch(() => ({ error: { message: `server error ${response.status}` } }));
   if (response.ok) return answer;
+  // Another window has taken over: follow it, because this one may show old points.
+  if (response.status === 409) { facts.writes = false; banner(); fill(); }
   const { message, remedy } = answer.error;
   throw new Error(`${message}${remedy ? ` (${remedy})` : ''}`);
 }

@@ -49,7 +49,7 @@ _REMEDY = "reload the page"
 
 
 class Windows:
-    """Which browser window can write: the first one, until another takes over."""
+    """Which browser window can write: the first one, until it leaves or another takes over."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -58,7 +58,14 @@ class Windows:
     def claim(self, window: str, *, take: bool = False) -> bool:
         """Return whether a window can write; with `take`, it takes over."""
         with self._lock:
-            if self._writer is None or take:
+            if not self._writer or take:
+                self._writer = window
+            return self._writer == window
+
+    def writes(self, window: str) -> bool:
+        """Return whether a window can write without `claim`: after another one has left, its points may be old."""
+        with self._lock:
+            if self._writer is None:
                 self._writer = window
             return self._writer == window
 
@@ -66,7 +73,7 @@ class Windows:
         """Release the right to write, if this window has it."""
         with self._lock:
             if self._writer == window:
-                self._writer = None
+                self._writer = ""
 
 
 class _Answers:
@@ -198,7 +205,7 @@ class _Answers:
         return self.making.told()
 
     def _require_writer(self, given: dict[str, Any]) -> None:
-        if not self._windows.claim(_window(given)):
+        if not self._windows.writes(_window(given)):
             raise InputError(
                 "these points are open in another window; this one is read-only", field="window", remedy="take over"
             )
