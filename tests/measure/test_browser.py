@@ -165,6 +165,33 @@ def test_a_person_clicks_two_points(serve, reference: Path, truth, features: np.
 
 
 @pytest.mark.slow
+def test_errors_that_a_person_enters_are_saved(serve, reference: Path, truth, features: np.ndarray) -> None:
+    """Those of surveyed coordinates are entered before the coordinates are used, and the pixel may move after."""
+    served = serve(reference)
+    page = served.page
+    page.click("summary:has-text('Surveyed coordinates')")
+    for name, value in zip(("x", "y", "h"), truth.ground_at(features[[2]])[0], strict=True):
+        page.fill(f"#{name}", f"{value:.9f}")
+    page.fill("#sigma-xy", "0.03")
+    page.fill("#sigma-h", "0,05")
+    page.click("#typed")
+    served.says("#said", "Coordinates set")
+    page.focus("#scene")
+    page.keyboard.press("m")
+    served.says("#said", "Matched|No match")
+    page.wait_for_load_state("networkidle")
+    page.locator("#sigma").press_sequentially("0.25")
+    page.focus("#scene")
+    page.keyboard.press("ArrowRight")
+    served.says("#said", "Manual")
+    page.keyboard.press("Enter")
+    served.says("#said", "P1 accepted")
+    (point,) = served.end()
+    assert point["properties"]["sigma_image"] == 0.25
+    assert [point["properties"][name] for name in ("sigma_xy", "sigma_h")] == [0.03, 0.05]
+
+
+@pytest.mark.slow
 def test_a_person_clicks_six_points_in_either_view(serve, reference: Path, truth, features: np.ndarray) -> None:
     served = serve(reference)
     for number, feature in enumerate(features):

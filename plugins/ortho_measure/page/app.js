@@ -471,7 +471,7 @@ const typed = safely(async () => {
   begin();
   const mine = (turn += 1);
   const { ground } = await ask('typed', { values: [decimal('x'), decimal('y'), decimal('h')], crs: $('crs').value, vertical: $('vertical').value });
-  Object.assign(pending, { ground, ground_from: 'typed', by_hand: true });
+  Object.assign(pending, { ground, ground_from: 'typed', by_hand: true, sigma_xy: decimal('sigma-xy') ?? 0, sigma_h: decimal('sigma-h') ?? 0 });
   const there = await ask('predict', { ground, version: state.version });
   if (mine !== turn) return;
   pending.places = there.places;
@@ -610,6 +610,9 @@ $('ortho-mix').addEventListener('input', () => { $('ortho-reference').style.opac
 $('swipe').addEventListener('input', () => compare({ swipe: Number($('swipe').value), flicker: false, difference: false }));
 $('correction').addEventListener('change', () => act({ do: 'correct', correction: $('correction').value || null }));
 for (const [id, key] of [['name', 'id'], ['role', 'role'], ['note', 'note']]) $(id).addEventListener('change', () => { if (pending) { pending[key] = $(id).value; fill(); } });
+for (const [id, key, none] of [['sigma', 'sigma_image', null], ['sigma-xy', 'sigma_xy', 0], ['sigma-h', 'sigma_h', 0]]) {
+  $(id).addEventListener('change', safely(async () => { if (pending) pending[key] = decimal(id) ?? none; }));
+}
 document.addEventListener('keydown', pressed, true);
 addEventListener('pagehide', () => navigator.sendBeacon('api/leave', JSON.stringify({ window: windowName })));
 safely(start)();
