@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_measure.marks import GROUND_CRS
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import DatumError, InputError
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
+from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.imaging.matching import Reference, SceneView, Target
 from ortho_pipeline.models import ImageCorrection
 from ortho_pipeline.models.base import Array, SensorModel
@@ -163,7 +164,7 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
     Raises
     ------
     InputError, CrsError, DatumError
-        If a value is missing, or its CRS or datum is unknown.
+        If a value is missing, its CRS or datum is unknown, or both state different heights.
     """
     for field, text in (("crs", crs), ("vertical", vertical or "ellipsoid")):
         # Other definitions could refer to files, which the page must not open.
@@ -175,7 +176,15 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
             )
     if len(values) != 3 or values[0] is None or values[1] is None:
         raise InputError("enter x and y; the height is optional", field="ground")
-    plane = horizontal(parse_crs(crs))
+    full, datum = parse_crs(crs), Vertical.parse(vertical or "ellipsoid")
+    declared = declared_vertical(full) if full.is_compound and values[2] is not None else None
+    if declared is not None and declared.vertical is not None and declared.vertical != datum:
+        raise DatumError(
+            f"the CRS has heights in {declared.vertical.label}, but the height datum is {datum.label}",
+            field="vertical",
+            remedy=f"give the height datum {declared.vertical.name}",
+        )
+    plane = horizontal(full)
     plan = np.array([[values[0], values[1]]], dtype=float)
     lonlat = ground_transform(plane, "EPSG:4326")(np.column_stack([plan, [0.0]]))[0, :2]
     if values[2] is None:
@@ -183,5 +192,5 @@ def ground_typed(values: Sequence[float | None], crs: str, vertical: str | None,
         if not np.isfinite(height):
             raise InputError("the DEM has no height here", field="ground", remedy="enter the height")
     else:
-        height = float(Vertical.parse(vertical or "ellipsoid").ellipsoidal(lonlat[:1], lonlat[1:], [values[2]])[0])
+        height = float(datum.ellipsoidal(lonlat[:1], lonlat[1:], [values[2]])[0])
     return np.array([lonlat[0], lonlat[1], height])

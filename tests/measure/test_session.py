@@ -175,6 +175,12 @@ def test_typed_ground_is_understood(opens: Opens, monkeypatch: pytest.MonkeyPatc
         patched.setattr(Vertical, "undulation", lambda self, lon, lat: np.full(np.shape(lon), 30.0))
         in_feet = session.typed([lon, lat, 1000.0], "EPSG:4326", "EPSG:8228")
     assert in_feet == pytest.approx([lon, lat, 304.8 + 30.0])
+    # The heights of a compound CRS are in its datum: not above the ellipsoid, which the page sends by default.
+    for stated in ("ellipsoid", None):
+        with pytest.raises(InputError, match="the CRS has heights in EGM96") as refused:
+            session.typed([lon, lat, height], "EPSG:4326+5773", stated)
+        assert refused.value.remedy == "give the height datum EPSG:5773"
+    assert session.typed([lon, lat, height], "EPSG:4326+5773", "EPSG:5773") == pytest.approx(above)
     from_dem = session.typed([531000.0, 4122700.0, None], "EPSG:32636", None)
     assert from_dem[:2] == pytest.approx([33.35, 37.25], abs=0.01)
     assert 690 < from_dem[2] < 1100
