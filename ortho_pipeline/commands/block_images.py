@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import ImageCorrection, families, family_of, start_model
 from ortho_pipeline.options import BlockOptions, SceneOptions
 from ortho_pipeline.points import Points
+from ortho_pipeline.points.formats import names_image
 
 
 def labels_of(images: Sequence[str | os.PathLike[str]]) -> list[str]:
@@ -85,7 +85,7 @@ def image_named(name: str, images: Sequence[str | os.PathLike[str]], field: str)
     InputError
         If it means none of them, or several.
     """
-    meant = [number for number, image in enumerate(images) if _means(name, image)]
+    meant = [number for number, image in enumerate(images) if names_image(name, image)]
     if len(meant) != 1:
         which = " or ".join(os.fspath(images[number]) for number in meant)
         raise InputError(
@@ -114,7 +114,7 @@ def points_of_images(
     owner: dict[int, int] = {}
     strangers = []
     for number, name in enumerate(points.images):
-        meant = [k for k, image in enumerate(images) if _means(name, image)]
+        meant = [k for k, image in enumerate(images) if names_image(name, image)]
         if len(meant) > 1:
             raise InputError(
                 f"the name {name!r} is ambiguous: {' or '.join(os.fspath(images[k]) for k in meant)}",
@@ -141,15 +141,6 @@ def points_of_images(
         image=np.array([owner[number] for number in of_images.image.tolist()], dtype=np.int64),
     )
     return kept.select(np.bincount(kept.point, minlength=len(kept)) > 0), strangers
-
-
-def _means(name: str, image: str | os.PathLike[str]) -> bool:
-    """Return whether a name in a points file means an image: its stem and the named folders agree."""
-    named = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
-    path = [part.lower() for part in Path(os.path.abspath(image)).parts]
-    if not named or len(named) > len(path) or named[:-1] != path[len(path) - len(named) : -1]:
-        return False
-    return named[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(named[-1]).stem == PurePath(path[-1]).stem
 
 
 def start_of(

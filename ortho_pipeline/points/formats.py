@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from ortho_pipeline.errors import InputError, completed, reads
@@ -116,7 +116,7 @@ def read_table(
     Parameters
     ----------
     image_name : str, optional
-        Keep only the points of this image.
+        Keep only the points of this image: its file name, or its path if the file has images of the same name.
     pieces : mapping of str to (float, float, float), optional
         Further images to keep: column and row of their first corner in this image, and the width of their pixels.
 
@@ -182,6 +182,15 @@ def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
     )
 
 
+def names_image(name: str, image: str | os.PathLike[str]) -> bool:
+    """Return whether a name in a points file means an image: its stem and the named folders agree."""
+    named = [part.lower() for part in re.split(r"[\\/]+", name.strip()) if part not in ("", ".", "..")]
+    path = [part.lower() for part in Path(os.path.abspath(image)).parts]
+    if not named or len(named) > len(path) or named[:-1] != path[len(path) - len(named) : -1]:
+        return False
+    return named[-1] in (path[-1], PurePath(path[-1]).stem) or PurePath(named[-1]).stem == PurePath(path[-1]).stem
+
+
 def _of_image(
     path: str | os.PathLike[str], table: Table, image_name: str | None, pieces: Mapping[str, Placement]
 ) -> Table:
@@ -200,18 +209,18 @@ def _of_image(
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         stem, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}
         # A point that was measured in several images counts once: in this image, else in the first piece.
-        kept += [
-            replace(row, piece=piece)
-            for row in table.rows
-            if row.image_name and Path(row.image_name).stem.lower() == stem and row.id not in ids
-        ]
+        rows = [row for row in table.rows if Path(str(row.image_name)).stem.lower() == stem]
+        if len({Path(str(row.image_name)).parent for row in rows}) > 1:
+            # Images of the same name in different folders.
+            rows = [row for row in rows if names_image(str(row.image_name), name)]
+        kept += [replace(row, piece=piece) for row in rows if row.id not in ids]
     if not kept and table.format == "GeoJSON" and len(named) == 1:
         # The 'filename' of a GeoJSON is only a note; a renamed image still has these points.
         return table
     if not kept:
         some = ", ".join(sorted(map(str, named))[:5])
         raise InputError(
-            f"no point was measured in {image_name!r}, only in {some}",
+            f"no point was measured in {Path(image_name).name!r}, only in {some}",
             file=path,
             field="image",
             remedy="measure points in this image: `ortho measure IMAGE -o points.geojson`, for a finished ortho with "

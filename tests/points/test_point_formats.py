@@ -288,6 +288,23 @@ def test_several_images_are_not_taken_for_one(tmp_path: Path) -> None:
         read(tmp_path, text)
 
 
+def test_images_of_the_same_name_in_different_folders_are_kept_apart(tmp_path: Path) -> None:
+    """`ortho ties` and `measure` write the folder of such images, and cameras number their photos in each folder."""
+    path = tmp_path / "points.csv"
+    path.write_text(
+        "id,image,col,row,x,y,h\nA,fore/BAND.tif,1,2,500000,4000000,9\n"
+        "A,aft/BAND.tif,5,6,500000,4000000,9\nB,aft/BAND.tif,7,8,500100,4000000,9\n"
+    )
+    given = {"crs": "EPSG:32636", "vertical": "ellipsoid"}
+    for name, image in (("fore", [[1, 2]]), ("aft", [[5, 6], [7, 8]])):
+        assert read_points(path, image_name=str(tmp_path / name / "BAND.tif"), **given).image.tolist() == image
+    with pytest.raises(InputError, match=r"no point was measured in 'BAND\.tif', only in aft/BAND\.tif, fore/BAND"):
+        read_points(path, image_name="BAND.tif", **given)
+    # Images of a folder that was renamed keep their points.
+    path.write_text("id,image,col,row,x,y,h\nA,old/BAND.tif,1,2,500000,4000000,9\n")
+    assert read_points(path, image_name=str(tmp_path / "new/BAND.tif"), **given).ids == ("A",)
+
+
 def test_arcgis_link_table(tmp_path: Path) -> None:
     text = "link table\n10.5\t-20.25\t500100.5\t6270000.25\n30.5 -40.5 500200 6270100\n"
     points = read(tmp_path, text, "links.txt")

@@ -188,8 +188,8 @@ def _given_points(scene: Scene, request: Request, surface: Surface | None) -> Po
     pieces = {
         Path(piece.path).name: OWN_IMAGE if piece.sees_apart else (*piece.offset, piece.scale) for piece in scene.pieces
     }
-    name, path = Path(scene.path).name, located(path, allow_network=request.scene.allow_network)
-    table = read_table(path, name, pieces)
+    path = located(path, allow_network=request.scene.allow_network)
+    table = read_table(path, os.fspath(scene.path), pieces)
     points = points_of(table, crs, vertical, origin)
     # The same rows in the same order: the table names the image in which each was measured.
     named = np.array([Path(row.image_name).stem.lower() if row.image_name else "" for row in table.rows])
