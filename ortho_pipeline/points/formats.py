@@ -205,6 +205,14 @@ def _of_image(
         )
     if image_name is None or not named:
         return table
+    nameless = next((row for row in table.rows if not row.image_name), None)
+    if nameless is not None:
+        raise InputError(
+            "this point does not name its image, but others do",
+            file=path,
+            field=nameless.where,
+            remedy="name the image of each point, or of none",
+        )
     kept: list[PointRow] = []
     for name, piece in {image_name: OWN_IMAGE, **pieces}.items():
         stem, ids = Path(name).stem.lower(), {row.id for row in kept} - {None}

@@ -305,6 +305,14 @@ def test_images_of_the_same_name_in_different_folders_are_kept_apart(tmp_path: P
     assert read_points(path, image_name=str(tmp_path / "new/BAND.tif"), **given).ids == ("A",)
 
 
+def test_a_point_without_an_image_among_others_is_not_lost(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    path.write_text("id,image,col,row,x,y,h\nA,s.tif,1,2,500000,4000000,9\nB,,7,8,500100,4000000,9\n")
+    with pytest.raises(InputError, match="this point does not name its image, but others do") as refused:
+        read_points(path, crs="EPSG:32636", vertical="ellipsoid", image_name="s.tif")
+    assert refused.value.field == "line 3"
+
+
 def test_arcgis_link_table(tmp_path: Path) -> None:
     text = "link table\n10.5\t-20.25\t500100.5\t6270000.25\n30.5 -40.5 500200 6270100\n"
     points = read(tmp_path, text, "links.txt")
