@@ -67,7 +67,8 @@ _FORMATS = (
         "ENVI .pts",
         read_envi,
         "write numbers in the order of the comment 'Map (x,y,elev), Image (x,y)'",
-        lambda start, first: start.startswith(";"),
+        # A table that was saved with its index and semicolons also begins with one.
+        lambda start, first: start.startswith(";") and not is_header(first),
         (".pts",),
     ),
     _Format(
@@ -161,8 +162,9 @@ def _read(kind: _Format, path: str | os.PathLike[str], text: str, *expected: Col
 
 def _format_of(path: str | os.PathLike[str], text: str) -> _Format:
     suffix, start = Path(path).suffix.lower(), text.lstrip()[:4096]
-    lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
-    first = lines[0].strip() if lines else ""
+    # Comments may be long, such as the WKT of a CRS.
+    lines = (line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#"))
+    first = next(lines, "")[:4096]
     for kind in _FORMATS:
         if suffix in kind.suffixes or kind.known(start, first):
             return kind

@@ -68,6 +68,17 @@ def test_points_without_ids_are_numbered(tmp_path: Path) -> None:
     assert points.image.tolist() == [[1.5, 2.0], [3.0, 4.0]]
 
 
+def test_a_table_that_was_saved_with_its_index_and_semicolons(tmp_path: Path) -> None:
+    points = read(tmp_path, ";id;col;row;x;y;h\n0;A;1,5;2;500100,5;6270000;9\n1;B;3;4;500200;6270000;9\n")
+    assert points.ids == ("A", "B")
+    assert read(tmp_path, ";col;row;x;y;h\n0;1,5;2;500100,5;6270000;9\n").ids == ("0",)
+
+
+def test_comments_may_be_long(tmp_path: Path) -> None:
+    comments = "".join(f"# survey of day {day}, by the book\n" for day in range(200))
+    assert read(tmp_path, f"{comments}id,col,row,x,y,h\nA,1,2,500100,6270000,9\n", "points.txt").ids == ("A",)
+
+
 def test_status_of_a_point(tmp_path: Path) -> None:
     text = "ID P L X Y Z S\n1 1 2 500100 6270000 5 G\n2 3 4 500200 6270000 5 C\n3 5 6 500300 6270000 5 I\n"
     points = read(tmp_path, text, "pci.txt")
