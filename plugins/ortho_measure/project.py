@@ -21,7 +21,7 @@ from ortho_measure.planning import Next
 from ortho_pipeline.commands.results import Result
 from ortho_pipeline.errors import InputError, completed
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.files import write_json
+from ortho_pipeline.files import json_text, parse_json, write_json
 from ortho_pipeline.files.json.values import json_position, json_value
 from ortho_pipeline.imaging.matching import SceneView
 from ortho_pipeline.models.base import Array, SensorModel
@@ -30,6 +30,8 @@ from ortho_pipeline.surface.base import Surface
 
 #: Suffix of the journal of a file of points.
 JOURNAL = ".journal"
+#: Properties of a point that other programs read.
+_READ = ("id", "ji", "role", "filename", "sigma_image", "sigma_xy", "sigma_h")
 #: Render again if the model moves anything by more than this (px).
 _MOVED = 0.2
 
@@ -269,10 +271,31 @@ class Project(_Shown):
                 count = self._take(self.journal.actions)
             if self.stopped:
                 self.journal.set_aside(count)
+            elif not self.journal.read_only:
+                self._require_own_file()
         except BaseException:
             self.journal.close()
             raise
         self._solve()
+
+    def _require_own_file(self) -> None:
+        """Raise an error if another program changed the file of points: it would be overwritten."""
+        try:
+            changed, written = (os.stat(path).st_mtime_ns for path in (self.output, self.journal.path))
+        except FileNotFoundError:
+            return
+        # After a kill, the file can be older than the journal, but not newer.
+        if changed > written and _points_of(self.output.read_bytes()) != _points_of(json_text(self._document())):
+            raise InputError(
+                "another program changed these points, and their journal has others",
+                file=self.output,
+                field="output",
+                remedy=Text(
+                    "to continue with this file, give it as ",
+                    Setting("points.gcps"),
+                    " with another output; to continue with the journal, move this file away",
+                ),
+            )
 
     def _take(self, actions: Sequence[Mapping[str, Any]]) -> int:
         """Apply actions of the journal until one is impossible; return the number of applied ones."""
@@ -376,6 +399,17 @@ class Project(_Shown):
 def _plain(action: Mapping[str, Any]) -> dict[str, Any]:
     """Return an action without the fields of the journal."""
     return {key: value for key, value in action.items() if key not in ("at", "image", "source")}
+
+
+def _points_of(text: bytes | str) -> object:
+    """Return what other programs read of a file of points; None if it is no such file."""
+    try:
+        return [
+            (feature["geometry"] and feature["geometry"]["coordinates"], *map(feature["properties"].get, _READ))
+            for feature in parse_json(text, "points", JOURNAL_REMEDY)["features"]
+        ]
+    except (InputError, LookupError, TypeError, AttributeError):
+        return None
 
 
 def points_file(output: str | os.PathLike[str]) -> Path:

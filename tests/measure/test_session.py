@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -162,6 +163,31 @@ def test_reopening_goes_on_where_it_ended(opens: Opens, tmp_path: Path) -> None:
     (tmp_path / "old.geojson").write_text("{}")
     with pytest.raises(InputError, match="was not made by ortho measure"):
         opens("old.geojson")
+
+
+def test_points_that_another_program_changed_are_not_overwritten(opens: Opens, tmp_path: Path) -> None:
+    opens(gcps=SAMPLE / "gcps.geojson").close()
+    path, journal = tmp_path / "p.geojson", tmp_path / "p.geojson.journal"
+
+    def written(document: dict[str, object], age: int) -> str:
+        path.write_text(json.dumps(document))
+        moment = journal.stat().st_mtime_ns - age * 10**9
+        os.utime(path, ns=(moment, moment))
+        return path.read_text()
+
+    document = json.loads(path.read_text())
+    written({**document, "name": "as QGIS saves it"}, -9)
+    opens().close()
+    fewer = {**document, "features": document["features"][1:]}
+    changed = written(fewer, -9)
+    with pytest.raises(InputError, match="another program changed these points"):
+        opens()
+    assert path.read_text() == changed
+    assert len(opens("other.geojson", gcps=path).marks.by_id) == len(fewer["features"])
+    # A kill leaves an older file: the journal has what it lacks.
+    written(fewer, 9)
+    opens().close()
+    assert json.loads(path.read_text())["features"] == document["features"]
 
 
 def test_typed_ground_is_understood(opens: Opens, monkeypatch: pytest.MonkeyPatch) -> None:
