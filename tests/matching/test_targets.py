@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from osgeo import gdal, osr
 
-from ortho_pipeline.imaging.matching.targets import SceneView, near
+from ortho_pipeline.imaging.matching.targets import Reference, SceneView, near
 from ortho_pipeline.models import RPC
 
 SIZE = 1000
@@ -62,3 +64,24 @@ def test_targets_that_a_scene_cannot_see_are_left_out(view, place, reach, kept):
 def test_where_none_is_near_all_are_kept_to_be_refused_by_name(view):
     far = [Square(1e6, 0), Square(-1e6, 0)]
     assert near(view, far, 10) == far
+
+
+@pytest.mark.parametrize(("code", "circle"), [(4326, 360.0), (4807, 400.0)])
+def test_a_reference_may_be_on_either_side_of_the_antimeridian(tmp_path: Path, code: int, circle: float) -> None:
+    """A model that counts on to 180.01 degrees, and a map from -180 degrees or beyond 180; also in grads from Paris."""
+    system = osr.SpatialReference()
+    system.ImportFromEPSG(code)
+    places = []
+    for turn in (-1, 0, 1):
+        path = tmp_path / f"{turn}.tif"
+        dataset = gdal.GetDriverByName("GTiff").Create(str(path), 40, 30, 1)
+        dataset.SetProjection(system.ExportToWkt())
+        dataset.SetGeoTransform((circle / 2 - 0.02 + turn * circle, 0.001, 0.0, 10.0, 0.0, -0.001))
+        dataset = None
+        reference = Reference.open(path)
+        lon = np.array([179.99, 180.01, -179.99, -180.01]) / 360 * circle
+        ground = np.column_stack([lon, np.full(4, 9.98), np.zeros(4)])
+        places.append(reference.project(ground, reference.crs))
+    np.testing.assert_allclose(places, np.broadcast_to(places[1], (3, 4, 2)), atol=1e-6)
+    step = 0.01 / 360 * circle / 0.001
+    np.testing.assert_allclose(places[1][:, 0], 20 + step * np.array([-1, 1, 1, -1]), atol=1e-6)

@@ -202,6 +202,10 @@ class Reference:
     def project(self, ground: Array, crs: str) -> Array:
         """Convert ground to the map, and the map to pixels."""
         plan = ground_transform(crs, self.crs)(ground)[:, :2]
+        if self.crs.is_geographic:
+            # Longitudes are taken modulo a circle, so that the map may be on either side of the antimeridian.
+            circle = math.tau / self.crs.axis_info[0].unit_conversion_factor
+            plan[:, 0] -= circle * np.round((plan[:, 0] - self.corners[:, 0].mean()) / circle)
         return plan @ self.pixel_from_map[:, :2].T + self.pixel_from_map[:, 2]
 
 
