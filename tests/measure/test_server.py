@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 import time
 import warnings
 from collections.abc import Iterator
@@ -17,12 +18,13 @@ from ortho_measure.project import Project
 from ortho_measure.session import open_session
 
 from ortho_pipeline import commands
-from ortho_pipeline.options import MatchOptions, PointOptions, SurfaceOptions
+from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import MatchOptions, PointOptions, SceneOptions, SurfaceOptions
 
 pytest.importorskip("starlette", reason="the extra 'measure' is not installed")
 from ortho_measure.serving.entry import PageEntry
 from ortho_measure.serving.guard import MAX_BODY, REPORT_POLICY
-from ortho_measure.serving.server import PAGE, application
+from ortho_measure.serving.server import PAGE, application, serve
 from starlette.testclient import TestClient
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
@@ -59,6 +61,15 @@ def test_the_page_and_its_parts_are_given_with_a_strict_policy(client: TestClien
         assert answer.headers["referrer-policy"] == "no-referrer"
         assert "access-control-allow-origin" not in answer.headers
     assert "http" not in client.get(f"/{FOLDER}/").text.replace("http-equiv", "")
+
+
+def test_a_port_in_use_is_named() -> None:
+    never: Any = None
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port} of this machine cannot be used") as refused:
+            serve(never, SceneOptions(), never, port)
+    assert refused.value.field == "port"
 
 
 @pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/api/state", f"/{FOLDER}", f"/{FOLDER}x/", f"//{FOLDER}/"])

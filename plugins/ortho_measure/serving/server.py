@@ -25,6 +25,7 @@ from ortho_measure.serving.making import PICTURES, Making
 from ortho_measure.serving.tiles import MOST, SIDE, TileServer
 from ortho_measure.session import Session
 from ortho_pipeline.errors import InputError, OrthoError
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files import parse_json
 from ortho_pipeline.options import CORRECTIONS, OutputOptions, SceneOptions
 from ortho_pipeline.raster.caching.block_cache import limit_cache
@@ -333,10 +334,22 @@ def serve(session: Project, opened: SceneOptions, ready: Callable[[str], None], 
         Called with the address when the server is ready. The address works once.
     port : int
         0 means any free port.
+
+    Raises
+    ------
+    InputError
+        If the port cannot be used.
     """
     import uvicorn
 
-    entry, listener = PageEntry(), Listener(port)
+    try:
+        entry, listener = PageEntry(), Listener(port)
+    except OSError as error:
+        raise InputError(
+            f"port {port} of this machine cannot be used ({error.strerror or error})",
+            field="port",
+            remedy=Text("give another ", Setting("port"), ", or leave it out to use any free port"),
+        ) from error
     number = listener.getsockname()[1]
     hosts = {f"{LOOPBACK}:{number}", f"localhost:{number}"}
     limit_cache(OutputOptions.memory, os.cpu_count() or 1)
