@@ -472,6 +472,8 @@ def _geojson_text(points: Points, suffix: str) -> str:
 
 
 def _qgis_text(points: Points, suffix: str) -> str:
+    if points.crs.is_geocentric:
+        points = points.to_crs("EPSG:4979")  # without heights, X and Y alone are no position
     lines = [f"#CRS: {crs_definition(points.crs)}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     for (column, row), (x, y, _) in zip(points.image.tolist(), points.ground.tolist(), strict=True):
         lines.append(f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0")

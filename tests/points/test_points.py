@@ -449,6 +449,12 @@ def test_round_trips(tmp_path: Path, crs: str, suffix: str) -> None:
     assert again.sigma_ground == pytest.approx(points.sigma_ground)
 
 
+def test_a_qgis_file_of_geocentric_points_has_longitudes_and_latitudes(tmp_path: Path) -> None:
+    points = Points.of([[1.0, 2.0]], [[24.4, -33.65, 100.0]], "EPSG:4979")
+    write_points(points.to_crs("EPSG:4978"), tmp_path / "out.points")
+    assert read_points(tmp_path / "out.points").ground[0, :2] == pytest.approx([24.4, -33.65], abs=1e-9)
+
+
 def test_odd_ids_and_missing_heights_survive(tmp_path: Path) -> None:
     points = some_points().select([0, 1, 2])
     ground = points.ground.copy()
