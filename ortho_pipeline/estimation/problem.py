@@ -252,9 +252,14 @@ class Problem:
     def _adjusted(self, ground: Array, image: Array, errors: ImageErrors, scale: float) -> SensorModel:
         start = self.model
         origin = start.params
+        missed = np.full(2 * len(ground) + len(self._pseudo(start, scale)[0]), np.nan)
 
         def misfit(params: Array) -> Array:
-            model = start.with_params(params)
+            try:
+                model = start.with_params(params)
+            except InputError:
+                # No such model exists, such as a camera with a negative focal length: the step is too long.
+                return missed
             return np.concatenate(
                 [errors.whitened(image - model.ground_to_image(ground)).ravel(), self._pseudo(model, scale)[0]]
             )

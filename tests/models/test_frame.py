@@ -294,6 +294,15 @@ def test_self_calibration_with_priors(heading_deg):
         fit(start._replace(free=(*free, "pitch_x", "pitch_y")), points, robust=False)
 
 
+def test_a_step_to_a_negative_focal_length_is_shortened():
+    truth = aerial(free=(*EXTERIOR, "focal_length"))
+    points = measured(truth, 20, 0.5, heights=(900.0, 950.0))
+    # Over almost flat ground, a step would reverse the lens.
+    high = truth.exterior + np.array([0.0, 0.0, 9000.0, 0.0, 0.0, 0.0])
+    start = truth._replace(exterior=high, interior=replace(AERIAL, focal_length=0.03))
+    assert fit(start, points, robust=False).sigma0 == pytest.approx(1, abs=0.3)
+
+
 def test_corners_are_those_of_the_image_and_not_of_the_box():
     camera = satellite(8, 115)
     corners = camera.corners
