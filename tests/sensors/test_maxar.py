@@ -17,6 +17,7 @@ from used import pixels, ran, used
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc import rpc_metadata
 from ortho_pipeline.exchange.rpc_fit import fit_rpc
 from ortho_pipeline.geodesy.ellipsoid import enu_from_ecef, geocentric
 from ortho_pipeline.host import open_scene
@@ -395,6 +396,23 @@ def test_a_camera_of_unknown_conventions_is_left_for_the_rpc(
     (notice,) = scene.notices
     assert notice.code == "rigorous-left-out"
     assert said in notice
+
+
+def test_a_tag_that_contradicts_the_xml_is_an_error(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
+    """gdal_translate -srcwin writes a tag for the crop; the XML of the whole image is still next to it."""
+    image, rpc = pixels(folder / f"{STEM}.TIF", (30, 20)), whole[1]
+    dataset = gdal.Open(str(image), gdal.GA_Update)
+    dataset.SetMetadata(rpc_metadata(rpc.shifted(10.0, 20.0)), "RPC")
+    dataset = None
+    xml = folder / f"{STEM}.XML"
+    xml.write_text(isd_text(size=SIZE, rpc=rpc))
+    with pytest.raises(InputError, match=r"differ by 20\.0 px") as caught:
+        open_scene(image)
+    assert caught.value.field == "scene.rpc"
+    middle = np.array([[rpc.lon_off, rpc.lat_off, rpc.h_off]])
+    for choice, shift in (("tag", (10.0, 20.0)), (str(xml), (0.0, 0.0))):
+        seen = open_scene(image, options={"rpc": choice}).models["rpc"].ground_to_image(middle)
+        assert seen == pytest.approx(rpc.ground_to_image(middle) - shift, abs=1e-3)
 
 
 def test_a_crop_is_said_and_a_stranger_left_alone(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
