@@ -11,7 +11,20 @@ import numpy as np
 from osgeo import gdal
 
 from ortho_orbview3.product import Product, choose_rpc, label_of, read_product, rpc_text_of
-from ortho_pipeline.plugin import RPC, InputError, Notice, Scene, Sensor, Setting, Text, hookimpl, place, read_bounded
+from ortho_pipeline.plugin import (
+    RPC,
+    InputError,
+    Notice,
+    Scene,
+    Sensor,
+    Setting,
+    Text,
+    has_rpc,
+    hookimpl,
+    place,
+    read_bounded,
+    rpc_of_dataset,
+)
 
 #: Names of the USGS: 3v, year, month, day, and p for panchromatic or m for multispectral.
 _NAME = re.compile(r"3v(\d{6})([pm])\d", re.IGNORECASE)
@@ -41,7 +54,7 @@ def ortho_sensors() -> Iterable[Sensor]:
         recognises,
         open_scene,
         options={
-            "rpc": "which RPC to use: text (default), label or an RPC file",
+            "rpc": "which RPC to use: text (default), label, tag or an RPC file",
             "label": "the label, if it is not <image>.pvl",
         },
     )
@@ -84,7 +97,7 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
                 ")",
             ),
         )
-    model, source, warnings = choose_rpc(product, rpc_text_of(name), rpc)
+    model, source, warnings = _chosen(dataset, product, rpc)
     return Scene(
         sensor="orbview3",
         path=name,
@@ -97,6 +110,15 @@ def open_scene(dataset: gdal.Dataset, *, rpc: str | None = None, label: str | No
         unsuited=UNSUITED,
         accuracy=None if product.circular_error is None else product.circular_error * _SIGMA_OF_CE90,
     )
+
+
+def _chosen(dataset: gdal.Dataset, product: Product, choice: str | None) -> tuple[RPC, str, tuple[Notice, ...]]:
+    """Return the RPC to use, its file, and warnings; a tag that contradicts the text is an error."""
+    if choice == "tag":
+        return *rpc_of_dataset(dataset, choice), ()
+    if choice is None and has_rpc(dataset):
+        rpc_of_dataset(dataset)  # raises the error
+    return choose_rpc(product, rpc_text_of(dataset.GetDescription()), choice)
 
 
 def _facts(product: Product, model: RPC, image: str, bands: int) -> dict[str, object]:

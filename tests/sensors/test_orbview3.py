@@ -222,6 +222,16 @@ def test_an_rpc_without_its_text_is_that_of_the_label(copied):
     assert caught.value.field == "rpc"
 
 
+def test_a_tag_that_contradicts_the_text_is_an_error(copied):
+    dataset = gdal.OpenEx(str(copied), gdal.OF_UPDATE, sibling_files=[copied.name])
+    dataset.SetMetadata(rpc_metadata(read_product(copied.with_suffix(".pvl")).rpc.shifted(0.0, 9.0)), "RPC")
+    dataset = None
+    with pytest.raises(InputError, match=r"differ by 9\.0 px"):
+        open_scene(copied)
+    lines = [open_scene(copied, options={"rpc": choice}).model.row_off for choice in ("tag", "sidecar")]
+    assert lines[1] - lines[0] == pytest.approx(9.0)
+
+
 @pytest.mark.parametrize(("moved", "outcome"), [(0.0005, None), (0.02, "differ by 0.02 px"), (3.0, InputError)])
 def test_label_and_text_are_compared(copied, moved, outcome):
     text = copied.with_name(f"{copied.stem}_rpc.txt")
