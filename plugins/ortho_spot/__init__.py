@@ -42,7 +42,8 @@ def metadata_of(name: str) -> Path | None:
             return there if there.is_file() else None
         folder = there if there.is_dir() else there.parent
         there_are = listing(folder)
-        names = sorted({*there_are.named("metadata.dim"), *there_are.named(f"{there.stem}.dim")})
+        # Metadata of the image's own name first: the other ones may be of another scene in this folder.
+        names = [*there_are.named(f"{there.stem}.dim"), *there_are.named("metadata.dim")]
         return next((folder / name for name in names if (folder / name).is_file()), None)
     except (OSError, ValueError, InputError):
         return None
