@@ -17,7 +17,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import DegeneratePoints, InputError
 from ortho_pipeline.estimation.fit import fit
-from ortho_pipeline.exchange.rpc_files import read_rpc_text
+from ortho_pipeline.exchange.rpc_files import read_rpc_text, rpc_metadata
 from ortho_pipeline.host import open_scene
 from ortho_pipeline.models.pushbroom.metadata import SoftSigmas
 from ortho_pipeline.points import read_points
@@ -224,6 +224,19 @@ def test_the_first_rpc_that_can_be_read_is_taken(pair_folder, tmp_path):
     assert "LINE_OFF" in scene.warnings[0]
     # Whatever else lies there can be chosen.
     assert open_scene(image, options={"rpc": str(decrypted)}).model_source == str(decrypted)
+
+
+def test_a_tag_that_contradicts_the_file_is_an_error(pair_folder, tmp_path):
+    folder = deliver(pair_folder, tmp_path, named("BANDA"))
+    image, text = folder / "BANDA.tif", folder / "BANDA_RPC.TXT"
+    rpc = read_rpc_text(text)
+    dataset = gdal.OpenEx(str(image), gdal.OF_UPDATE, sibling_files=[image.name])
+    dataset.SetMetadata(rpc_metadata(rpc.shifted(0.0, 9.0)), "RPC")
+    dataset = None
+    with pytest.raises(InputError, match=r"differ by 9\.0 px"):
+        open_scene(image)
+    lines = [open_scene(image, options={"rpc": choice}).model.row_off for choice in ("tag", str(text))]
+    assert lines == pytest.approx([rpc.row_off - 9.0, rpc.row_off])
 
 
 def test_gdal_finds_another_rpc_than_the_plugin_and_that_is_said(pair_folder, tmp_path):
