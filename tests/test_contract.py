@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import datetime
 import itertools
+import json
+import math
 import types
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 from osgeo import gdal
 
+from ortho_pipeline import commands
 from ortho_pipeline.errors import InputError, PluginError
 from ortho_pipeline.estimation.fit import Prior
 from ortho_pipeline.hookspecs import Scene, Sensor, hookimpl
@@ -101,6 +105,13 @@ def test_what_keeps_the_contract_opens_with_a_handful_of_projections(image, monk
     assert sum(projected) <= 8
 
 
+def test_facts_of_a_plugin_become_json(image):
+    facts = {"cloud": np.float32(0.5), "file": Path("a.txt"), "time": datetime.date(2026, 3, 1), "sun": math.nan}
+    document = commands.info(open_with(image, facts=facts, accuracy=np.float32(5)))
+    assert document["facts"] == {"cloud": 0.5, "file": "a.txt", "time": "2026-03-01", "sun": None}
+    json.dumps(document, allow_nan=False)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -113,6 +124,8 @@ def test_what_keeps_the_contract_opens_with_a_handful_of_projections(image, monk
         ({"warnings": "beware"}, "warnings must be a tuple of str, not 'beware'"),
         ({"pieces": ("b.tif",)}, "pieces must be a tuple of Piece"),
         ({"facts": ["a"]}, "facts must be a mapping"),
+        ({"models": {1: Plane()}}, "the name of a model must be a text, not 1"),
+        ({"accuracy": "5 m"}, "accuracy must be None or a number of metres, not '5 m'"),
         (
             {"priors": {"shiftt": Prior(0, 1)}},
             "the adjusted model has no parameter 'shiftt' for this prior; it has shift, delay",

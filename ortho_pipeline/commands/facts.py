@@ -215,7 +215,7 @@ def info(image: str | os.PathLike[str], options: SceneOptions = SceneOptions()) 
         "gsd_m": gsd,
         "view": viewing(model, *size)["view"],
         "corners_lon_lat": json_value(ground[:, :2]),
-        "facts": dict(scene.facts),
+        "facts": json_value(scene.facts),
         "same_acquisition": [Path(piece.path).name for piece in scene.pieces],
         **to_document(scene.notices),
     }

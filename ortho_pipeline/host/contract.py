@@ -10,6 +10,7 @@ import inspect
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,11 @@ def scene_faults(
     for name in ("facts", "unsuited"):
         if not isinstance(getattr(scene, name), Mapping):
             yield f"{name} must be a mapping, not {_shown(getattr(scene, name))}"
+    yield from _accuracy_faults(scene.accuracy)
     for name, model in scene.models.items():
+        if not isinstance(name, str) or not name:
+            yield f"the name of a model must be a text, not {name!r}"
+            return
         if not isinstance(model, SensorModel):
             yield f"model {name!r} must be a SensorModel, not {_shown(model)}"
             return
@@ -213,6 +218,11 @@ def _scale_fault(model: SensorModel, image: Array, step: Array) -> Iterator[str]
             f"a pixel is only {min(pixel):.1g} m on the ground. Either ground_to_image does not take its ground in "
             f"{model.crs}, or domain is not (centre, half-size)"
         )
+
+
+def _accuracy_faults(accuracy: object) -> Iterator[str]:
+    if accuracy is not None and not (isinstance(accuracy, Real) and 0 <= float(accuracy) < math.inf):
+        yield f"accuracy must be None or a number of metres, not {_shown(accuracy)}"
 
 
 def _prior_faults(priors: object, names: tuple[str, ...]) -> Iterator[str]:
