@@ -104,6 +104,7 @@ def test_it_keeps_the_contract_and_closes(light: dict[str, bool]) -> None:
     image, ground = points(model)
     assert np.abs(model.ground_to_image(ground) - image).max() < 1e-5
     check_sensor_model(model, ground)
+    check_sensor_model(model.freed("path_offset", "path_drift"), ground)  # aberration also changes with a drift
     plain = lit(model).image_to_ground(image, ground[:, 2])
     moved = np.einsum("nij,nj->ni", enu_from_ecef(ground), geocentric(ground) - geocentric(plain))[:, :2]
     low, high = (15.0, 30.0) if model.light.aberration else (0.3, 2.0)

@@ -90,6 +90,10 @@ class LightPath:
         unit = line / np.linalg.norm(line, axis=1)[:, None]
         return np.asarray(matrix + (matrix @ velocity[:, :, None] / LIGHT) * unit[:, None, :])
 
+    def by_velocity(self, matrix: Array, line: Array) -> Array:
+        """Return the derivatives ``(N, 3, 3)`` of apparent vectors, turned by matrices, by the velocity."""
+        return np.asarray(matrix * (np.linalg.norm(line, axis=1)[:, None, None] * self.numbers[1]))
+
     def straight(self, direction: Array, velocity: Array) -> Array:
         """Return the unit vectors ``(N, 3)`` along which light arrived that is seen along unit vectors `direction`."""
         if not self.aberration:

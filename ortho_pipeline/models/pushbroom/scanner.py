@@ -386,14 +386,15 @@ def _by_params(model: Pushbroom, ground: Array) -> Array:
     place = {column: at for at, column in enumerate(parameters.places(model.free))}
     by_vector = np.zeros((len(ground), 3, len(place)))
     groups = (
-        ("path", model.path, -(model.mounting.T @ state.by_line)),
-        ("attitude", model.attitude, model.mounting.T @ state.by_angles),
+        ("path", model.path, 0, -(model.mounting.T @ state.by_line)),
+        ("path", model.path, 1, model.mounting.T @ state.by_velocity),
+        ("attitude", model.attitude, 0, model.mounting.T @ state.by_angles),
     )
-    for group, spline, slopes in groups:
-        for first, weights in parameters.triples(group, model.flight.basis(spline, state.times)):
+    for group, spline, derivative, slopes in groups:
+        for first, weights in parameters.triples(group, model.flight.basis(spline, state.times, derivative)):
             for axis in range(3):
                 if (at := place.get(first + axis)) is not None:
-                    by_vector[:, :, at] = slopes[:, :, axis] * weights[:, None]
+                    by_vector[:, :, at] += slopes[:, :, axis] * weights[:, None]
     inner = np.zeros((len(ground), 2, len(place)))
     start = parameters.first["camera"]
     camera = [(column - start, at) for column, at in place.items() if column >= start]
@@ -442,6 +443,8 @@ class _State:
         back = np.swapaxes(self.turn, 1, 2)
         #: d(vector in platform axes)/d(line from the camera to the point)
         self.by_line = model.light.turned(back, line, rate)
+        #: d(vector in platform axes)/d(velocity of the camera)
+        self.by_velocity = model.light.by_velocity(back, line)
         line = model.light.apparent(line, rate, up, ground[:, 2])
         place = np.einsum("nij,nj->ni", back, line)
         #: d(vector in platform axes)/d(roll, pitch, yaw)
