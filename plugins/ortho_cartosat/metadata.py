@@ -72,9 +72,13 @@ class Metadata:
         key = next((key for key in keys if self.text(key) is not None), None)
         if key is None:
             return None
-        token = str(self.text(key)).split()[0]
+        token, *rest = str(self.text(key)).split()
         if not _NUMBER.fullmatch(token):
             raise InputError(f"{token[:60]!r} is not a number", file=self.path, field=key, remedy=_REMEDY)
+        # Degrees, minutes and seconds would otherwise be read as whole degrees.
+        if any(map(_NUMBER.fullmatch, rest)):
+            text = str(self.text(key))[:60]
+            raise InputError(f"{text!r} is not one number", file=self.path, field=key, remedy="write it as one number")
         value = float(token)
         if not low <= value <= high or not math.isfinite(value):
             raise InputError(f"{token[:60]} is out of range", file=self.path, field=key, remedy=f"{low:g} to {high:g}")

@@ -99,6 +99,7 @@ def test_the_satellite_decides(tmp_path, name, ours):
         ("SatelliteAltitude = 638000\n", lambda read: read.altitude, "SatelliteAltitude"),
         ("SatID = A\nSatID = B\n", lambda read: read.is_cartosat1, "SatID"),
         ("ImageULLat = 1\nImageULLon = 2\nImageURLat = 1\n", lambda read: read.corners, "ImageUR"),
+        ("ImageULLon = 147 18 33.2\n", lambda read: read.corners, "ImageULLon"),
         ("ImageULLat = 91\n", lambda read: read.corners, "ImageULLat"),
         ("ViewAngleAlongTrack = 1_0\n", lambda read: read.view, "ViewAngleAlongTrack"),
     ],
