@@ -18,6 +18,7 @@ from ortho_pipeline.plugin import (
     Scene,
     Sensor,
     camera_from_platform,
+    decoded,
     exterior_sigmas,
     geodetic,
     hookimpl,
@@ -50,7 +51,7 @@ def recognises(dataset: gdal.Dataset) -> bool:
         # A dataset in memory has no name: ValueError.
         survey = survey_of(dataset.GetDescription())
         # Check first: the error for a missing file searches the whole folder for similar names.
-        return survey.is_file() and read_bounded(survey, len(MARK)).startswith(MARK.encode())
+        return survey.is_file() and decoded(read_bounded(survey, 2 * len(MARK))).startswith(MARK)
     except (InputError, ValueError):
         return False
 

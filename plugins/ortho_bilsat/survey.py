@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import datetime
 import math
 import re
@@ -139,7 +140,7 @@ def _text(path: str | PathLike[str]) -> str:
     if len(data) > MAX_BYTES:
         raise InputError(f"this survey is larger than the limit of {MAX_BYTES} bytes", file=path)
     try:
-        return data.decode("ascii")
+        return data.removeprefix(codecs.BOM_UTF8).decode("ascii")
     except ValueError as error:
         raise InputError("a survey must be plain ASCII text", file=path) from error
 

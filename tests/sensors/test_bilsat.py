@@ -106,6 +106,13 @@ def test_bilsat_scene_opens_as_it_was_taken(product):
     np.testing.assert_allclose(scene.model.ground_to_image(ground), image, atol=1e-6)
 
 
+def test_a_byte_order_mark_before_the_survey_is_skipped(product):
+    folder, *_ = product
+    survey = folder / "ankara_survey.txt"
+    survey.write_bytes(b"\xef\xbb\xbf" + survey.read_bytes())
+    assert open_scene(folder / "ankara.tif").sensor == "bilsat"
+
+
 def test_without_attitude_the_angles_are_zero(product):
     folder, *_ = product
     scene = sensor(ortho_bilsat).open_scene(gdal.Open(str(folder / "ankara.tif")), attitude="zero")
