@@ -83,7 +83,7 @@ class Objects:
                 remedy=f"use one of {', '.join(SCHEMES)}, and a name",
             )
         self.address = address.rstrip("/")
-        self._store = _store_of(self.address)
+        self._store, self._is_on_web = _store_of(self.address), Location(self.address).is_on_web
         self._version = "version" if self.address.startswith("gs://") else "e_tag"
         # The ETag of what is encrypted so is no checksum; the store verifies the SHA-256 that comes with an object.
         self._encrypted = bool(_key_management()) and self.address.startswith("s3://")
@@ -156,6 +156,8 @@ class Objects:
     def stated(self, name: str) -> tuple[int, str]:
         """Return the size of an object and the tag that its store gives this version (empty if it gives none).
 
+        Of a web server without tags it is the date of the last change.
+
         Raises
         ------
         FileNotFoundError
@@ -163,7 +165,7 @@ class Objects:
         """
         with self._errors(name):
             found = self._store.head(name)
-        return found["size"], found["e_tag"] or ""
+        return found["size"], found["e_tag"] or (self._is_on_web and found["last_modified"].isoformat()) or ""
 
     def version(self, name: str) -> str | None:
         """Return the store's name of this version of an object, whose content is not read.

@@ -371,3 +371,24 @@ def test_a_crop_of_a_large_image_reads_little_more_than_its_share(tmp_path: Path
         read = source.read(500, 500, part, part)
         np.testing.assert_array_equal(read[0], noise[500 : 500 + part, 500 : 500 + part])
         assert public.sent < 0.12 * size
+
+
+class WithoutTags:
+    """A web server that gives no ETag."""
+
+    address, changed = "", "Wed, 21 Oct 2015 07:28:00 GMT"
+
+    def answer(self, handler: Any) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Length", "5")
+        handler.send_header("Last-Modified", self.changed)
+        handler.end_headers()
+
+
+def test_of_a_server_without_tags_the_date_of_the_last_change_counts() -> None:
+    with running(WithoutTags()) as server:
+        folder = Objects(server.address, allow_network=True)
+        before = folder.stated("a.tif")
+        assert before == folder.stated("a.tif")
+        server.changed = "Wed, 21 Oct 2015 07:28:01 GMT"
+        assert folder.stated("a.tif") != before
