@@ -6,6 +6,7 @@ scene is fresh while all of them are so, and settings and software too.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ from ortho_pipeline.surface.cells.sources import places_of
 
 #: Larger files next to an image are not metadata.
 _COMPANION_BYTES = 5_000_000
+#: Role of the file that the model was read from, if the scene does not name it otherwise.
+_MODEL = "model source"
 #: Checksums that this process has taken.
 DIGESTS = Digests()
 
@@ -78,29 +81,53 @@ def inputs_as_recorded(record: RunRecord, job: Job, checksums: bool = False) -> 
     if not checksums:
         DIGESTS.learn(record.inputs)
     known = {state.path: state.role for state in record.inputs if os.path.isfile(state.path)}
-    roles = Ledger.of(job.request).roles
+    ledger = Ledger.of(job.request)
     read = (
-        *_local_states(job, {**{str(path): role for path, role in roles.items()}, **known}),
+        *_local_states(job, {**{str(path): role for path, role in ledger.roles.items()}, **known}),
         *(state for state in record.inputs if state.role == MISSING and state.untouched()),
-        *far_states(job.request),
+        *_far_now(record, job, ledger),
     )
     return read if record.key == key_of(read, job.configuration, job.versions) else None
 
 
-def as_read(job: Job, report: Mapping[str, Any]) -> tuple[FileState, ...]:
-    """Return the files that a report was made from, and DEM cells that were missing; a changed file is an error."""
+def as_read(job: Job, report: Mapping[str, Any], far: Sequence[FileState]) -> tuple[FileState, ...]:
+    """Return the files that a report was made from, and DEM cells that were missing; a changed file is an error.
+
+    Parameters
+    ----------
+    far : sequence of FileState
+        From `far_states` before the work.
+    """
     used = {entry["path"]: entry for entry in report["provenance"]["inputs"]}
     roles = {path: entry["role"] for path, entry in used.items()}
     source = str(report["scene"]["model_source"])
     if os.path.isfile(source):
-        roles.setdefault(os.path.abspath(source), "model source")
+        roles.setdefault(os.path.abspath(source), _MODEL)
     sought = _sought_of_cells(job, report)
     roles.update((str(path), "DEM") for path in sought if path.name == LIST and path.is_file())
     states = _local_states(job, roles)
     for state in states:
         if state.path in used and used[state.path]["sha256"] != state.sha256:
             raise InputError("this file changed during the run", file=state.path, remedy="run again")
-    return (*states, *(FileState.missing(path) for path in sought if str(path) not in roles))
+    missing = (FileState.missing(path) for path in sought if str(path) not in roles)
+    return (*states, *missing, *far, *_further(job, source, far))
+
+
+def _far_now(record: RunRecord, job: Job, ledger: Ledger) -> tuple[FileState, ...]:
+    """Return size and tag of the recorded inputs on other machines as they are now, in the order of `as_read`."""
+    far = far_states(job.request, ledger)
+    sources = [state.path for state in record.inputs if state.role == _MODEL]
+    return (*far, *(state for source in sources for state in _further(job, source, far)))
+
+
+def _further(job: Job, source: str, far: Sequence[FileState]) -> list[FileState]:
+    """Return the state of far metadata from which the model was read, and which are no side-car for GDAL."""
+    address = Location(source).url
+    if Location(source).is_far and address.is_address and address not in {state.path for state in far}:
+        # A source may be a name with a remark, such as one of a tag.
+        with contextlib.suppress(InputError):
+            return [far_state(_MODEL, address, allow_network=job.request.scene.allow_network)]
+    return []
 
 
 def _sought_of_cells(job: Job, report: Mapping[str, Any]) -> list[Path]:
@@ -121,8 +148,13 @@ def as_recorded(record: RunRecord, job: Job) -> bool:
             return False
 
 
-def far_states(request: Request) -> tuple[FileState, ...]:
-    """Return size and tag of the inputs in object storage, or on a server with tags.
+def far_states(request: Request, ledger: Ledger | None = None) -> tuple[FileState, ...]:
+    """Return size and tag of the inputs and their side-cars in object storage, or on a server.
+
+    Parameters
+    ----------
+    ledger : Ledger, optional
+        That of the request.
 
     Raises
     ------
@@ -131,15 +163,12 @@ def far_states(request: Request) -> tuple[FileState, ...]:
     StorageError
         If the store does not answer.
     """
-    addresses = sorted({Location(path).url for _, path in request.files if Location(path).is_far})
-    allowed = request.scene.allow_network
-    return tuple(
-        far_state("far input", address, allow_network=allowed) for address in addresses if Location(address).is_address
-    )
+    addresses, allowed = (ledger or Ledger.of(request)).far, request.scene.allow_network
+    return tuple(far_state("far input", address, allow_network=allowed) for address in addresses)
 
 
 def far_state(role: str, address: str, *, allow_network: bool) -> FileState:
-    """Return size and tag of a file in object storage, or on a server with tags; see `far_states`."""
+    """Return size and tag of a file in object storage, or on a server; see `far_states`."""
     folder, _, name = address.rpartition("/")
     try:
         size, tag = Objects(folder, allow_network=allow_network).stated(name)
@@ -220,10 +249,13 @@ def reads_the_same(record: RunRecord, job: Job) -> bool:
     try:
         far = tuple(state for state in record.inputs if state.tag)
         near = record.replaced(inputs=tuple(state for state in record.inputs if not state.tag))
-        if not _files_untouched(near, job, record.inputs) or (far and far != far_states(job.request)):
+        if not _files_untouched(near, job, record.inputs):
             return False
         with confined(job.output):
-            roles = Ledger.of(job.request).roles
+            ledger = Ledger.of(job.request)
+        if far and far != _far_now(record, job, ledger):
+            return False
+        roles = ledger.roles
     except OrthoError:
         return False
     known = {state.path for state in record.inputs}

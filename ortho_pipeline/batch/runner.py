@@ -101,7 +101,7 @@ def _make_locked(job: Job, checksums: bool, begin: float) -> Outcome:
         if result.failure is not None:
             raise result.failure
         report = result.document["report"]
-        read = (*as_read(job, report), *far)
+        read = as_read(job, report, far)
         done = RunRecord(
             name=job.name,
             key=key_of(read, job.configuration, job.versions),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import os
@@ -32,6 +33,7 @@ from ortho_pipeline.batch.shared.run import SharedFolder, run_shared, summary_of
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.errors import InputError, error_document
+from ortho_pipeline.exchange.rpc import write_rpc_txt
 from ortho_pipeline.stores import objects
 from ortho_pipeline.stores.objects import Objects
 
@@ -458,6 +460,30 @@ def test_a_file_on_this_machine_may_name_addresses_if_that_is_allowed(tiny: Any)
         )
         with pytest.raises(InputError, match="cannot search a web server"):
             plan(file, allow_network=True)
+
+
+def test_a_changed_side_car_of_an_image_behind_a_url_is_noticed(tiny: Any) -> None:
+    folder, file = tiny.folder / "web", tiny.folder / "p.yaml"
+    folder.mkdir()
+    plain = gdal.GetDriverByName("GTiff").Create(str(folder / "plain.tif"), tiny.width, tiny.height, 1, gdal.GDT_UInt16)
+    plain.WriteArray(gdal.Open(str(tiny.image)).ReadAsArray())
+    plain = None
+    write_rpc_txt(tiny.model, folder / "plain_RPC.TXT")
+    with serving(folder) as public:
+        file.write_text(
+            f"scenes:\n  - image: {public.address}/plain.tif\n    surface: {{height: 500}}\n"
+            "    output: {format: GTiff, resolution: 40}\n"
+        )
+
+        def run() -> list[str]:
+            return [one.status for one in runner.run(file, allow_network=True, executor="sequential").scenes]
+
+        assert run() == ["done"]
+        assert run() == ["unchanged"]
+        write_rpc_txt(dataclasses.replace(tiny.model, col_off=tiny.model.col_off + 7), folder / "plain_RPC.TXT")
+        assert runner.list_scenes(plan(file, allow_network=True))[0]["state"] == "changed"
+        assert run() == ["done"]
+        assert runner.list_scenes(plan(file, allow_network=True))[0]["state"] == "done"
 
 
 def test_items_of_a_local_pipeline_file_are_their_images(tiny: Any) -> None:

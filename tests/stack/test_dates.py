@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from osgeo import gdal, osr
+from servers import serving
 
 from ortho_pipeline.batch.stack.dates import by_pattern, dated_orthos, read_list, time_of
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.options import SceneOptions
 
 gdal.UseExceptions()
 
@@ -105,3 +107,14 @@ def test_what_is_no_date_or_list_is_refused(tmp_path):
     (tmp_path / "list.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="no column of files"):
         read_list(tmp_path / "list.csv")
+
+
+def test_the_state_of_an_ortho_behind_a_url_has_its_side_cars(tmp_path):
+    path = ortho(tmp_path / "a.tif")
+    path.with_name("a.tif.msk").write_bytes(ortho(tmp_path / "mask.tif").read_bytes())
+    with serving(tmp_path) as server:
+        images = [f"{server.address}/{name}.tif" for name in ("a", "mask")]
+        (tmp_path / "list.csv").write_text("file,date\n" + "".join(f"{image},2020-01-01\n" for image in images))
+        access = SceneOptions(allow_network=True)
+        first = dated_orthos([tmp_path / "list.csv"], options=access)[0]
+        assert [Path(state.path).name for state in first.states(access)] == ["a.tif", "a.tif.msk"]

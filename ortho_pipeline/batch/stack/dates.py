@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ortho_pipeline.batch.freshness import DIGESTS, state_of
+from ortho_pipeline.batch.freshness import DIGESTS, far_states, state_of
 from ortho_pipeline.batch.paths import PipelinePaths, Place, key_of_name
 from ortho_pipeline.batch.records import FileState
 from ortho_pipeline.batch.stack.conditions import Conditions, conditions_of
@@ -103,9 +103,11 @@ class Dated:
         """Return the states of the ortho, of its side-cars and of the sources of a VRT, if they are on this machine."""
         if self.made is not None:
             return (self.made,)
+        request = Request(self.path, options)
         if Location(self.path).is_far:
-            return (state_of("ortho", self.path, allow_network=options.allow_network),)
-        files = Ledger.of(Request(self.path, options), self.scene).roles
+            ortho = state_of("ortho", self.path, allow_network=options.allow_network)
+            return (ortho, *(state for state in far_states(request) if state.path != ortho.path))
+        files = Ledger.of(request, self.scene).roles
         return tuple(FileState.of("ortho", file.absolute(), DIGESTS) for file in sorted(files))
 
     @property

@@ -199,7 +199,7 @@ class Rectifier:
     @staticmethod
     def _inputs(resolved: Resolved) -> tuple[FileState, ...]:
         near = (FileState.of(role, file.absolute(), DIGESTS) for file, role in resolved.ledger.roles.items())
-        return (*near, *far_states(resolved.request))
+        return (*near, *far_states(resolved.request, resolved.ledger))
 
     def _set(self, name: str, raw: RawScene) -> FileSet:
         file, placed = _ortho_of(name), raw.placed

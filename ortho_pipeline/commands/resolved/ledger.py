@@ -63,10 +63,14 @@ class Ledger:
         Every file and its role, side-cars and sources of a VRT included. Of what is in an archive, the archive.
     begun : mapping
         From `files.states`.
+    far : tuple of str
+        Addresses of the files on other machines that a request names, and of their side-cars. Not of the sources of a
+        VRT: they may be thousands.
     """
 
     roles: Mapping[Path, str] = field(default_factory=dict)
     begun: State = field(default_factory=dict)
+    far: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -80,17 +84,24 @@ class Ledger:
             States of the named files when the work began; without, the current states.
         """
         found: dict[Path, str] = {}
+        far: set[str] = set()
 
         def enter(role: str, paths: Iterable[str | os.PathLike[str] | None], *, attached: bool = False) -> None:
             for name in (name for name in paths if name is not None):
-                path = Location(name).archive or Path(name)
+                place = Location(name)
+                path = place.archive or Path(name)
                 if path.is_file():
                     found.setdefault(path, role)
+                if place.is_far:
+                    far.add(place.url)
+                    attached = attached and not place.endswith(".vrt")
                 if attached:
-                    enter(role, _files_of(name, request.scene))
+                    files = _files_of(name, request.scene)
+                    enter(role, (file for file in files if place.is_far or not Location(file).is_far))
 
         for role, path in request.files:
             enter(role, [path], attached=role in _ATTACHING and not (role == "DEM" and Location(path).is_collection))
+        addresses = tuple(sorted(name for name in far if Location(name).is_address))
         if scene is not None:
             enter("image", [scene.path, *scene.rasters])
             if scene.path != Path(request.image):
@@ -102,7 +113,7 @@ class Ledger:
             read = (cell for cell in surface.files if Path(cell) not in found and not Location(cell).is_far)
             enter("DEM", read, attached=True)
         roles = dict(sorted(found.items(), key=lambda entry: _ORDER.get(entry[1], 1)))
-        return cls(roles, {**states(roles), **(begun or {})})
+        return cls(roles, {**states(roles), **(begun or {})}, addresses)
 
     def joined(self, *others: Ledger) -> Ledger:
         """Return the files of several ledgers as one; the first ledger of a file decides its role."""
