@@ -185,6 +185,17 @@ def test_a_date_that_is_added_is_matched_alone(made, tmp_path, counted):
     assert contents(tmp_path / "out") == contents(made[1])
 
 
+def test_pairs_whose_names_join_to_the_same_text_keep_their_own_matches(made, tmp_path, counted):
+    (tmp_path / "in").mkdir()
+    for path, name in zip(made[0], ("z", "y__z", "x", "x__y"), strict=True):
+        (tmp_path / "in" / f"{name}.tif").write_bytes(path.read_bytes())
+    record = run([tmp_path / "in"], tmp_path / "out").record
+    assert [one.status for one in record.pairs] == ["accepted"] * 6
+    counted.clear()
+    run([tmp_path / "in"], tmp_path / "out")
+    assert not counted
+
+
 def test_a_changed_ortho_is_matched_again(made, tmp_path, counted):
     folder = tmp_path / "in"
     folder.mkdir()

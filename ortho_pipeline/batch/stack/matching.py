@@ -27,6 +27,8 @@ from ortho_pipeline.raster.source import open_dataset
 from ortho_pipeline.stores.objects import Objects
 
 _BYTES = 100_000_000
+#: What is between the names of two dates.
+_BETWEEN = "__"
 
 
 class EdgeMatches(Record):
@@ -140,7 +142,11 @@ def _copied(one: Dated, folder: Path, options: SceneOptions) -> Dated:
 
 
 def _name_of(first: Dated, second: Dated) -> str:
-    return f"{first.name}__{second.name}"
+    """Return the name of the record of a pair, which no other pair has."""
+    name = f"{first.name}{_BETWEEN}{second.name}"
+    # Another pair may have its names joined to the same text: here the length tells where the first one ends.
+    is_ambiguous = name.find(_BETWEEN) != name.rfind(_BETWEEN)
+    return f"{name}{_BETWEEN}{len(first.name)}" if is_ambiguous else name
 
 
 def _file_of(name: str) -> str:
