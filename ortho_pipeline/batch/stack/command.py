@@ -343,9 +343,16 @@ def _with_datum(
         if one.name == datum:
             return list(dates), number
     wanted = time_of(datum).date()
-    for number, one in enumerate(dates):
-        if one.time.date() == wanted:
-            return list(dates), number
+    numbers = [number for number, one in enumerate(dates) if one.time.date() == wanted]
+    if len(numbers) > 1:
+        names = [dates[number].name for number in numbers]
+        raise InputError(
+            f"{len(names)} images are of {wanted}: {', '.join(names)}",
+            field="stack.datum",
+            remedy=Text("name one of them: ", Setting("stack.datum", names[0])),
+        )
+    if numbers:
+        return list(dates), numbers[0]
     raise InputError(
         f"no ortho is of {wanted}", field="stack.datum", remedy=f"give mean, or a date such as {dates[0].time.date()}"
     )
