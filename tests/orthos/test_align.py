@@ -117,7 +117,11 @@ def test_type_nodata_bands_and_grid_are_kept(shifted, tmp_path):
 
 @pytest.mark.parametrize("form", [pytest.param("COG", marks=pytest.mark.slow), "GTiff"])
 def test_without_resampling_no_pixel_is_touched(shifted, tmp_path, form):
+    earlier = tmp_path / f"ortho_aligned{'.tif' if form == 'COG' else '.vrt'}"
+    for path in (earlier, tmp_path / "ortho_align.json"):
+        path.write_text("of an earlier run")
     document = aligned(*shifted, tmp_path, "--shift-only", "--no-resample", "--format", form, "--match-points", 200)
+    assert not earlier.exists()
     path = tmp_path / f"ortho_aligned{'.vrt' if form == 'COG' else '.tif'}"
     assert document["files"]["ortho"] == str(path)
     source, found = gdal.Open(str(shifted[0])), gdal.Open(str(path))

@@ -26,7 +26,7 @@ from ortho_pipeline.estimation.spatial.displacement_field import DisplacementFie
 from ortho_pipeline.estimation.statistics import chance_of_mean
 from ortho_pipeline.exchange.model_file import SavedModel, write_model_file
 from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
-from ortho_pipeline.files import together, write_json
+from ortho_pipeline.files import retire, together, write_json
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.imaging.matching.matcher import held_out
 from ortho_pipeline.models import ImageCorrection, MapGrid, SensorModel, SmoothField
@@ -128,7 +128,12 @@ def align(
     document["correction"] = _described(chosen)
     document["resampled"] = resample
     document["provenance"] = record
+    # Next to this ortho, one of an earlier run in the other format would be taken for it.
+    other = files["ortho"].with_suffix(".tif" if as_vrt else ".vrt")
+    is_input = other.resolve() in {Path(path).resolve() for _, path in request.files}
     with together(folder, stem):
+        if files["json"].is_file() and not is_input:
+            retire([other])
         write_json(files["json"], document)
         write_json(files["displacements"], displacements(measured))
         size = measured.size
