@@ -29,14 +29,14 @@ def ortho(path: Path, **metadata: str) -> Path:
 
 
 def test_dates_come_from_metadata_and_documents_in_order_of_time(tmp_path):
-    ortho(tmp_path / "late.tif", TIFFTAG_DATETIME="2022:05:03 10:12:00")
+    ortho(tmp_path / "late.tif", ACQUISITIONDATETIME="2022:05:03 10:12:00", TIFFTAG_DATETIME="1999:01:01 00:00:00")
     ortho(tmp_path / "early_ortho.tif")
     (tmp_path / "early_stac.json").write_text(json.dumps({"properties": {"datetime": "2020-01-02T00:00:00Z"}}))
     ortho(tmp_path / "middle.tif")
     (tmp_path / "middle_report.json").write_text(json.dumps({"scene": {"facts": {"acquired": "2021-01-01"}}}))
     found = dated_orthos([tmp_path])
     assert [one.name for one in found] == ["early_ortho", "middle", "late"]
-    assert [one.source for one in found] == ["early_stac.json", "middle_report.json", "TIFFTAG_DATETIME"]
+    assert [one.source for one in found] == ["early_stac.json", "middle_report.json", "ACQUISITIONDATETIME"]
     assert found[2].time.isoformat() == "2022-05-03T10:12:00+00:00"
 
 
@@ -70,6 +70,10 @@ def test_an_ortho_without_a_date_is_an_error(tmp_path):
     with pytest.raises(InputError, match="has no date") as error:
         dated_orthos([tmp_path])
     assert "stack.date_pattern=%Y%m%d" in str(error.value.remedy)
+    (tmp_path / "a.tif").unlink()
+    ortho(tmp_path / "c.tif", ACQUISITIONDATETIME="2022-05-03")
+    with pytest.raises(InputError, match=r"TIFFTAG_DATETIME may be when the file was written"):
+        dated_orthos([tmp_path])
 
 
 @pytest.mark.parametrize(

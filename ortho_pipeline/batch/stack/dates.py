@@ -44,8 +44,9 @@ _ITEMS = (
     ("IMAGERY", "ACQUISITIONDATETIME"),
     ("", "ACQUISITIONDATETIME"),
     ("", "acquired"),
-    ("", "TIFFTAG_DATETIME"),
 )
+#: This may be the time of acquisition, or of the last change by any program.
+_WRITTEN = "TIFFTAG_DATETIME"
 _PARTS = {"%Y": r"(?P<Y>\d{4})", "%m": r"(?P<m>\d{2})", "%d": r"(?P<d>\d{2})", "%j": r"(?P<j>\d{3})",
           "%H": r"(?P<H>\d{2})", "%M": r"(?P<M>\d{2})", "%S": r"(?P<S>\d{2})", "%%": "%"}  # fmt: skip
 #: Numbers in names that are years of other times are no dates.
@@ -308,7 +309,8 @@ def _date(
         if text:
             return time_of(text, path), item
     raise InputError(
-        "this image has no date: no STAC item and no report are next to it, and its metadata state none",
+        "this image has no date: no STAC item and no report are next to it, and its metadata state none"
+        + (" (TIFFTAG_DATETIME may be when the file was written)" if dataset.GetMetadataItem(_WRITTEN) else ""),
         file=path,
         field="date",
         remedy=Text(
