@@ -280,7 +280,11 @@ def test_a_lock_of_a_run_that_was_killed_after_its_last_rename_goes(made, tmp_pa
 
 def test_corrections_only_keep_the_pixels(made, tmp_path):
     options = StackOptions(corrections_only=True, datum=f"scene_{RASTERS.days()[0]:%Y%m%d}")
+    resampled = tmp_path / "out" / "aligned" / f"{made[0][1].stem}_aligned.tif"
+    resampled.parent.mkdir(parents=True)
+    resampled.write_text("of an earlier run")
     result = run(made[0][:2], tmp_path / "out", options)
+    assert not resampled.exists()
     source = gdal.Open(str(made[0][1]))
     moved = gdal.Open(str(tmp_path / "out" / result.document["dates"][1]["output"]))
     np.testing.assert_array_equal(moved.ReadAsArray(), source.ReadAsArray())

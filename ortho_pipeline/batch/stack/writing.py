@@ -74,6 +74,8 @@ class Writer:
         found: list[str] = []
         for name, files in self.folder.others(one.name for one in sets).items():
             found += [f"{name}_stac.json", f"{name}_delivery.json", *files]
+        # Those of an earlier run with the other kind of output.
+        found += [f"{one.name}{end}" for one in sets for end in (_TIF, _VRT) if one.files.get(end[-3:]) is None]
         there = self.folder.names()
         return [name for name in found if name in there]
 
