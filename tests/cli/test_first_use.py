@@ -117,6 +117,16 @@ def test_init_writes_a_file_that_a_run_takes(folder):
     assert elsewhere.exit_code == 2
 
 
+def test_init_names_scenes_of_the_same_stem_by_their_folders(folder):
+    for place in ("a", "b/c"):
+        (folder / place).mkdir(parents=True)
+        for name in ("scene.tif", "scene_RPC.TXT"):
+            shutil.copy(folder / name, folder / place / name)
+    assert run("init", folder).exit_code == 0
+    listed = run("run", folder / "pipeline.yaml", "--list")
+    assert [line.split("\t")[0] for line in listed.stdout.splitlines() if line] == ["a_scene", "b_c_scene", "scene"]
+
+
 def test_files_belong_to_the_scene_that_they_are_named_after_or_lie_beside(folder):
     deeper = folder / "two: [*]"
     deeper.mkdir()

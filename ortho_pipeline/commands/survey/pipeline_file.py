@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+from collections import Counter
 from pathlib import Path
 
 from ortho_pipeline.commands.results import Result
@@ -100,8 +101,12 @@ def text(seen: FolderSurvey, prefix: str = ".") -> str:
         "  #   resolution: 2.5           # default: about that of the image",
         "scenes:",
     ]
+    stems = Counter(Path(scene).stem.casefold() for scene in seen.of("scene"))
     for scene in seen.of("scene"):
         lines.append(f"  - image: {at(scene)}")
+        if stems[Path(scene).stem.casefold()] > 1:
+            name = "_".join(Path(scene).with_suffix("").parts)
+            lines.append(f"    name: {json.dumps(name, ensure_ascii=False)}")
         for kind, group, key in _GROUPS:
             files = seen.beside(scene, kind)
             # Of several the first; which one is right only the user knows.
