@@ -11,6 +11,7 @@ from typing import Any
 import click
 import pytest
 from click.testing import CliRunner, Result
+from osgeo import gdal
 
 from ortho_pipeline.batch.config import read_config
 from ortho_pipeline.cli.program import cli
@@ -115,6 +116,14 @@ def test_init_writes_a_file_that_a_run_takes(folder):
     assert run("init", folder, "--overwrite").exit_code == 0
     elsewhere = run("init", folder, "-o", folder / "deeper" / "p.yaml")
     assert elsewhere.exit_code == 2
+
+
+def test_points_of_which_most_are_outside_of_an_image_are_of_another_one(folder):
+    gdal.Translate(str(folder / "bundle_ms.tif"), str(folder / "scene.tif"), srcWin=[0, 0, 250, 250])
+    shutil.copy(folder / "scene_RPC.TXT", folder / "bundle_ms_RPC.TXT")
+    seen = survey(folder)
+    assert seen.beside("scene.tif", "points") == ["gcps.csv"]
+    assert seen.beside("bundle_ms.tif", "points") == []
 
 
 def test_init_names_scenes_of_the_same_stem_by_their_folders(folder):

@@ -9,6 +9,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from ortho_pipeline import host
 from ortho_pipeline.commands.results import ENDINGS, SCHEMA_VERSION
 from ortho_pipeline.commands.survey.map_raster import is_upright, kind_of
@@ -55,12 +57,16 @@ _NAMED = 10
 
 @dataclass(frozen=True)
 class SurveyedFile:
-    """A file, by its path from the folder: its kind, its description, and the models of a scene."""
+    """A file, by its path from the folder: its kind, its description, and the models of a scene.
+
+    `reach` is how far pixels reach (columns, rows): the size of a scene, and the median place of points.
+    """
 
     path: str
     kind: Kind
     said: str
     models: tuple[str, ...] = ()
+    reach: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -78,13 +84,15 @@ class FolderSurvey:
         """Return the files of a kind that belong to a scene: named after it, in its folder, or above it.
 
         What bears another scene's name is that one's; what lies in a folder above belongs to the scenes of that folder
-        if it has some. The only DEM of the delivery, in a folder without scenes, belongs to all.
+        if it has some. The only DEM of the delivery, in a folder without scenes, belongs to all. Points of which most
+        are outside of an image were measured in another one, such as the pan image of a bundle.
         """
+        reach = {file.path: file.reach for file in self.found}
         mine, others = Path(scene).stem, {Path(name).stem for name in self.of("scene")} - {Path(scene).stem}
         for folder in Path(scene).parents:
             if folder != Path(scene).parent and any(Path(name).parent == folder for name in self.of("scene")):
                 break
-            here = [name for name in self.of(kind) if Path(name).parent == folder]
+            here = [name for name in self.of(kind) if Path(name).parent == folder and _fits(reach[name], reach[scene])]
             if named := [name for name in here if Path(name).stem.startswith(mine)]:
                 return named
             if free := [name for name in here if not any(Path(name).stem.startswith(other) for other in others)]:
@@ -95,7 +103,12 @@ class FolderSurvey:
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of ``ortho info FOLDER --json``."""
-        return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": json_value(self.found)}
+        files = [{name: value for name, value in vars(file).items() if name != "reach"} for file in self.found]
+        return {"schema_version": SCHEMA_VERSION, "folder": str(self.folder), "files": json_value(files)}
+
+
+def _fits(inner: tuple[float, float], outer: tuple[float, float]) -> bool:
+    return inner[0] <= outer[0] and inner[1] <= outer[1]
 
 
 def survey(folder: str | os.PathLike[str], options: SceneOptions = SceneOptions()) -> FolderSurvey:
@@ -192,6 +205,7 @@ def _image(path: Path, name: str, options: SceneOptions) -> SurveyedFile | None:
         "scene",
         f"{scene.width} x {scene.height}, {scene.sensor}, {models} of {_short(scene.model_source)}",
         tuple(scene.models),
+        (scene.width, scene.height),
     )
 
 
@@ -227,7 +241,9 @@ def _points(path: Path, name: str) -> SurveyedFile | None:
         counted(int(mask.sum()), f"{role} point")
         for role, mask in (("control", points.control), ("check", points.check))
     ]
-    return SurveyedFile(name, "points", ", ".join(roles))
+    pixels = points.image[np.isfinite(points.image).all(axis=1)]
+    column, row = np.median(pixels, axis=0).tolist() if len(pixels) else (0.0, 0.0)
+    return SurveyedFile(name, "points", ", ".join(roles), reach=(column, row))
 
 
 def _without_parts(files: list[SurveyedFile]) -> list[SurveyedFile]:
