@@ -20,7 +20,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.files import clear_up, confined
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import Location, VsiPath
-from ortho_pipeline.stores.objects import Objects
+from ortho_pipeline.stores.objects import Objects, stated_at
 from ortho_pipeline.surface.cells.copernicus import LIST
 from ortho_pipeline.surface.cells.sources import places_of
 
@@ -169,11 +169,7 @@ def far_states(request: Request, ledger: Ledger | None = None) -> tuple[FileStat
 
 def far_state(role: str, address: str, *, allow_network: bool) -> FileState:
     """Return size and tag of a file in object storage, or on a server; see `far_states`."""
-    folder, _, name = address.rpartition("/")
-    try:
-        size, tag = Objects(folder, allow_network=allow_network).stated(name)
-    except FileNotFoundError as error:
-        raise InputError("file not found", file=address, remedy="check the address") from error
+    size, tag = stated_at(address, allow_network=allow_network)
     return FileState(role=role, path=address, bytes=size, mtime_ns=0, sha256="", tag=tag)
 
 

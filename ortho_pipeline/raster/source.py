@@ -32,6 +32,7 @@ from ortho_pipeline.raster.opening.drivers import DRIVERS
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
 from ortho_pipeline.raster.pixel_types import check_types, nodata_of, numpy_type, read_type
 from ortho_pipeline.runtime.process_limits import require_memory
+from ortho_pipeline.stores.objects import stated_at
 
 gdal.UseExceptions()
 log = logging.getLogger(__name__)
@@ -135,12 +136,13 @@ def _opened(
     try:
         dataset, block = open_seen(place, roots, drivers, siblings)
     except (RuntimeError, UnicodeDecodeError) as error:
+        if Location(name).url.is_address:
+            stated_at(Location(name).url, allow_network=allow_network)  # its error says more than GDAL's
         # What GDAL quotes of a damaged file need not be UTF-8.
-        raise InputError(
-            f"GDAL cannot open this as a raster ({first_line(error)})",
-            file=name,
-            remedy="give a raster in an allowed format ('ortho doctor' lists them)",
-        ) from error
+        text, remedy = first_line(error), "give a raster in an allowed format ('ortho doctor' lists them)"
+        if text.startswith("Range downloading not supported"):
+            remedy = "download the file and give its path: this server sends no parts of files"
+        raise InputError(f"GDAL cannot open this as a raster ({text})", file=name, remedy=remedy) from error
     _check_size(dataset, name)
     log.info("%s: opened by %s", name, dataset.GetDriver().ShortName)
     return dataset, block

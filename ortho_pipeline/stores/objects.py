@@ -297,6 +297,23 @@ class Objects:
             ) from error
 
 
+def stated_at(address: str, *, allow_network: bool) -> tuple[int, str]:
+    """Return size and tag of a file in a store or on a web server, as `Objects.stated` does.
+
+    Raises
+    ------
+    InputError
+        If it is not there, or access is denied.
+    StorageError
+        If the store does not answer.
+    """
+    folder, _, name = address.rpartition("/")
+    try:
+        return Objects(folder, allow_network=allow_network).stated(name)
+    except FileNotFoundError as error:
+        raise InputError("file not found", file=address, remedy="check the address") from error
+
+
 class Conflict(StorageError):
     """Another version of an object is there than the one that was to be replaced."""
 

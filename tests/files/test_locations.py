@@ -15,12 +15,14 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 from osgeo import gdal
+from servers import serving
 
 from ortho_pipeline import commands
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import Location, VsiPath, located
 from ortho_pipeline.options import SceneOptions
+from ortho_pipeline.raster import source
 from ortho_pipeline.raster.source import open_dataset
 
 POINTS = ["--points-crs", "EPSG:4979", "--points-vertical", "ellipsoid"]
@@ -177,6 +179,25 @@ def test_what_is_not_there_is_said(tiny, served):
     done = run("fit", tiny.image, "--gcps", f"{url}/none.csv", *POINTS, "--allow-network")
     assert done.exit_code == 2
     assert "none.csv" in done.stderr
+
+
+@pytest.mark.parametrize(("status", "said"), [(404, "file not found"), (403, "the store denies access")])
+def test_why_an_image_behind_a_url_cannot_be_opened_is_said(tiny, status, said):
+    with serving(tiny.folder) as public:
+        public.faults["tiny.tif"] = lambda data, number: status
+        done = run("info", f"{public.address}/tiny.tif", "--allow-network")
+    assert done.exit_code == 2
+    assert said in done.stderr
+
+
+def test_a_server_that_sends_no_parts_of_files_has_a_remedy(tiny, monkeypatch):
+    def refused(*_: Any) -> Any:
+        raise RuntimeError("Range downloading not supported by this server!")
+
+    monkeypatch.setattr(source, "open_seen", refused)
+    with serving(tiny.folder) as public:
+        done = run("info", f"{public.address}/tiny.tif", "--allow-network")
+    assert "download the file and give its path" in done.stderr
 
 
 # -- archives --------------------------------------------------------------------------------------------------------
