@@ -6,6 +6,7 @@ GeoJSON knows no longitude beyond 180 degrees: what crosses the antimeridian is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from os import PathLike
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.raster.pixel_types import numpy_type
 from ortho_pipeline.raster.regridded import grid_of
 from ortho_pipeline.raster.source import open_pixels
 
@@ -25,6 +27,8 @@ _SIDE = 512
 _STEPS = 32
 #: Decimals of a degree: a centimetre.
 _DECIMALS = 7
+#: GDAL's number of the colour interpretation alpha (GCI_AlphaBand).
+_ALPHA = 6
 
 
 def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeometry:
@@ -34,7 +38,7 @@ def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeomet
     """
     dataset, grid = open_pixels(path)[0], grid_of(path)
     columns, rows = min(side, grid.width), min(side, grid.height)
-    mask = dataset.GetRasterBand(1).GetMaskBand().ReadAsArray(buf_xsize=columns, buf_ysize=rows) > 0
+    mask = sampled_mask([dataset.GetRasterBand(k + 1) for k in range(dataset.RasterCount)], columns, rows)
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     # In reading order beginnings and ends of the runs of a row belong together.
     (row, begin), (_, end) = np.nonzero(edges == 1), np.nonzero(edges == -1)
@@ -44,6 +48,19 @@ def valid_outline(path: str | PathLike[str], *, side: int = _SIDE) -> BaseGeomet
     outline = shapely.union_all(shapely.box(left, bottom, right, top))
     coarse = max(x_scale * grid.dx, y_scale * grid.dy)
     return shapely.make_valid(outline.simplify(coarse)) if columns * rows > 1 else outline
+
+
+def sampled_mask(bands: Sequence[Any], columns: int, rows: int) -> NDArray[np.bool_]:
+    """Return where some band, except alpha, has a value, in a sample ``(rows, columns)`` of a raster."""
+    sample, valid = {"buf_xsize": columns, "buf_ysize": rows}, np.zeros((rows, columns), dtype=bool)
+    for band in bands:
+        if band.GetColorInterpretation() != _ALPHA and not valid.all():
+            own = band.GetMaskBand().ReadAsArray(**sample) > 0
+            if numpy_type(band.DataType).kind == "f":
+                # No mask has NaN if there is no nodata value.
+                own &= ~np.isnan(band.ReadAsArray(**sample))
+            valid |= own
+    return valid
 
 
 def to_geojson(outline: BaseGeometry, crs: pyproj.CRS) -> tuple[dict[str, Any], list[float]]:

@@ -181,3 +181,16 @@ def test_cells_without_values_are_known(tmp_path):
     written.FlushCache()
     shares = filled_of(open_ortho(path, SceneOptions()), SceneOptions(), 4)
     np.testing.assert_allclose(shares, np.repeat([[1.0, 1.0, 0.0, 0.0]], 4, axis=0))
+
+
+def test_cells_of_nan_have_no_value_without_nodata(tmp_path):
+    """Of floating point; nor does an empty first band hide the values of the others."""
+    pixels = np.full((2, 64, 64), np.nan, dtype=np.float32)
+    pixels[1, :, :32] = 7
+    written = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "nan.tif"), 64, 64, 2, gdal.GDT_Float32)
+    written.SetProjection(pyproj.CRS("EPSG:32636").to_wkt())
+    written.SetGeoTransform((5e5, 1.0, 0.0, 4e6, 0.0, -1.0))
+    written.WriteArray(pixels)
+    del written
+    shares = filled_of(open_ortho(tmp_path / "nan.tif", SceneOptions()), SceneOptions(), 4)
+    np.testing.assert_allclose(shares, np.repeat([[1.0, 1.0, 0.0, 0.0]], 4, axis=0))

@@ -40,6 +40,23 @@ def test_the_outline_is_that_of_the_pixels(tmp_path: Path) -> None:
     assert valid_outline(raster(tmp_path / "c.tif", ~np.ones((3, 4), dtype=bool))).is_empty
 
 
+def test_the_outline_is_that_of_all_bands_except_alpha(tmp_path: Path) -> None:
+    """Of nodata, which marks each band by itself, and of alpha, which has a value everywhere."""
+    for name, kind, alpha in (("a.tif", gdal.GDT_Byte, False), ("b.tif", gdal.GDT_Float32, False), ("c.tif", 1, True)):
+        made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / name), 40, 30, 2, kind, ["ALPHA=YES"] * alpha)
+        made.SetProjection(pyproj.CRS("EPSG:32635").to_wkt())
+        made.SetGeoTransform((500_000, 10, 0, 4_000_000, 0, -20))
+        pixels = np.zeros((2, 30, 40))
+        pixels[1, :, :20] = 1
+        if kind == gdal.GDT_Float32:
+            pixels[pixels == 0] = np.nan
+        elif not alpha:
+            made.GetRasterBand(1).SetNoDataValue(0)
+        made.WriteArray(pixels.astype(np.float32 if kind == gdal.GDT_Float32 else np.uint8))
+        del made
+        assert valid_outline(tmp_path / name).bounds == (500_000, 3_999_400, 500_200, 4_000_000), name
+
+
 def test_a_large_raster_is_looked_at_in_few_pixels(tmp_path: Path) -> None:
     """In 10 x 8 of them: each stands for 4 x 4 pixels."""
     valid = np.zeros((32, 40), dtype=bool)

@@ -20,6 +20,7 @@ from ortho_pipeline.models import MapGrid
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.options import SceneOptions
 from ortho_pipeline.raster.source import RasterSource
+from ortho_pipeline.raster.valid_area import sampled_mask
 
 #: Name of the "sensor" of a finished ortho.
 ORTHO = "ortho"
@@ -28,21 +29,15 @@ _LEVELS = ("productLevel", "PROCESSING_LEVEL", "Processing Level", "productType"
 #: Where metadata state the time of acquisition: domain and item.
 _ACQUIRED = (("IMAGERY", "ACQUISITIONDATETIME"), ("", "PRODUCT_START_TIME"), ("", "DATE_ACQUIRED"))
 _RAW = ("LV1", "LV2", "SENSOR", "PRIMARY", "BASIC", "STANDARD GEOMETRICALLY", "L1A", "L1B", "1A", "1B")
-#: GDAL's flags of a band whose pixels are all valid (GMF_ALL_VALID).
-_ALL_VALID = 1
 
 
 def filled_of(scene: Scene, options: SceneOptions, cells: int) -> Array:
     """Return the shares ``(cells, cells)`` of pixels that have a value, in cells along rows and columns.
 
-    They come from a sample of 8 x 8 pixels of each cell, of the first band.
+    They come from a sample of 8 x 8 pixels of each cell.
     """
     source, side = RasterSource(scene.path, **options.access), 8 * cells  # a band needs its dataset
-    band = source.bands[0]
-    if band.GetMaskFlags() == _ALL_VALID:
-        return np.ones((cells, cells))
-    valid = band.GetMaskBand().ReadAsArray(buf_xsize=side, buf_ysize=side) > 0
-    return np.asarray(valid.reshape(cells, 8, cells, 8).mean(axis=(1, 3)))
+    return np.asarray(sampled_mask(source.bands, side, side).reshape(cells, 8, cells, 8).mean(axis=(1, 3)))
 
 
 def open_ortho(image: str | os.PathLike[str] | Scene, options: SceneOptions, *, only: bool = True) -> Scene:
