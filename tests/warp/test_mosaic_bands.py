@@ -14,7 +14,7 @@ from osgeo import gdal
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, RasterWriter
 from ortho_pipeline.raster.source import Grid
-from ortho_pipeline.warp.mosaic import Ortho, balanced, lay_out, overlaps, owners_of, write_cog
+from ortho_pipeline.warp.mosaic import Ortho, balanced, lay_out, overlaps, owners_of, write_cog, write_vrt
 
 UTM = pyproj.CRS("EPSG:32636")
 #: Three bands of a ground on which two orthos lie, the second 40 px right of the first.
@@ -70,6 +70,30 @@ def test_a_band_without_a_value_costs_the_other_bands_nothing(tmp_path, way, kin
         np.testing.assert_array_equal(values[known], truth[known])
     else:
         assert ((values == seen[0]) | (values == seen[1]))[known].all()
+
+
+@pytest.mark.parametrize("write_mosaic", [write_cog, write_vrt])
+def test_the_mosaic_keeps_names_and_units_and_fills_nan(tmp_path, write_mosaic):
+    """Of orthos of floating point without nodata: the first has NaN in columns that the second has, too."""
+    orthos = []
+    for name, left in LEFT.items():
+        pixels = GROUND[:, :, left : left + 80].astype(np.float32)
+        if name == "a":
+            pixels[:, :, 50:60] = np.nan
+        made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / f"{name}.tif"), 80, 60, 3, gdal.GDT_Float32)
+        made.SetProjection(UTM.to_wkt())
+        made.SetGeoTransform((5e5 + 2.0 * left, 2.0, 0.0, 4e6, 0.0, -2.0))
+        made.WriteArray(pixels)
+        made.GetRasterBand(2).SetDescription("nir")
+        made.GetRasterBand(2).SetUnitType("dB")
+        del made
+        orthos.append(Ortho(name, tmp_path / f"{name}.tif"))
+    path = tmp_path / f"m{'.vrt' if write_mosaic is write_vrt else '.tif'}"
+    write_mosaic(lay_out(orthos, "first-on-top"), path)
+    np.testing.assert_array_equal(read(path)[0], GROUND)
+    mosaic = gdal.Open(str(path))
+    bands = [mosaic.GetRasterBand(number) for number in (1, 2)]
+    assert [(band.GetDescription(), band.GetUnitType()) for band in bands] == [("", ""), ("nir", "dB")]
 
 
 # -- bands that tell nothing -----------------------------------------------------------------------------------------

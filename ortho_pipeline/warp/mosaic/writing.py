@@ -12,7 +12,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.raster.ortho import Profile, RasterWriter, as_written, keep_off_nodata, value_range
-from ortho_pipeline.raster.source import MEMORY
+from ortho_pipeline.raster.source import MEMORY, RasterSource
 from ortho_pipeline.raster.verified_writing import raster_output, written
 from ortho_pipeline.warp.mosaic.balance import Balance
 from ortho_pipeline.warp.mosaic.layout import Mosaic, box_of, circular_errors, intersection, windows
@@ -36,6 +36,9 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
             "a VRT cannot choose between orthos pixel by pixel", file=path, field="mosaic.format", remedy="write a COG"
         )
     names = [str(layer.ortho.path) for layer in reversed(placed.layers)]
+    source = RasterSource(placed.layers[0].ortho.path)
+    # GDAL takes NaN for a value unless it is the nodata value.
+    empty = {"srcNodata": "nan"} if source.validity == "all" and source.dtype.kind == "f" else {}
     with raster_output(path) as temporary:
         vrt = gdal.BuildVRT(
             str(temporary),
@@ -44,8 +47,12 @@ def write_vrt(placed: Mosaic, path: Path) -> None:
             xRes=placed.grid.dx,
             yRes=placed.grid.dy,
             resolution="user",
+            **empty,
         )
         with written(vrt) as dataset:
+            for number, band in enumerate(source.bands, 1):
+                dataset.GetRasterBand(number).SetDescription(band.GetDescription())
+                dataset.GetRasterBand(number).SetUnitType(band.GetUnitType())
             size = dataset.RasterXSize, dataset.RasterYSize
             listed = {Path(name).resolve() for name in dataset.GetFileList()}
         missing = [layer.ortho.name for layer in placed.layers if layer.ortho.path.resolve() not in listed]
