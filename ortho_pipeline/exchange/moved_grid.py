@@ -35,7 +35,8 @@ def write_moved(dataset: Any, geotransform: tuple[float, ...], path: str | os.Pa
     Parameters
     ----------
     path : path
-        A ``.vrt``, which names the ortho relative to itself; or a ``.tif``, a copy of a GeoTIFF byte for byte.
+        A ``.vrt``, which names the ortho relative to itself; or a ``.tif``, a copy of a GeoTIFF byte for byte. What
+        GDAL reads from side-cars, such as a mask, is in the file of the copy; its pixels are then compressed anew.
 
     Raises
     ------
@@ -57,10 +58,14 @@ def write_moved(dataset: Any, geotransform: tuple[float, ...], path: str | os.Pa
             remedy="write a VRT",
         )
     with raster_output(path) as temporary:
-        shutil.copyfile(source, temporary)
-        made = gdal.OpenEx(
-            os.fspath(temporary), gdal.OF_RASTER | gdal.OF_UPDATE,
-            allowed_drivers=["GTiff"], open_options=["IGNORE_COG_LAYOUT_BREAK=YES"],
-        )  # fmt: skip
+        if all(name.endswith(".ovr") for name in dataset.GetFileList()[1:]):
+            shutil.copyfile(source, temporary)
+            made = gdal.OpenEx(
+                os.fspath(temporary), gdal.OF_RASTER | gdal.OF_UPDATE,
+                allowed_drivers=["GTiff"], open_options=["IGNORE_COG_LAYOUT_BREAK=YES"],
+            )  # fmt: skip
+        else:
+            options = ["TILED=YES", "COMPRESS=DEFLATE", "BIGTIFF=IF_SAFER"]
+            made = gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), dataset, options=options)
         with written(made) as copy:
             copy.SetGeoTransform(geotransform)

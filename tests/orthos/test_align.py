@@ -14,7 +14,8 @@ from pairs import BENT, SHIFTED, Pair
 
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.exchange.model_file import read_model_file
-from ortho_pipeline.exchange.moved_grid import moved_geotransform
+from ortho_pipeline.exchange.moved_grid import moved_geotransform, write_moved
+from ortho_pipeline.geodesy.crs import parse_crs
 
 gdal.UseExceptions()
 
@@ -130,6 +131,31 @@ def test_without_resampling_no_pixel_is_touched(shifted, tmp_path, form):
     np.testing.assert_allclose(moved, SHIFTED.shift, atol=0.03)
     assert document["relative"]["bias_px"]["value"] < 0.03
     assert not document["resampled"]
+
+
+def test_a_moved_copy_keeps_what_is_in_side_cars(tmp_path):
+    """Its mask, its CRS and its place; the pixels are those of the original."""
+    pixels = np.arange(2400, dtype=np.uint16).reshape(40, 60)
+    made = gdal.GetDriverByName("GTiff").Create(
+        str(tmp_path / "a.tif"), 60, 40, 1, gdal.GDT_UInt16, ["PROFILE=BASELINE"]
+    )
+    made.SetGeoTransform((5e5, 2.0, 0.0, 4e6, 0.0, -2.0))
+    made.SetProjection(parse_crs("EPSG:32636").to_wkt())
+    made.WriteArray(pixels)
+    made.GetRasterBand(1).SetDescription("nir")
+    made.CreateMaskBand(gdal.GMF_PER_DATASET)
+    made.GetRasterBand(1).GetMaskBand().WriteArray(np.where(pixels % 60 < 30, 255, 0).astype(np.uint8))
+    del made
+    assert {path.name for path in tmp_path.iterdir()} == {"a.tif", "a.tif.aux.xml", "a.tif.msk"}
+    write_moved(gdal.Open(str(tmp_path / "a.tif")), (5e5 + 7, 2.0, 0.0, 4e6, 0.0, -2.0), tmp_path / "b.tif")
+    assert not [path.name for path in tmp_path.iterdir() if path.name.startswith("b.tif.")]
+    copy = gdal.Open(str(tmp_path / "b.tif"))
+    band = copy.GetRasterBand(1)
+    np.testing.assert_array_equal(band.ReadAsArray(), pixels)
+    np.testing.assert_array_equal(band.GetMaskBand().ReadAsArray() > 0, pixels % 60 < 30)
+    assert copy.GetGeoTransform()[0] == 5e5 + 7
+    assert parse_crs(copy.GetProjection()) == parse_crs("EPSG:32636")
+    assert band.GetDescription() == "nir"
 
 
 def test_a_geotransform_is_moved_along_its_own_axes():
