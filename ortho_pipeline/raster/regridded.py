@@ -145,16 +145,29 @@ class Regridded:
             raise InputError(
                 f"GDAL cannot resample this ortho ({first_line(error)})", file=self.path, remedy="make it again"
             ) from error
-        pixels = stack[:-1]
-        valid = np.broadcast_to(stack[-1] >= _ENOUGH, pixels.shape)
+        # GDAL resamples an alpha band of the ortho into its own.
+        pixels = stack[: self._source.count]
+        valid = np.repeat(stack[-1:] >= _ENOUGH, len(pixels), axis=0)
+        # Alpha is that of all bands together; a band of its own lacks what is empty in it.
+        for band, value in enumerate(self._empty):
+            valid[band] &= pixels[band] != pixels.dtype.type(value)
         return pixels, valid & ~np.isnan(pixels) if pixels.dtype.kind == "f" else valid
+
+    @property
+    def _empty(self) -> tuple[float, ...]:
+        """The nodata value of each band; NaN if floating point has no other mark, none if all bands share a mask."""
+        source = self._source
+        values = tuple(value for value in source.nodata if value is not None)
+        if not values and source.validity == "all" and source.dtype.kind == "f":
+            return (math.nan,) * source.count
+        return values if len(values) == source.count else ()
 
     @property
     def _warped(self) -> gdal.Dataset:
         """The ortho on the grid, with alpha as its last band; of the calling thread."""
         if not hasattr(self._local, "warped"):
             # The kernels of each block as wide as at the middle: GDAL would take what it finds in the block.
-            scales = self._scales()
+            scales, nodata = self._scales(), " ".join(map(repr, self._empty)) or None
             self._local.warped = gdal.Warp(
                 "",
                 self._source.dataset,
@@ -166,9 +179,11 @@ class Regridded:
                 height=self._grid.height,
                 resampleAlg=self._resampling,
                 errorThreshold=0.0,
+                srcNodata=nodata,
+                dstNodata=nodata,
                 dstAlpha=True,
                 warpMemoryLimit=self._memory // 8,
-                warpOptions=[f"XSCALE={scales[0]!r}", f"YSCALE={scales[1]!r}"],
+                warpOptions=[f"XSCALE={scales[0]!r}", f"YSCALE={scales[1]!r}", "UNIFIED_SRC_NODATA=PARTIAL"],
             )
         return self._local.warped
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,42 @@ def test_pixels_of_another_grid_have_the_coordinates_of_their_middle(ortho: Path
     assert valid.all()
     there = pyproj.Transformer.from_crs(grid.crs, GRID.crs, always_xy=True).transform(*middles(grid))
     np.testing.assert_allclose(pixels, np.stack(there), rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("resampling", ["near", "bilinear", "average"])
+@pytest.mark.parametrize("nodata", [0.0, -9999.0, math.nan, None])
+def test_a_band_without_a_value_has_none_on_another_grid(tmp_path: Path, nodata: float | None, resampling: str) -> None:
+    """The first band lacks a square that the second has; without nodata, NaN is no value either."""
+    pixels = np.stack([np.full((40, 60), 100.0), np.full((40, 60), 200.0)])
+    pixels[0, 10:20, 10:30] = math.nan if nodata is None else nodata
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 60, 40, 2, gdal.GDT_Float32)
+    made.SetProjection(GRID.crs.to_wkt())
+    made.SetGeoTransform(GRID.geotransform)
+    if nodata is not None:
+        made.GetRasterBand(1).SetNoDataValue(nodata)
+    made.WriteArray(pixels.astype(np.float32))
+    del made
+    off = Grid(GRID.crs, 500_003.0, 3_999_992.0, 10.0, 20.0, 50, 35)
+    values, valid = Regridded(tmp_path / "a.tif", off, resampling=resampling).read(0, 0, 50, 35)
+    assert valid[1].all()
+    assert not valid[0, 10:19, 10:29].any()
+    assert valid[0].sum() >= 50 * 35 - 11 * 21
+    assert set(values[0][valid[0]]) == {100.0}
+    assert set(values[1][valid[1]]) == {200.0}
+
+
+def test_alpha_of_another_grid_stays_the_last_band(tmp_path: Path) -> None:
+    made = gdal.GetDriverByName("GTiff").Create(str(tmp_path / "a.tif"), 60, 40, 4, gdal.GDT_Byte, ["ALPHA=YES"])
+    made.SetProjection(GRID.crs.to_wkt())
+    made.SetGeoTransform(GRID.geotransform)
+    pixels = np.repeat(np.array([10, 20, 30, 255], dtype=np.uint8), 2400).reshape(4, 40, 60)
+    pixels[3, :, 30:] = 0
+    made.WriteArray(pixels)
+    del made
+    off = Grid(GRID.crs, 500_003.0, 3_999_992.0, 10.0, 20.0, 50, 35)
+    values, valid = Regridded(tmp_path / "a.tif", off).read(0, 0, 50, 35)
+    np.testing.assert_array_equal(values[:, 5, 5], [10, 20, 30, 255])
+    np.testing.assert_array_equal(valid, np.broadcast_to(np.arange(50) < 30, valid.shape))
 
 
 def test_coarser_pixels_are_means_of_what_they_cover(ortho: Path) -> None:
