@@ -102,11 +102,31 @@ class Profile:
         kinds = self.interpretations or [gdal.GCI_Undefined] * self.count
         return [band for band, kind in enumerate(kinds) if kind != gdal.GCI_AlphaBand]
 
+    def unlike(self, other: Profile, name: str, others: str) -> str:
+        """Return how equal pixels of this ortho and another one differ in value or colour; empty if they do not."""
+        what = ""
+        for band, (one, two) in enumerate(zip(self.scales, other.scales, strict=True), 1):
+            if one[:2] != two[:2]:
+                what = (
+                    f"band {band} of {others} has scale {two[0]:g} and offset {two[1]:g}, but that of {name} has "
+                    f"{one[0]:g} and {one[1]:g}"
+                )
+        if not _same_colours(self.color_table, other.color_table):
+            what = f"{others} and {name} have different colour tables"
+        return what
+
     def mask_of(self, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which pixels ``(h, w)`` are valid, of what is valid in each band ``(bands, h, w)``."""
         # NaN says for itself which band has no value; an integer cannot, so there a pixel needs all of its bands.
         any_band = self.validity == "nodata" or self.dtype.kind == "f"
         return valid[0] if len(valid) == 1 else np.asarray((np.any if any_band else np.all)(valid, axis=0))
+
+
+def _same_colours(one: Any, other: Any) -> bool:
+    """Return whether two of GDAL's colour tables (None without) agree in the colours that both have."""
+    if one is None or other is None:
+        return one is other
+    return all(one.GetColorEntry(k) == other.GetColorEntry(k) for k in range(min(one.GetCount(), other.GetCount())))
 
 
 def _palette(band: gdal.Band) -> gdal.ColorTable | None:

@@ -11,6 +11,7 @@ import math
 import os
 import threading
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,7 @@ class Regridded:
         return self._source.block
 
     def require(self, profile: Profile) -> None:
-        """Raise an `InputError` unless it has the bands and the type of an ortho of this profile."""
+        """Raise an `InputError` unless its pixels are as those of an ortho of this profile: bands, type and meaning."""
         own = f"{counted(self._source.count, 'band')} of {self._source.dtype}"
         needed = f"{counted(profile.count, 'band')} of {profile.dtype}"
         if own != needed:
@@ -112,6 +113,10 @@ class Regridded:
                     ")",
                 ),
             )
+
+        what = profile.unlike(Profile.of(self._source), "the image", Path(self.path).name)
+        if what:
+            raise InputError(what, file=self.path, remedy="give an ortho of the same kind of product")
 
     def read(self, left: int, top: int, width: int, height: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return pixels and which are valid ``(bands, height, width)`` of a window of the grid."""

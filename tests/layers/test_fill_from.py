@@ -195,10 +195,14 @@ def test_an_ortho_that_cannot_fill_is_refused_before_the_first_pixel(tiny, steep
     grid = Grid(crs, *_corner(place), 10.0, 10.0, 50, 50)
     bands = other_ortho(tmp_path / "bands.tif", grid, dtype=dtype, count=2)
     kind = other_ortho(tmp_path / "kind.tif", grid, dtype="float32")
+    scaled = other_ortho(tmp_path / "scaled.tif", grid, dtype=dtype)
+    dataset = gdal.Open(str(scaled), gdal.GA_Update)
+    dataset.GetRasterBand(1).SetScale(0.5)
+    dataset.FlushCache()
     bare = tmp_path / "bare.tif"
     gdal.GetDriverByName("GTiff").Create(str(bare), 20, 20, 1, gdal.GDT_Byte).FlushCache()
-    for path, words in ((elsewhere, "does not overlap the scene"), (bands, "2 bands"), (kind, "float32"), (bare, "CRS"),
-                        (tmp_path / "none.tif", "no such file")):  # fmt: skip
+    for path, words in ((elsewhere, "does not overlap the scene"), (bands, "2 bands"), (kind, "float32"),
+                        (scaled, "scale 0.5"), (bare, "CRS"), (tmp_path / "none.tif", "no such file")):  # fmt: skip
         with pytest.raises(InputError, match=words) as caught:
             commands.check(tiny.image, **common, output=dataclasses.replace(output, fill_from=path))
         assert caught.value.file == str(path)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,26 +194,10 @@ def _check_bands(orthos: Sequence[Ortho]) -> None:
 
 def _check_meaning(orthos: Sequence[Ortho], profiles: Sequence[Profile]) -> None:
     """Raise an `InputError` if equal pixels of two orthos mean different values or colours."""
-    first, name = profiles[0], orthos[0].path.name
     for ortho, profile in zip(orthos, profiles, strict=True):
-        what = ""
-        for band, (one, other) in enumerate(zip(first.scales, profile.scales, strict=True), 1):
-            if one[:2] != other[:2]:
-                what = (
-                    f"band {band} of {ortho.path.name} has scale {other[0]:g} and offset {other[1]:g}, but that of "
-                    f"{name} has {one[0]:g} and {one[1]:g}"
-                )
-        if not _same_colours(first.color_table, profile.color_table):
-            what = f"{ortho.path.name} and {name} have different colour tables"
+        what = profiles[0].unlike(profile, orthos[0].path.name, ortho.path.name)
         if what:
             raise InputError(what, file=ortho.path, field="orthos", remedy="combine only orthos of one kind")
-
-
-def _same_colours(one: Any, other: Any) -> bool:
-    """Return whether two of GDAL's colour tables (None without) agree in the colours that both have."""
-    if one is None or other is None:
-        return one is other
-    return all(one.GetColorEntry(k) == other.GetColorEntry(k) for k in range(min(one.GetCount(), other.GetCount())))
 
 
 # -- windows ---------------------------------------------------------------------------------------------------------
