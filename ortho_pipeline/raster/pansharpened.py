@@ -223,6 +223,8 @@ class Pansharpened:
             dstNodata=_EMPTY,
             errorThreshold=0.0,
             warpMemoryLimit=self._memory,
+            # A pixel that one band lacks is empty; GDAL would require that of all bands where it is told of NaN.
+            warpOptions=["UNIFIED_SRC_NODATA=PARTIAL"],
             **more,
         )
 

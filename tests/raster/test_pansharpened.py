@@ -127,6 +127,16 @@ def test_pixels_without_a_value_have_that_of_the_product(tmp_path: Path) -> None
     np.testing.assert_allclose(pixels[:, valid], 500.0)
 
 
+def test_nan_in_one_band_is_no_value_without_nodata(tmp_path: Path) -> None:
+    sharp, wide = np.full((1, 64, 64), 500, np.uint16), np.full((2, 16, 16), 400, np.float32)
+    wide[1, 5:9, 6:10] = np.nan
+    pan = write(tmp_path / "p.tif", place(0, 0, 64, 64), sharp)
+    pixels, valid = opened(pan, write(tmp_path / "m.tif", place(0, 0, 16, 16, RATIO), wide)).read(0, 0, 64, 64)
+    assert not valid[24:32, 28:36].any()
+    assert valid.mean() > 0.9
+    np.testing.assert_allclose(pixels[:, valid], 500.0)
+
+
 @pytest.mark.parametrize(
     ("dx", "dy", "ratio"),
     # The size of a pixel times 40 columns or 50 rows, in panchromatic pixels: up to a thousandth is rounding.
