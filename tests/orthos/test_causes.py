@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import types
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from osgeo import gdal
 from pairs import CORNER, Array, Look, Pair
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from ortho_pipeline.commands.orthos.dependence import steps_of
 from ortho_pipeline.commands.orthos.verifying import verify
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import parse_crs
@@ -88,6 +90,21 @@ def written(heights: Array, gsd: float, path: Path) -> Path:
     made.SetGeoTransform((CORNER[0], POST * gsd, 0.0, CORNER[1], 0.0, -POST * gsd))
     made.GetRasterBand(1).WriteArray(heights)
     return path
+
+
+@pytest.mark.parametrize(("lines", "jump"), [(10, 0.0), (30, 0.0), (30, 1.0)])
+def test_a_step_needs_two_lines_of_matches_on_each_side(lines, jump):
+    """Of a displacement that is the same everywhere, or jumps at row 200; few lines stay without a step."""
+    places = np.linspace(10.0, 390.0, lines)
+    image = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    noise = np.random.default_rng(3).normal(0.0, 0.005, image.shape)
+    displacement = noise + (5.3, -3.1) + jump * (image[:, 1:] > 200)
+    measured = types.SimpleNamespace(image=image, displacement=displacement, pixel=2.0)
+    found = steps_of(measured, None)
+    assert len(found) == (jump > 0)
+    for step in found:
+        assert (step.axis, round(step.east, 1), round(step.north, 1)) == ("row", jump, jump)
+        assert step.at == pytest.approx(200, abs=20)
 
 
 @pytest.mark.parametrize(

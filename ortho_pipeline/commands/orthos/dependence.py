@@ -158,6 +158,9 @@ def _steps(measured: MeasuredOrtho, axis: int, name: str) -> list[FieldStep]:
         off = (along[near] - at) / window
         other = (across[near] - across[near].mean()) / max(np.ptp(across[near]), 1.0)
         design = np.column_stack([beyond, np.ones(len(off)), off, other, other**2, off * beyond])
+        # With a single line of matches on a side, a slope may be taken for a step.
+        if np.linalg.matrix_rank(design) < design.shape[1]:
+            continue
         inverse = np.linalg.pinv(design)
         size = inverse[0] @ values[near]
         left = values[near] - design @ (inverse @ values[near])
