@@ -262,7 +262,7 @@ def _fit_robust(kind: str, reference: Array, moving: Array, name: str) -> tuple[
                 f"of {counted(len(used), 'tie point')} of the band {name}, only {int(used.sum())} agree, too few for a "
                 "transformation",
                 field=name,
-                remedy="check that the bands are of one scene, or use larger patches",
+                remedy="check that the bands are of one scene, and at least 500 pixels wide and high",
             )
         transform = Transform.fit(kind, reference[used], moving[used])
         miss = np.hypot(*(moving - transform(reference)).T)

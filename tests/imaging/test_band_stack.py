@@ -9,8 +9,9 @@ import pytest
 from osgeo import gdal
 from scipy.ndimage import gaussian_filter
 
-from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors import InputError, TooFewPoints
 from ortho_pipeline.imaging.band_stack import stack_bands
+from ortho_pipeline.imaging.registration import register
 
 gdal.UseExceptions()
 #: How far (columns, rows) the second band shows the ground displaced.
@@ -53,3 +54,10 @@ def test_types_that_the_stack_cannot_hold_are_refused(tmp_path, kind):
     with pytest.raises(InputError, match="unsigned integers of 8 or 16 bits"):
         stack_bands(bands(tmp_path, kind, None), tmp_path / "stack.tif")
     assert not (tmp_path / "stack.tif").exists()
+
+
+def test_images_too_small_for_tie_points_are_told_so():
+    pixels = gaussian_filter(np.random.default_rng(1).uniform(0, 100, (250, 250)), 2)
+    with pytest.raises(TooFewPoints) as caught:
+        register([pixels, pixels], ["red", "nir"])
+    assert "at least 500 pixels" in caught.value.remedy
