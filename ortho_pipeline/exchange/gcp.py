@@ -12,7 +12,7 @@ from osgeo import gdal, osr
 
 from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.exchange.rpc import name_sources_relatively
+from ortho_pipeline.exchange.rpc import name_sources_relatively, without_georeference
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
@@ -83,7 +83,7 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
     """
     path = Path(path)
     points = [gdal.GCP(x, y, h, column, row, "", str(k + 1)) for k, (column, row, x, y, h) in enumerate(gcps.tolist())]
-    view = _without_georeferencing(dataset)
+    view = without_georeference(dataset)
     view.SetGCPs(points, _wgs84().ExportToWkt())
     with raster_output(path) as temporary:
         if path.suffix.lower() == ".vrt":
@@ -98,15 +98,6 @@ def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> 
         other = copy.GetMetadata("RPC") or copy.GetGeoTransform(can_return_null=True)
         if again.shape != gcps.shape or np.abs(again - gcps).max() > 1e-4 or other:
             raise ModelError("the written control points differ when they are read again", file=path)
-
-
-def _without_georeferencing(dataset: gdal.Dataset) -> gdal.Dataset:
-    """Return a view of an image without RPC, points and geotransform, which programs would prefer to ours."""
-    # A geotransform cannot be removed; with points, Translate does not copy it.
-    view = gdal.Translate("", dataset, format="VRT", GCPs=[gdal.GCP()])
-    view.SetGCPs([], "")
-    view.SetMetadata({}, "RPC")
-    return view
 
 
 def _wgs84() -> osr.SpatialReference:
@@ -160,7 +151,7 @@ def write_geolocation(
         with written(created) as raster:
             for k in (0, 1):
                 raster.GetRasterBand(k + 1).WriteArray(np.ascontiguousarray(lonlat[:, :, k]))
-    view = _without_georeferencing(dataset)
+    view = without_georeference(dataset)
     view.SetMetadata(
         {
             "X_DATASET": str(arrays),

@@ -45,6 +45,7 @@ __all__ = [
     "read_rpc",
     "rpc_metadata",
     "rpc_of_dataset",
+    "without_georeference",
     "write_bare_vrt",
     "write_rpb",
     "write_rpc_txt",
@@ -300,7 +301,8 @@ def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> No
 def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
     """Write a VRT of `dataset` with `rpc`, for any GDAL program.
 
-    It has no GCPs, because GDAL prefers them to an RPC. The path of its source is relative to the VRT.
+    It has no GCPs and no geotransform, because GDAL prefers them to an RPC. The path of its source is relative to the
+    VRT.
 
     Raises
     ------
@@ -310,9 +312,9 @@ def write_vrt(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> Non
         If the RPC differs when it is read again.
     """
     with raster_output(path) as temporary:
-        with written(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), dataset)) as copy:
-            copy.SetGCPs([], "")
-            copy.SetMetadata(rpc_metadata(rpc), "RPC")
+        view = without_georeference(dataset)
+        view.SetMetadata(rpc_metadata(rpc), "RPC")
+        close(gdal.GetDriverByName("VRT").CreateCopy(os.fspath(temporary), view))
         name_sources_relatively(temporary, Path(path))
         _check_written(gdal.OpenEx(os.fspath(temporary), gdal.OF_RASTER, allowed_drivers=["VRT"]), rpc, path)
 
@@ -340,6 +342,18 @@ def write_bare_vrt(dataset: gdal.Dataset, path: str | PathLike[str]) -> None:
         temporary.write_bytes(ElementTree.tostring(root))
 
 
+def without_georeference(dataset: gdal.Dataset) -> gdal.Dataset:
+    """Return a view of an image without RPC, points and geotransform, which programs would prefer to ours."""
+    # A geotransform cannot be removed; with points, Translate does not copy it.
+    view = gdal.Translate("", dataset, format="VRT", GCPs=[gdal.GCP()])
+    view.SetGCPs([], "")
+    view.SetMetadata({}, "RPC")
+    # The place of a photo, which its sensor would prefer. And what Translate leaves out.
+    view.SetMetadata([], "xml:XMP")
+    view.SetMetadata(dataset.GetMetadata("IMD") or {}, "IMD")
+    return view
+
+
 def name_sources_relatively(vrt: Path, final: Path) -> None:
     """Make the source paths of a VRT relative to `final`, its final path."""
     from defusedxml import ElementTree
@@ -356,8 +370,8 @@ def name_sources_relatively(vrt: Path, final: Path) -> None:
 def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -> None:
     """Write a lossless GeoTIFF copy of `dataset` with `rpc` in its TIFF tag.
 
-    It keeps bands, nodata, mask, palette and colour interpretation. It has no GCPs, because GDAL prefers them to an
-    RPC.
+    It keeps bands, nodata, mask, palette and colour interpretation. It has no GCPs and no geotransform, because GDAL
+    prefers them to an RPC.
 
     Raises
     ------
@@ -370,8 +384,7 @@ def write_tagged_copy(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]
     if stale:
         raise InputError("this RPC file would override the tag of the copy", file=stale[0], remedy="remove it")
     with raster_output(path) as temporary:
-        view = gdal.GetDriverByName("VRT").CreateCopy("", dataset)
-        view.SetGCPs([], "")
+        view = without_georeference(dataset)
         view.SetMetadata(rpc_metadata(rpc), "RPC")
         options = ["COMPRESS=DEFLATE", "TILED=YES", "BIGTIFF=IF_SAFER"]
         close(gdal.GetDriverByName("GTiff").CreateCopy(os.fspath(temporary), view, options=options))
@@ -389,7 +402,7 @@ def _check_written(dataset: gdal.Dataset, rpc: RPC, path: str | PathLike[str]) -
     written = rpc_of_fields(dataset.GetMetadata("RPC") or {}, path)
     ground = box_grid(*domain_box(rpc), (5, 5, 3))
     worst = np.nanmax(np.abs(written.ground_to_image(ground) - rpc.ground_to_image(ground)))
-    if not worst < 1e-6 or dataset.GetGCPCount():
+    if not worst < 1e-6 or dataset.GetGCPCount() or dataset.GetGeoTransform(can_return_null=True):
         raise ModelError(f"the written RPC is off by {worst:g} px when it is read again", file=path)
 
 

@@ -320,7 +320,7 @@ def test_every_format_from_the_command_line(tiny, tmp_path):
     assert document["exact"] is True
 
 
-@pytest.mark.parametrize("name", ["gcp", "gcp-tag", "geolocation"])
+@pytest.mark.parametrize("name", ["vrt", "tag", "gcp", "gcp-tag", "geolocation"])
 def test_what_stands_for_the_model_is_not_beside_a_geotransform(tiny, tmp_path, name):
     # A product on a plane looks like a map: gdalwarp would take its geotransform, and so would a GeoTIFF.
     gdal.Open(str(tiny.image), gdal.GA_Update).SetGeoTransform((500000.0, 1.0, 0.0, 6000000.0, 0.0, -1.0))
@@ -328,8 +328,20 @@ def test_what_stands_for_the_model_is_not_beside_a_geotransform(tiny, tmp_path, 
     path = commands.export(tiny.image, tmp_path / "out", formats=[name], surface=surface).files[name]
     dataset = gdal.Open(str(path))
     assert dataset.GetGeoTransform(can_return_null=True) is None
-    assert bool(dataset.GetGCPs()) == (name != "geolocation")
+    assert bool(dataset.GetGCPs()) == (name in ("gcp", "gcp-tag"))
     np.testing.assert_array_equal(dataset.ReadAsArray(), gdal.Open(str(tiny.image)).ReadAsArray())
+
+
+def test_an_export_keeps_dates_and_no_position_of_a_photo(tiny, tmp_path):
+    xmp = ['<x:xmpmeta xmlns:x="adobe:ns:meta/"/>']
+    image = gdal.Open(str(tiny.image), gdal.GA_Update)
+    image.SetMetadata(xmp, "xml:XMP")
+    image.SetMetadata({"firstLineTime": "2024-05-01T10:00:00Z"}, "IMD")
+    image = None
+    path = commands.export(tiny.image, tmp_path / "out", formats=["vrt"]).files["vrt"]
+    dataset = gdal.Open(str(path))
+    assert not dataset.GetMetadata("xml:XMP")
+    assert dataset.GetMetadata("IMD") == {"firstLineTime": "2024-05-01T10:00:00Z"}
 
 
 def test_an_unknown_format_is_refused(tiny, tmp_path):
