@@ -36,7 +36,7 @@ Gcps = Array
 def gcps_of_points(points: Points) -> Gcps:
     """Return measured points ``(N, 5)``: column, row, longitude, latitude, ellipsoidal height."""
     control = points.to_crs("EPSG:4979")
-    return np.column_stack([control.image, np.nan_to_num(control.ground, nan=0.0)])
+    return np.column_stack([control.image, np.nan_to_num(_unwrapped(control.ground), nan=0.0)])
 
 
 def gcps_of_model(
@@ -66,7 +66,14 @@ def _lonlat(model: SensorModel, image: Array, surface: Surface | None) -> Array:
         ground = model.image_to_ground(image, model.reference_height)
     else:
         ground = meet_surface(model, image, surface)
-    return ground_transform(model.crs, "EPSG:4979")(ground)
+    return _unwrapped(ground_transform(model.crs, "EPSG:4979")(ground))
+
+
+def _unwrapped(ground: Array) -> Array:
+    """Return ground without a jump of longitude at 180 degrees: all are within half a turn of the first finite one."""
+    lon = ground[:, 0]
+    first = lon[np.isfinite(lon)][:1].sum()
+    return np.column_stack([first + np.remainder(lon - first + 180.0, 360.0) - 180.0, ground[:, 1:]])
 
 
 def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> None:

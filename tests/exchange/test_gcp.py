@@ -24,6 +24,15 @@ def test_measured_points_are_longitude_latitude_and_height() -> None:
     np.testing.assert_allclose(found, np.column_stack([[1.5, 3], [2.5, 4], lon, lat, [120, 0]]), rtol=1e-12)
 
 
+def test_longitudes_do_not_jump_at_the_antimeridian() -> None:
+    """A polynomial through 179.99 and -179.99 degrees would go around the Earth."""
+    image = np.random.default_rng(3).uniform(0, 400, (20, 2))
+    # Metres in UTM zone 60, on both sides of its border at 180 degrees.
+    ground = np.column_stack([image * (10.0, -10.0) + (817_500.0, 8_120_000.0), np.full(20, 50.0)])
+    gcps = gcps_of_points(Points.of(image, ground, "EPSG:32760"))
+    assert 179.9 < gcps[:, 2].min() < 180.0 < gcps[:, 2].max() < 180.1
+
+
 @pytest.mark.parametrize("side", [2, 11])
 def test_a_grid_of_points_has_the_corners_of_the_image(tiny: Any, side: int) -> None:
     found = gcps_of_model(tiny.model, (tiny.width, tiny.height), side=side)
