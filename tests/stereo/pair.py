@@ -20,7 +20,10 @@ BIAS = {"aft": np.array([3.0, -2.0]), "fore": np.array([-1.5, 4.0])}
 class Pair:
     """Two scenes 28 degrees apart, whose points have control."""
 
-    def __init__(self, folder: Path, *, away: float = 0.0, bands: int = 1) -> None:
+    def __init__(
+        self, folder: Path, *, away: float = 0.0, bands: int = 1, turns: dict[str, float] | None = None
+    ) -> None:
+        """`turns`: degrees by which each image is moved around the Earth."""
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.rpcs: dict[str, RPC] = {}
@@ -29,7 +32,8 @@ class Pair:
                 LON + number * away, LAT, 500.0, off_nadir_deg=angle, image_width=SIZE, image_height=SIZE, gsd=PIXEL,
                 heights=(0.0, 1000.0),
             )  # fmt: skip
-            self.rpcs[name] = export_rpc(camera).rpc
+            rpc = export_rpc(camera).rpc
+            self.rpcs[name] = rpc._replace(lon_off=rpc.lon_off + (turns or {}).get(name, 0.0))
             made = gdal.GetDriverByName("GTiff").Create(str(self.image(name)), SIZE, SIZE, bands, gdal.GDT_Byte)
             made.WriteArray(np.full((bands, SIZE, SIZE) if bands > 1 else (SIZE, SIZE), 100, dtype=np.uint8))
             made.SetMetadata(rpc_metadata(self.rpcs[name]), "RPC")

@@ -27,6 +27,7 @@ from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import BlockFormat, hookimpl
 from ortho_pipeline.host import Host
 from ortho_pipeline.options import BlockOptions, SurfaceOptions
+from ortho_pipeline.surface.writing import write_dem
 
 ALL = ("cars", "asp", "s2p")
 
@@ -74,6 +75,17 @@ def test_cars_gets_sensors_pairs_and_heights_above_the_ellipsoid(pair: Pair, tmp
     assert abs(undulation) > 20
     report = json.loads(done.files["report"].read_text())
     assert given.ReadAsArray()[100, 100] == pytest.approx(500.0 + undulation, abs=2.0), report["warnings"]
+
+
+def test_the_coarse_dem_is_no_wider_where_images_meet_at_the_antimeridian(tmp_path: Path) -> None:
+    """One RPC counts longitudes from 180 degrees, the other one from -180."""
+    pair = Pair(tmp_path / "pair", turns={"aft": 180.0 - LON, "fore": -180.0 - LON})
+    dem = tmp_path / "dem.tif"
+    write_dem(dem, np.full((120, 120), 500.0), (180.0 - 0.06, LAT + 0.06), 0.001, "EPSG:4326+5773")
+    surface = SurfaceOptions(dem=dem)
+    adjust(pair.images, tmp_path / "out", BlockOptions(points=pair.points()), surface=surface, export=["cars"])
+    elevation = gdal.Open(str(tmp_path / "out" / "elevation.tif"))
+    assert elevation.RasterXSize * elevation.GetGeoTransform()[1] < 0.2
 
 
 def test_s2p_gets_what_it_requires(pair: Pair, tmp_path: Path) -> None:

@@ -174,6 +174,9 @@ class AdjustedBlock:
         if not isinstance(self.heights, DemSurface):
             return None
         ground = np.concatenate(list(self._corners()))
+        # Across the antimeridian each image may count longitudes from another side.
+        west = np.nanmin(ground[:, 0])
+        ground[:, 0] = west + np.remainder(ground[:, 0] - west + 180.0, 360.0) - 180.0
         box = [np.nanmin(ground, axis=0) - _AROUND, np.nanmax(ground, axis=0) + _AROUND]
         write_ellipsoidal(folder / _ELEVATION, corrected(self.heights, self.fit).with_fill("mask"), box)
         files["elevation"] = folder / _ELEVATION
