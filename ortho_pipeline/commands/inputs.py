@@ -237,6 +237,16 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
             field="folder",
             remedy="choose a different output folder",
         )
+    if "tag" in files:
+        # GDAL prefers DigitalGlobe's XML next to an image to the tag in it.
+        stale = files["tag"].with_suffix(".xml")
+        if stale.exists() and stale not in files.values():
+            raise InputError(
+                "this RPC file would override the tag of the copy",
+                file=stale,
+                field="folder",
+                remedy="remove it, export rpc-xml too, or choose another output folder",
+            )
     if "ortho" in files and not overwrite:
         # Statistics, overviews and masks go with an ortho that is replaced; a model is nothing that an ortho has.
         for stale in old_side_cars(files["ortho"]):

@@ -195,6 +195,17 @@ def test_gdal_maps_with_the_exported_rpc(tiny, tmp_path, name):
     np.testing.assert_allclose(ground_to_image(path, GROUND, "METHOD=RPC"), expected, atol=1e-6)
 
 
+def test_an_old_xml_that_would_override_the_tag_is_refused(tiny, tmp_path):
+    out = tmp_path / "out"
+    commands.export(tiny.image, out, formats=["tag", "rpc-xml"])
+    with pytest.raises(InputError, match="would override the tag") as caught:
+        commands.export(tiny.image, out, formats=["tag"], points=points_of(tiny))
+    assert caught.value.file.endswith("tiny_rpc.xml")
+    path = commands.export(tiny.image, out, formats=["tag", "rpc-xml"], points=points_of(tiny)).files["tag"]
+    expected = fitted(tiny).ground_to_image(GROUND)
+    np.testing.assert_allclose(ground_to_image(path, GROUND, "METHOD=RPC"), expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["rpc-txt", "rpb"])
 def test_gdal_maps_with_an_exported_side_car(tiny, tmp_path, name):
     out = tmp_path / "out"
