@@ -74,7 +74,8 @@ def fit_rpc(
     Raises
     ------
     InputError
-        If the box is empty or mostly outside of the model, or the fit is off by more than 0.1 px without `force`.
+        If the box is empty or mostly outside of the model, no sound RPC fits, or the fit is off by more than 0.1 px
+        without `force`.
     """
     centre, half = _centre_and_half(box, height_range)
     ground, image = _samples(model, box, height_range, grid)
@@ -86,7 +87,13 @@ def fit_rpc(
     # A box across the antimeridian may extend beyond 180 degrees; readers of RPCs need an offset within.
     numbers["lon_off"] = math.remainder(numbers["lon_off"], 360.0)
     (col_num, col_den), (row_num, row_den) = (_fit_ratio(terms, (image - middle)[:, k] / scale[k]) for k in (0, 1))
-    rpc = RPC(**numbers, col_num=col_num, col_den=col_den, row_num=row_num, row_den=row_den)
+    try:
+        rpc = RPC(**numbers, col_num=col_num, col_den=col_den, row_num=row_num, row_den=row_den)
+    except InputError as error:
+        raise InputError(
+            f"an RPC cannot represent this model ({error.message.replace('this RPC', 'the fitted RPC')})",
+            remedy="fit it over a smaller box or height range, or export control points or geolocation arrays",
+        ) from error
     nx, ny, nh = grid
     ground, image = _samples(model, box, height_range, (nx + 1, ny + 1, nh + 1))
     worst = float(np.abs(rpc.ground_to_image(ground) - image).max())

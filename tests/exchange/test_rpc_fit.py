@@ -90,6 +90,18 @@ def test_a_flat_box_is_a_metre_high_in_both_directions(heights: tuple[float, flo
     assert (rpc.h_off, rpc.h_scale) == (550.0, scale)
 
 
+def test_a_model_that_folds_the_ground_is_no_damaged_rpc() -> None:
+    class Folded(Formula):
+        def ground_to_image(self, ground: Any) -> np.ndarray:
+            x, y, _ = ((np.asarray(ground, dtype=float) - CENTRE) / HALF).T
+            return np.stack([500.0 * (x - 0.3) ** 2, -200.0 * y], axis=1)
+
+    with pytest.raises(InputError, match=r"cannot represent this model .*several places on the ground") as caught:
+        fit_rpc(Folded(), BOX, HEIGHTS)
+    assert "geolocation" in str(caught.value.remedy)
+    assert caught.value.field is None
+
+
 def test_a_scene_of_less_than_two_pixels_has_a_scale_of_one_pixel() -> None:
     small = tuple(CENTRE[[0, 1, 0, 1]] + 1e-3 * HALF[[0, 1, 0, 1]] * (-1, -1, 1, 1))
     rpc = fit_rpc(Formula(), small, (550.0, 550.0), grid=(6, 5, 4)).rpc
