@@ -128,7 +128,7 @@ def line_scanner_fields(model: Pushbroom) -> dict[str, Any]:
     """Return the state of a line scanner, with aberration and refraction folded into its angles."""
     flight, camera = model.flight, model.camera
     low, high = (float(edge) for edge in model.path.breaks[[0, -1]])
-    places_at = np.linspace(low, high, max(_FEWEST, math.ceil((high - low) / _EVERY)) + 1)
+    places_at = _around(model, low, high, max(_FEWEST, math.ceil((high - low) / _EVERY)))
     turned_at = _sites(model)
     line = _line(model)
     turns = _turns(model, turned_at, line)
@@ -145,7 +145,7 @@ def line_scanner_fields(model: Pushbroom) -> dict[str, Any]:
         "m_intTimeLines": [1.0],
         "m_intTimeStartTimes": [0.5 * model.line_period],
         "m_intTimes": [model.line_period],
-        "m_t0Ephem": low,
+        "m_t0Ephem": float(places_at[0]),
         "m_dtEphem": float(places_at[1] - places_at[0]),
         "m_numPositions": 3 * len(places_at),
         "m_positions": flight.positions(places_at, 0).ravel().tolist(),
@@ -202,13 +202,20 @@ def _sites(model: Pushbroom) -> Array:
     breaks = model.attitude.breaks
     step = float(np.diff(breaks).min()) / _OFTEN
     step = min(step, float(breaks[-1] - breaks[0]) / _FEWEST)
-    count = max(1, round(float(breaks[-1] - breaks[0]) / step))
-    step = float(breaks[-1] - breaks[0]) / count
-    # The library's polynomials want four rows beyond the image.
+    low, high = (float(edge) for edge in breaks[[0, -1]])
+    return _around(model, low, high, max(1, round((high - low) / step)))
+
+
+def _around(model: Pushbroom, low: float, high: float, count: int) -> Array:
+    """Return times in `count` equal steps from `low` to `high`, and beyond for the library's polynomials.
+
+    They want four rows beyond the image, and are straight lines in the first and last step.
+    """
+    step = (high - low) / count
     earliest, latest = sorted((0.0, model.camera.height * model.line_period))
-    before = max(0, math.ceil((float(breaks[0]) + 4 * step - earliest) / step))
-    after = max(0, math.ceil((latest + 4 * step - float(breaks[-1])) / step))
-    return np.asarray(breaks[0] + step * np.arange(-before, count + after + 1))
+    before = max(0, math.ceil((low + 4 * step - earliest) / step))
+    after = max(0, math.ceil((latest + 4 * step - high) / step))
+    return np.asarray(low + step * np.arange(-before, count + after + 1))
 
 
 def _seen(model: Pushbroom, times: Array) -> Array:

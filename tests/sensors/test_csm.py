@@ -16,6 +16,7 @@ from ortho_spot.dimap import read_spot
 from products import isd_text, reversed_scan, spot_text
 from scipy.spatial.transform import Rotation
 
+from ortho_pipeline import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.ellipsoid import geocentric, meet_height
 from ortho_pipeline.models import FrameCamera, ImageCorrection, Pushbroom
@@ -37,9 +38,12 @@ class Library:
     def table(self, what: str, width: int, time: float) -> Array:
         values = np.array(self.s[{3: "m_positions", 4: "m_quaternions"}[width]]).reshape(-1, width)
         at = (time - self.s[f"m_t0{what}"]) / self.s[f"m_dt{what}"]
-        first = min(max(math.floor(at) - 3, 0), len(values) - 8)
-        weights = [math.prod((at - first - j) / (i - j) for j in range(8) if j != i) for i in range(8)]
-        return np.array(weights) @ values[first : first + 8]
+        row = min(max(int(at), 0), len(values) - 2)
+        # Towards the ends of the table the polynomial has fewer rows, in the last step two.
+        half = min(4, row + 1, len(values) - 1 - row)
+        first, count = row - half + 1, 2 * half
+        weights = [math.prod((at - first - j) / (i - j) for j in range(count) if j != i) for i in range(count)]
+        return np.array(weights) @ values[first : first + count]
 
     @staticmethod
     def turn(q: Array) -> Array:
@@ -133,6 +137,17 @@ def test_a_line_scanner_in_the_library(tmp_path: Path, kind: str) -> None:
         line = point - place
         apart = np.linalg.norm(np.cross(line, direction))
         assert apart < 0.01 * np.linalg.norm(line) / model.camera.focal_length
+
+
+def test_positions_that_end_with_the_image_are_no_straight_line_there(sample: Path) -> None:
+    """The library interpolates linearly in the first and last step of a table: 3 cm on the ground."""
+    model = open_scene(sample / "cartosat" / "BANDF.tif").models["pushbroom"]
+    library = Library(csm_text(model)[0])
+    rows = np.array([10.0, 200.0, 390.0])
+    ground = geocentric(model.image_to_ground(np.column_stack([np.full(3, 50.0), rows]), model.reference_height))
+    for row, point in zip(rows, ground, strict=True):
+        place, direction = library.ray(row, 50.0)
+        assert np.linalg.norm(np.cross(point - place, direction)) < 1e-3
 
 
 def test_a_state_whose_lines_were_taken_from_the_last_to_the_first(tmp_path: Path) -> None:
