@@ -208,10 +208,13 @@ def meet(frame: GroundFrame, models: Sequence[SensorModel], points: BlockPoints,
         lost[better] = parallel
         local[moving] = before + factor[:, None] * shift
         ended = lost | ~((np.linalg.norm(shift, axis=1) * factor > 1e-7) & (factor > 1e-4))
-        met = ended & ~lost & np.isfinite(squares)
+        # Steps that end because a model does not project there end at its border, where the rays do not meet.
+        met = ended & ~lost & np.isfinite(squares) & np.isfinite(now)
         found[moving[met]] = local[moving[met]]
         moving, before, factor, shift, squares = (part[~ended] for part in (moving, before, factor, shift, squares))
     found[moving] = np.where(np.isfinite(squares)[:, None], local[moving], np.nan)
+    unseen = used & ~np.isfinite(predict(frame, models, points, found)).all(axis=1)
+    found[points.point[unseen]] = np.nan
     return found
 
 

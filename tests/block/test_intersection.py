@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
 import pytest
+from pair import Pair
 
 from ortho_pipeline.block.intersection import _LONGEST, PARALLEL, _solved, frame_of, intersect, models_of
 from ortho_pipeline.block.points import BlockPoints
@@ -55,6 +57,19 @@ def test_points_without_errors_are_where_they_are() -> None:
     assert found.rays.tolist() == [3, 3, 1]
     assert found.sigma0 == pytest.approx(0.0, abs=1e-4)
     assert repr(found).startswith("<2 of 3 points intersected from 7 rays")
+
+
+def test_rays_that_meet_outside_of_their_models_do_not_meet(tmp_path: Path) -> None:
+    """A column that is wrong by 90 pixels puts the point above the heights of the RPCs, where they do not project."""
+    pair = Pair(tmp_path)
+    ground = pair.rpcs["aft"].image_to_ground([[150.0, 150.0], [90.0, 200.0], [180.0, 90.0]], 500.0)
+    measured = np.concatenate([rpc.ground_to_image(ground) for rpc in pair.rpcs.values()])
+    measured[0, 0] += 90.0
+    points = replace(block(drop=[6, 7, 8]), images=tuple(pair.rpcs), measured=measured, sigma_image=np.full(6, 0.5))
+    found = intersect(pair.rpcs, points)
+    assert np.isfinite(found.covariance).all(axis=(1, 2)).tolist() == [False, True, True]
+    np.testing.assert_allclose(found.ground[1:], ground[1:], atol=1e-3)
+    assert np.isnan(found.ground[0]).all()
 
 
 def design(points: BlockPoints, point: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
