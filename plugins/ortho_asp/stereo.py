@@ -57,4 +57,5 @@ def asp_text(block: BlockExport) -> str:
 
 
 def _quoted(*names: str) -> str:
-    return " ".join(shlex.quote(name) for name in names)
+    # A name that begins with a dash would be an option.
+    return " ".join(shlex.quote(f"./{name}" if name.startswith("-") else name) for name in names)

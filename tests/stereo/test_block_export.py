@@ -13,6 +13,7 @@ import numpy as np
 import pyproj
 import pytest
 from click.testing import CliRunner
+from ortho_asp.stereo import asp_text
 from ortho_csm.files import read_csm
 from osgeo import gdal
 from pair import BIAS, LAT, LON, SIZE, Pair
@@ -21,7 +22,7 @@ import ortho_pipeline as op
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block import adjust
 from ortho_pipeline.errors import CoverageError, InputError, PluginError
-from ortho_pipeline.exchange.block_export import pairs_of
+from ortho_pipeline.exchange.block_export import BlockExport, ExportedImage, ImagePair, pairs_of
 from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.hookspecs import BlockFormat, hookimpl
@@ -234,6 +235,13 @@ def test_an_export_into_a_store_of_objects_is_refused() -> None:
     done = CliRunner().invoke(cli, words)
     assert done.exit_code == 2
     assert "read images and models from disk" in done.output
+
+
+def test_names_that_begin_with_a_dash_are_no_options_of_asp() -> None:
+    images = {name: ExportedImage(f"{name}.tif", f"{name}_rpc.xml", (9, 9)) for name in ("-a", "b")}
+    block = BlockExport(images, "rpc-xml", [ImagePair("-a", "b", 0.9, 20.0)], 2.5, "EPSG:32636")
+    words = shlex.split(asp_text(block), comments=True)
+    assert {"./-a.tif", "./-a_rpc.xml", "b.tif"} <= set(words)
 
 
 def test_asp_refuses_images_of_several_bands(tmp_path: Path) -> None:
