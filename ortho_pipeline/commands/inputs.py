@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -221,13 +221,8 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
     InputError
         With the path in conflict.
     """
-    inputs = {Path(path).resolve() for _, path in request.files}
     removed = old_side_cars(files["ortho"]) if overwrite and "ortho" in files else []
-    for path in (*map(allowed, files.values()), *removed):
-        if path.resolve() in inputs:
-            raise InputError(
-                "this file is both input and output", file=path, field="folder", remedy="choose another output folder"
-            )
+    refuse_read((*map(allowed, files.values()), *removed), [path for _, path in request.files])
     folder = next(iter(files.values())).parent
     attaching = any(str(path).endswith(SIDE_CARS) for path in files.values())
     if attaching and folder.resolve() == Path(request.image).resolve().parent:
@@ -256,6 +251,22 @@ def check_paths(files: Mapping[str, Path], request: Request, overwrite: bool = F
                     file=stale,
                     remedy=Text("delete it, use ", Setting("overwrite"), ", or choose another output folder"),
                 )
+
+
+def refuse_read(outputs: Iterable[Path], read: Iterable[str | os.PathLike[str]]) -> None:
+    """Refuse outputs that overwrite a file that the work began with, such as a camera next to its image.
+
+    Raises
+    ------
+    InputError
+        With the path in conflict.
+    """
+    inputs = {Path(path).resolve() for path in read}
+    for path in outputs:
+        if path.resolve() in inputs:
+            raise InputError(
+                "this file is both input and output", file=path, field="folder", remedy="choose another output folder"
+            )
 
 
 def old_side_cars(ortho: Path) -> list[Path]:

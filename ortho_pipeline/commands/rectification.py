@@ -195,7 +195,9 @@ def export(
     files = {file_format.name: Path(folder) / f"{Path(image).stem}{file_format.ending}" for file_format in chosen}
     request = Request(image, scene, points, surface, match)
     inputs.check_paths(files, request)
-    adjusted, heights = adjust(resolved := adjustable(request)), resolved.surface
+    resolved = adjustable(request)
+    inputs.refuse_read(files.values(), resolved.ledger.roles)
+    adjusted, heights = adjust(resolved), resolved.surface
     dataset = raster.open_dataset(image, **scene.access)
     size = adjusted.scene.width, adjusted.scene.height
     adjustment = adjusted.fit

@@ -13,10 +13,11 @@ import pytest
 from ortho_csm.files import csm_text, read_csm, write_csm
 from ortho_maxar.isd import Isd, read_isd_pushbroom
 from ortho_spot.dimap import read_spot
+from osgeo import gdal
 from products import isd_text, reversed_scan, spot_text
 from scipy.spatial.transform import Rotation
 
-from ortho_pipeline import open_scene
+from ortho_pipeline import commands, open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.ellipsoid import geocentric, meet_height
 from ortho_pipeline.models import FrameCamera, ImageCorrection, Pushbroom
@@ -171,6 +172,18 @@ def test_a_frame_in_the_library() -> None:
     library = Library(csm_text(model)[0])
     image, ground = points(model, (400, 300))
     assert np.abs([library.pixel(point) for point in geocentric(ground)] - image).max() < 1e-6
+
+
+def test_a_camera_next_to_its_image_is_not_overwritten(tmp_path: Path) -> None:
+    camera, image = tmp_path / "photo_csm.json", tmp_path / "photo.tif"
+    write_csm(frame(), camera)
+    gdal.GetDriverByName("GTiff").Create(str(image), 400, 300, 1).FlushCache()
+    before = camera.read_bytes()
+    with pytest.raises(InputError, match="both input and output") as caught:
+        commands.export(image, tmp_path, formats=["csm"])
+    assert Path(caught.value.file) == camera
+    assert camera.read_bytes() == before
+    assert commands.export(image, tmp_path / "out", formats=["csm"]).files["csm"].is_file()
 
 
 def test_the_ground_of_an_aeroplanes_frame_lies_below_it(tmp_path: Path) -> None:

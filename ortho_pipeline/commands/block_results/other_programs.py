@@ -14,6 +14,7 @@ from ortho_pipeline.block.fit import BlockFit
 from ortho_pipeline.block.start import Start
 from ortho_pipeline.commands.block_results.orthos import corrected
 from ortho_pipeline.commands.control.points import no_points
+from ortho_pipeline.commands.inputs import refuse_read
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.exchange.block_export import BlockExport, ExportedImage, ImagePair, pairs_of
 from ortho_pipeline.exchange.export import Export, check_formats
@@ -123,8 +124,10 @@ class AdjustedBlock:
         resolution, crs = self._grid()
         elevation = self._elevation(folder, files)
         exports = {label: self._model(label, dataset) for label, dataset in datasets.items()}
+        read = [path for start in self.starts.values() for path in (start.scene.model_source, *start.scene.sources)]
         for chosen in formats:
             kind, written = _models(chosen, exports, folder)
+            refuse_read(written.values(), read)
             files |= written
             images = {
                 label: ExportedImage(
