@@ -118,7 +118,7 @@ def csm_text(model: SensorModel, *, force: bool = False) -> tuple[str, float]:
         raise InputError(
             f"a CSM state cannot represent the lens of this model; the error would be {middle:.2g} px",
             field="formats",
-            remedy=Text("accept this error with ", Setting("force"), ", or write an RPC"),
+            remedy=Text("accept this error with ", Setting("force"), ", or choose another format"),
         )
     return f"{name}\n{json.dumps({'m_modelName': name, **fields}, indent=2, sort_keys=True)}\n", worst
 
