@@ -335,12 +335,8 @@ class DemSurface(Surface):
             window = column * TILE, row * TILE, TILE + 1, TILE + 1
             tile = self._tiles.get((row, column, filled), functools.partial(self._window, *window, filled))
             out[these] = _bilinear(tile, u[these] - column * TILE, v[these] - row * TILE)
-        x, a, *_ = self.grid.crs_from_pixel
-        seam = np.flatnonzero((u < 0) | (u > columns - 1))
-        turned = self.around(x - a / 2) if len(seam) else self
-        if turned is not self:  # positions between the last and the first column of a global DEM
-            shift = turned.grid.first_column - self.grid.first_column
-            out[seam] = turned._interpolated((u[seam] - shift) % columns, v[seam], filled)
+        if len(seam := np.flatnonzero((u < 0) | (u > columns - 1))):
+            out[seam] = _across_seam(self, u[seam], v[seam], filled)
         return out
 
     # -- windows -----------------------------------------------------------------------------------------------------
@@ -470,6 +466,16 @@ def _undulations(vertical: Vertical, grid: SampleGrid, window: tuple[int, int, i
     across, down = (u % step) / step, ((v % step) / step)[:, None]
     along = nodes[:, i] * (1 - across) + nodes[:, i + 1] * across
     return along[j] * (1 - down) + along[j + 1] * down
+
+
+def _across_seam(dem: DemSurface, u: Array, v: Array, filled: bool) -> Array:
+    """Return heights ``(N,)`` between the last and the first column of a global DEM; NaN for another DEM."""
+    x, a, *_ = dem.grid.crs_from_pixel
+    turned = dem.around(x - a / 2)
+    if turned is dem:
+        return np.full(len(u), np.nan)
+    shift = turned.grid.first_column - dem.grid.first_column
+    return turned._interpolated((u - shift) % dem.shape[1], v, filled)
 
 
 def _by_tile(u: Array, v: Array, index: NDArray[np.intp], across: int) -> Iterator[tuple[int, int, NDArray[np.intp]]]:

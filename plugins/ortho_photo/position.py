@@ -20,8 +20,8 @@ LEAST = 0.02
 APART = 1.0
 _FIXED = 50.0
 _METRES_OF_DEGREE = 111_200.0
-#: Values of GPSAltitudeRef: below the reference surface, and above or below the ellipsoid.
-_BELOW, _ELLIPSOIDAL = ("1", "3"), ("2", "3")
+#: Values of GPSAltitudeRef: below the reference surface, and the two of EXIF 3 that state heights from sea level.
+_BELOW, _SEA_LEVEL = ("1", "3"), ("2", "3")
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ def _differing(tags: Tags, used: _Source, xmp: _Source, exif: _Source) -> tuple[
     (east, north), (lon, lat) = xmp.place, exif.place
     turn = math.remainder(lon - east, 360.0) * math.cos(math.radians(lat))
     metres = {"plan": math.hypot(turn, lat - north) * _METRES_OF_DEGREE}
-    # An ellipsoidal height in EXIF and DJI's height may have different datums.
-    if xmp.altitude is not None and exif.altitude is not None and _reference(tags) not in _ELLIPSOIDAL:
+    # A height from sea level in EXIF and DJI's height may have different datums.
+    if xmp.altitude is not None and exif.altitude is not None and _reference(tags) not in _SEA_LEVEL:
         metres["height"] = abs(exif.altitude - xmp.altitude)
     if max(metres.values()) <= APART:
         return ()

@@ -239,7 +239,7 @@ def test_an_accuracy_counts_for_the_position_of_its_own_source(tmp_path, exif, x
     assert all(f"The position in {used} is used" in notice for notice in scene.notices)
 
 
-def test_an_ellipsoidal_height_in_exif_is_not_compared_with_djis(tmp_path):
+def test_a_height_from_sea_level_in_exif_is_not_compared_with_djis(tmp_path):
     scene = opened(photo(tmp_path / "a.tif", {**EXIF, "GPSAltitude": "(1030)", "GPSAltitudeRef": "0x02"}, PLACED))
     assert scene.notices == ()
     [notice] = opened(photo(tmp_path / "b.tif", {**EXIF, "GPSAltitude": "(1030)"}, PLACED)).notices
