@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -26,6 +27,7 @@ from ortho_pipeline.batch.stack.command import match_part, stack
 from ortho_pipeline.batch.stack.recorded import FileSet
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.files import whole_or_nothing
 from ortho_pipeline.options import MatchOptions, OutputOptions, SceneOptions, StackOptions, SurfaceOptions
 from ortho_pipeline.stores.objects import Objects
 
@@ -237,3 +239,17 @@ def test_a_record_is_that_of_a_set_only_with_its_outputs(tmp_path: Path) -> None
     state = FileState(role="image", path="s3://bucket/a.tif", bytes=1, mtime_ns=0, sha256="0" * 64, tag="1")
     far = replace(near, inputs=(state,))
     assert not far.is_in(failed.replaced(key=far.key, inputs=far.inputs))
+
+
+def test_a_full_disk_is_not_recorded_as_a_pair_that_cannot_be_matched(tmp_path: Path) -> None:
+    def full(folder: Path) -> None:
+        with whole_or_nothing(folder / "pair.json"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def unmatched(folder: Path) -> None:
+        raise InputError("no match")
+
+    pair = FileSet("pair", (), {}, {"matches": "pair.json"}, full, may_fail=True)
+    with pytest.raises(InputError, match="No space left"):
+        pair.made(tmp_path)
+    assert replace(pair, write=unmatched).made(tmp_path).status == "failed"

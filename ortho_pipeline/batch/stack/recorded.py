@@ -47,7 +47,7 @@ class FileSet:
     write : callable (folder) -> None
         Writes them. It is sent to other processes.
     may_fail : bool
-        An `InputError` of `write` is recorded, too. Otherwise it ends the run.
+        An `InputError` of `write` is recorded, too, but not one of the disk. Otherwise it ends the run.
     """
 
     name: str
@@ -79,7 +79,8 @@ class FileSet:
             folder.mkdir(parents=True, exist_ok=True)
             self.write(folder)
         except InputError as error:
-            if not self.may_fail:
+            # A full disk says nothing of the inputs: the next run tries again.
+            if not self.may_fail or isinstance(error.__cause__, OSError):
                 raise
             return record.replaced(error=error_document(error))
         outputs = tuple(FileState.of(role, folder / name, name=name) for role, name in self.files.items())
