@@ -237,6 +237,14 @@ def _folders_of(folder: Path) -> Iterable[Path]:
 class Digests(files.Checksums):
     """Checksums that records know are not taken again."""
 
+    _renewed = ""
+
+    def renew(self, run: str) -> None:
+        """Forget all checksums from before a run; a process may make several of its scenes."""
+        if run != self._renewed:
+            self.known.clear()
+            self._renewed = run
+
     def learn(self, states: Sequence[FileState]) -> None:
         """Take over what a record knows."""
         self.known.update({(state.path, state.bytes, state.mtime_ns): state.sha256 for state in states})

@@ -453,6 +453,8 @@ class _Mosaic:
 
 
 def _with_checksums(job: Job) -> Outcome:
+    # A process of the caller, or of a cluster, may know checksums of earlier runs.
+    DIGESTS.renew(job.run)
     return make_scene(job, checksums=True)
 
 

@@ -516,6 +516,17 @@ def test_checksums_see_what_dates_hide(block):
     assert path.read_bytes() == text
 
 
+def test_checksums_see_inputs_that_this_process_has_read_before(block):
+    block.run()
+    path = block.folder / "raw" / "s1.tif"
+    stat, data = path.stat(), bytearray(path.read_bytes())
+    data[-1] ^= 255
+    path.write_bytes(data)
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert block.run()["s1"] == "unchanged"
+    assert block.run(checksums=True) == {"s0": "unchanged", "s1": "done", "s2": "unchanged"}
+
+
 def test_outputs_that_no_longer_belong_are_removed(block):
     block.tiny.write(block.folder / "gcps.csv", block.tiny.points(12, noise=0.1))
     block.write(FILE + "    points: {gcps: gcps.csv, crs: 'EPSG:4979', vertical: ellipsoid, correction: none}\n")
