@@ -110,6 +110,13 @@ def run(folder: Path, out: Path, **more: Any) -> Any:
     return stack([folder], out, output=OutputOptions(resampling="cubic", threads=1, format="GTiff"), **settings)
 
 
+@pytest.mark.parametrize(
+    "options", [{"bands": (1,)}, {"dem_interpolation": "cubic"}, {"tolerance": 0.1}, {"engine": "gdal"}]
+)
+def test_a_changed_option_of_the_warp_makes_orthos_again(options: dict[str, Any]) -> None:
+    assert raw.written_with(OutputOptions(**options)) != raw.written_with(OutputOptions())
+
+
 def test_a_raw_scene_and_an_ortho_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = delivered(tmp_path / "in")
     with pytest.raises(InputError, match="is not a finished ortho") as error:
@@ -125,12 +132,6 @@ def test_a_raw_scene_and_an_ortho_agree(tmp_path: Path, monkeypatch: pytest.Monk
     assert one.GetGeoTransform() == other.GetGeoTransform()
     inner = [image.ReadAsArray()[15:-15, 15:-15].astype(float).ravel() for image in (one, other)]
     assert np.corrcoef(*inner)[0, 1] > 0.97
-    monkeypatch.setattr(raw, "write_in", lambda *given: pytest.fail("it is made again"))
-    before = json.loads((tmp_path / "out" / "stack.json").read_text())
-    again = run(tmp_path / "in", tmp_path / "out", options=StackOptions(corrections_only=True))
-    assert [one["shift_px"] for one in again.document["dates"]] == [one["shift_px"] for one in before["dates"]]
-    moved = gdal.Open(str(again.orthos[paths[0].stem]))
-    assert moved.GetMetadata("RPC")
     with pytest.raises(InputError, match="all of these are finished orthos"):
         stack(
             list(result.orthos.values()),
@@ -138,3 +139,9 @@ def test_a_raw_scene_and_an_ortho_agree(tmp_path: Path, monkeypatch: pytest.Monk
             StackOptions(date_pattern="%Y%m%d"),
             surface=SurfaceOptions(height=0.0),
         )
+    monkeypatch.setattr(raw, "write_in", lambda *given: pytest.fail("it is made again"))
+    before = json.loads((tmp_path / "out" / "stack.json").read_text())
+    again = run(tmp_path / "in", tmp_path / "out", options=StackOptions(corrections_only=True))
+    assert [one["shift_px"] for one in again.document["dates"]] == [one["shift_px"] for one in before["dates"]]
+    moved = gdal.Open(str(again.orthos[paths[0].stem]))
+    assert moved.GetMetadata("RPC")

@@ -46,7 +46,10 @@ _SIDE, _FEWEST = 17, 3
 
 def written_with(output: OutputOptions) -> list[Any]:
     """Return the options that the pixels of an ortho and its file depend on."""
-    return [output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options)]
+    return [
+        output.resampling, output.nodata, output.dtype, output.format, dict(output.creation_options),
+        output.bands and list(output.bands), output.dem_interpolation, output.tolerance, output.engine,
+    ]  # fmt: skip
 
 
 def write_in(placed: Placement, name: str, folder: Path) -> None:
