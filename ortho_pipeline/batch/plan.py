@@ -106,7 +106,8 @@ class Job:
             del options["ortho"][budget]
         options["surface"]["source"] = self.dem_source or options["surface"]["source"]
         options["scene"]["allow_network"] = False  # leave to reach a file is no part of what is made of it
-        if self.request.match.reference:
+        # Without a reference these options are refused, also by a second run.
+        if self.request.match != MatchOptions():
             options["match"] = dataclasses.asdict(self.request.match)
         # Files on this machine are known by their content; of others there is the size.
         far = {"image_bytes": self.image.size()} if isinstance(self.image, VsiPath) else {}

@@ -212,3 +212,9 @@ def test_a_mosaic_that_is_no_longer_in_the_file_is_removed(block: Block) -> None
     assert mosaic_files(block) == sorted([*MOSAIC, own.name])
     assert block.run() == UNCHANGED
     assert mosaic_files(block) == [own.name]
+
+
+def test_options_of_matching_without_a_reference_are_refused_by_a_second_run_too(block: Block) -> None:
+    assert block.run() == ALL_DONE
+    block.write(FILE.replace("scenes:", "  match: {points: 50}\nscenes:"))
+    assert block.run() == dict.fromkeys(("s0", "s1"), "failed")
