@@ -355,10 +355,8 @@ class _Run:
         ordered = tuple(self.outcomes[job.name] for job in jobs)
         files = {"log": self.log_path}
         items = [Path(outcome.files["stac"]) for outcome in ordered if "stac" in outcome.files]
-        if items and not self.part:
-            files["catalog"] = self.planned.output / RUN_FILES["catalog"]
-            write_catalog(files["catalog"], items, self.planned.path.stem)
         if not self.part:
+            files |= self._catalog(items)
             files |= {kind: self.planned.output / RUN_FILES[kind] for kind in ("summary", "index")}
         if mosaic is not None and "file" in mosaic:
             files |= {
@@ -373,6 +371,18 @@ class _Run:
             write_run_page(files["index"], name, scenes, provenance_of(self.planned))
         self.log("run finished", counts=result.to_json()["counts"], seconds=result.seconds)
         return result
+
+    def _catalog(self, items: Sequence[Path]) -> dict[str, Path]:
+        """Write the catalog of the items, or remove that of the last run, whose items are no longer there."""
+        path = self.planned.output / RUN_FILES["catalog"]
+        if items:
+            write_catalog(path, items, self.planned.path.stem)
+            return {"catalog": path}
+        with contextlib.suppress(InputError):
+            before = read_json(self.planned.output / RUN_FILES["summary"], _REPORT_BYTES, "run again")
+            if isinstance(before, dict) and "catalog" in (before.get("files") or ()):
+                allowed(path).unlink(missing_ok=True)
+        return {}
 
     def log(self, event: str, **fields: Any) -> None:
         """Append a line to the log; several runs of parts may do so at once."""

@@ -218,3 +218,16 @@ def test_options_of_matching_without_a_reference_are_refused_by_a_second_run_too
     assert block.run() == ALL_DONE
     block.write(FILE.replace("scenes:", "  match: {points: 50}\nscenes:"))
     assert block.run() == dict.fromkeys(("s0", "s1"), "failed")
+
+
+def test_a_catalog_goes_with_its_items_and_a_file_of_the_user_stays(block: Block) -> None:
+    catalog = block.folder / "out" / "catalog.json"
+    block.write(FILE.replace("resolution: 5", "resolution: 5, stac: true, acquired: '2024-05-05'"))
+    assert block.run() == ALL_DONE
+    assert catalog.exists()
+    block.write(FILE)
+    assert block.run() == ALL_DONE
+    assert not catalog.exists()
+    catalog.write_text("{}")
+    assert block.run() == UNCHANGED
+    assert catalog.read_text() == "{}"
