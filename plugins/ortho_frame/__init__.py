@@ -112,7 +112,7 @@ def open_scene(
     if refraction not in ("yes", "no"):
         raise InputError(f"{refraction!r} must be yes or no", field="refraction")
     pose = read_exterior(exterior, name)
-    interior = read_camera(camera, dataset.RasterXSize, dataset.RasterYSize, pose.camera)
+    interior = read_camera(camera, dataset.RasterXSize, dataset.RasterYSize, pose.camera, name)
     others = {"heights": heights, "refraction": refraction == "yes"}
     if isinstance(pose, Shot):
         axes = _axes_of(pose, frame or TOPOCENTRIC, crs)
@@ -147,7 +147,7 @@ def open_odm(
             remedy="put it into the folder images next to the project's folder opensfm",
         )
     shot, axes = shot_in(path, place(dataset.GetDescription()))
-    interior = read_camera(path, dataset.RasterXSize, dataset.RasterYSize, shot.camera)
+    interior = read_camera(path, dataset.RasterXSize, dataset.RasterYSize, shot.camera, dataset.GetDescription())
     model = _shot_model(interior, shot, axes, _datum(vertical), heights=heights)
     return _scene("odm", dataset, model, shot, str(path), vertical, heights, sigmas)
 

@@ -45,10 +45,13 @@ CAMERA_KEYS = {
 
 
 @reads("write the camera file as in docs/formats/frame.md")
-def read_camera(path: str | PathLike[str], width: int, height: int, name: str | None = None) -> Interior:
+def read_camera(
+    path: str | PathLike[str], width: int, height: int, name: str | None = None, image: str | None = None
+) -> Interior:
     """Read the interior orientation for an image of `width` x `height` pixels.
 
-    `name` chooses among the cameras of a file of OpenSfM or orthority.
+    `name` chooses among the cameras of a file of OpenSfM or orthority. In a reconstruction of several parts, the camera
+    is that of the part with the shot of `image`, because each part has adjusted its cameras.
 
     A camera of another size with the same proportions is scaled: the image is then a reduced copy.
 
@@ -61,7 +64,7 @@ def read_camera(path: str | PathLike[str], width: int, height: int, name: str | 
     if orthority.is_camera(document):
         interior = orthority.camera_of(path, document, name)
     else:
-        interior = _opensfm(path, document, name) if _is_opensfm(document) else _own(path, document)
+        interior = _opensfm(path, document, name, image) if _is_opensfm(document) else _own(path, document)
     if interior.width * height != interior.height * width:
         raise InputError(
             f"the camera has {interior.width} x {interior.height} pixels, but the image {width} x {height}",
@@ -117,9 +120,11 @@ def _is_opensfm(document: Any) -> bool:
     )
 
 
-def _opensfm(path: str | PathLike[str], document: Any, name: str | None) -> Interior:
+def _opensfm(path: str | PathLike[str], document: Any, name: str | None, image: str | None) -> Interior:
     cameras: dict[str, Any] = {}
-    for part in document if isinstance(document, list) else [document]:  # a block may be in several parts
+    parts = document if isinstance(document, list) else [document]
+    names = {Path(image).name, Path(image).stem} if image else set()
+    for part in [part for part in parts if names & _object(part, "shots").keys()] or parts:
         cameras |= _object(part, "cameras") if "cameras" in part else part
     if name in cameras:
         cameras = {name: cameras[name]}

@@ -120,6 +120,19 @@ def test_other_cameras_are_refused_by_name(tmp_path, kind):
     assert "brown, perspective, simple_radial, radial" in error.value.remedy
 
 
+def test_each_part_of_a_reconstruction_has_its_own_camera(tmp_path):
+    image = project(tmp_path, offset=False)
+    file = tmp_path / "opensfm" / "reconstruction.json"
+    part = json.loads(file.read_text())[0]
+    other = {**part, "cameras": {"a": {**LENS, "focal": 0.9}}, "shots": {"two.tif": part["shots"]["one.tif"]}}
+    file.write_text(json.dumps([part, other]))
+    two = photo(image.with_name("two.tif"), size=(60, 40))
+    options = SceneOptions(sensor="frame", sensor_options={"exterior": str(file), "vertical": "ellipsoid"})
+    for path, focal in ((image, 48.0), (two, 54.0)):
+        assert open_scene(path).facts["focal_length_px"] == pytest.approx(focal)
+        assert open_scene(path, options).facts["focal_length_px"] == pytest.approx(focal)
+
+
 def test_a_photo_that_the_project_left_out_is_an_error(tmp_path):
     image = project(tmp_path, offset=False)
     other = photo(image.with_name("two.tif"), size=(60, 40))
