@@ -69,7 +69,8 @@ def metadata_of(name: str) -> Path | None:
         files = [image.parent / one for one in listing(image.parent).matching(_METADATA)]
     except (OSError, ValueError, InputError):
         return None
-    its = [one for one in files if image.stem.lower().startswith(one.name[: -len("_metadata.json")].lower())]
+    asset = f"{image.stem}_".lower()
+    its = [one for one in files if asset.startswith(one.name.lower().removesuffix("metadata.json"))]
     # The longest name is of the item itself, where one item's name begins with another's.
     return max(its, key=lambda one: len(one.name), default=None)
 

@@ -52,6 +52,13 @@ def test_the_metadata_are_those_of_the_item(image: Path) -> None:
         open_scene(image)
 
 
+def test_an_item_whose_number_only_begins_alike_is_another(image: Path) -> None:
+    other = image.with_name(f"{ITEM}0_1B_AnalyticMS.tif")
+    shutil.copy(image, other)
+    assert metadata_of(str(other)) is None
+    assert metadata_of(str(image.with_name(f"{ITEM}.tif"))) == image.parent / f"{ITEM}_metadata.json"
+
+
 def test_frames_of_a_strip_are_adjusted_together(tmp_path: Path) -> None:
     """Three SkySat frames behind each other, seen twice; each is off by pixels of its own.
 
