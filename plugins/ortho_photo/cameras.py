@@ -230,10 +230,15 @@ def _dewarped(tags: Tags, width: int, height: int, full: float) -> PhotoCamera |
 
 
 def _of_pix4d(tags: Tags, width: int, height: int, full: float) -> PhotoCamera | None:
-    """Return the camera of Pix4D's tags: mm, from the upper left corner, R1, R2, R3, T1, T2."""
+    """Return the camera of Pix4D's tags: mm, from the upper left corner, R1, R2, R3, T1, T2.
+
+    The focal length may be in pixels (MicaSense's imageprocessing, metadata.py).
+    """
     focal, pitch = tags.positive("Camera:PerspectiveFocalLength"), _pitch_mm(tags)
     if not focal or not pitch:
         return None
+    if tags.text("Camera:PerspectiveFocalLengthUnits").lower() in ("pixel", "pixels", "px"):
+        focal *= pitch
     pixel = pitch * 1e-3 * full / width
     lens = tags.numbers("Camera:PerspectiveDistortion") or [0.0] * 5
     middle = [width * pixel * 500, height * pixel * 500]

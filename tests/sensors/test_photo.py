@@ -408,6 +408,13 @@ def test_pix4ds_camera_counts_from_the_corner(tmp_path):
     assert found == pytest.approx((-0.1, 0.02, 0.003, 0.0004, 0.0005))
 
 
+@pytest.mark.parametrize(("length", "units"), [("5.5", "mm"), ("275", "pixel")])
+def test_pix4ds_focal_length_has_the_unit_that_is_stated(tmp_path, length, units):
+    lens = {"Camera:PerspectiveFocalLength": length, "Camera:PerspectiveFocalLengthUnits": units}
+    scene = opened(photo(tmp_path / "a.tif", {**EXIF, **PLANE}, {**DJI, **lens}))
+    assert scene.facts["focal_length_px"] == pytest.approx(275.0)
+
+
 # -- errors ----------------------------------------------------------------------------------------------------------
 
 
