@@ -35,6 +35,8 @@ _ALIKE = 0.05
 _CONTRARY = 1.2
 #: The optical centre is nearer to the middle of a photo than this part of half the width or height.
 _NEAR = 0.03
+#: A digital zoom of more than this makes a photo of a part of the sensor.
+_ZOOMED = 1.01
 #: Millimetres of a unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre.
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 #: The longer side (mm) of a frame of 35 mm film.
@@ -105,6 +107,15 @@ def camera_of(tags: Tags, width: int, height: int, sensor_width: float | None) -
         if focal is None:
             raise tags.error("the tags have no focal length", "FocalLength", "give camera=FILE (docs/formats/frame.md)")
         return PhotoCamera(_plain(width, height, focal / sensor_width * width), "sensor width of the options")
+    if (zoom := tags.positive("DigitalZoomRatio") or 1.0) > _ZOOMED:
+        raise tags.error(
+            f"this photo was zoomed digitally by {zoom:g}: it shows a part of the sensor",
+            "DigitalZoomRatio",
+            Text(
+                f"give the width of that part, which is the width of the sensor divided by {zoom:g}, with ",
+                Setting("scene.sensor_options", "MILLIMETRES", key="sensor_width"),
+            ),
+        )
     by_sensor = _of_sensor(tags, width, height, (full, full_rows))
     stated = by_sensor or _of_film(tags, width, height)
     try:

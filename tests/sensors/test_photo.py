@@ -394,6 +394,15 @@ def test_the_focal_length_in_35_mm_film_is_of_the_longer_side(tmp_path):
     assert portrait.facts["focal_length_px"] == pytest.approx(600 * 24 / 36, abs=1e-3)
 
 
+def test_a_digital_zoom_is_a_crop_unless_the_width_of_the_part_is_given(tmp_path):
+    assert opened(photo(tmp_path / "a.tif", {**EXIF, "DigitalZoomRatio": "(1)"})).facts["focal_length_px"] == 400.0
+    zoomed = photo(tmp_path / "b.tif", {**EXIF, "DigitalZoomRatio": "(2)"})
+    with pytest.raises(InputError, match="zoomed digitally by 2") as error:
+        opened(zoomed)
+    assert "divided by 2" in str(error.value.remedy)
+    assert opened(zoomed, sensor_width="6.6").facts["focal_length_px"] == 800.0
+
+
 def test_pix4ds_camera_counts_from_the_corner(tmp_path):
     lens = {
         "Camera:PerspectiveFocalLength": "5.5",
