@@ -209,6 +209,13 @@ def read_exterior(path: str | PathLike[str], image: str | PathLike[str]) -> Pose
     if geographic and not (abs(values[0]) <= 360 and abs(values[1]) <= 90):
         raise InputError("this position is not on Earth", file=path, field=f"line {line}, lon, lat")
     x, y, z, first, second, third = values
+    if max(abs(angle) for angle in values[3:]) > 360:
+        raise InputError(
+            "an angle is beyond 360 degrees",
+            file=path,
+            field=f"line {line}, {', '.join(name for name, _ in columns[3:])}",
+            remedy="give all angles in degrees: those in gon times 0.9",
+        )
     camera = row[header.index("camera")] if "camera" in header and header.index("camera") < len(row) else None
     crs = None if geographic else _crs_beside(path)
     return Pose(str(path), f"line {line}", geographic, (x, y, z), (first, second, third), crs, camera)

@@ -226,6 +226,10 @@ def test_a_table_without_a_header_has_the_crs_of_its_prj(tmp_path):
     )
     angles = np.radians([0.5, -0.2, 170.0])
     np.testing.assert_allclose(scene.model.exterior, [400_000, 4_300_000, 2500, *angles], atol=1e-9)
+    (tmp_path / "poses.txt").write_text("one 400000 4300000 2500 0.5 -0.2 398.5\n")
+    with pytest.raises(InputError, match="beyond 360 degrees") as error:
+        open_scene(image, SceneOptions(sensor="frame", sensor_options={**options, "vertical": "ellipsoid"}))
+    assert "gon times 0.9" in str(error.value.remedy)
 
 
 @pytest.mark.realdata
