@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.exchange.rpc import export_rpc as export_rpc
     from ortho_pipeline.exchange.rpc import has_rpc as has_rpc
     from ortho_pipeline.exchange.rpc import read_rpc as read_rpc
+    from ortho_pipeline.exchange.rpc import require_same_rpc as require_same_rpc
     from ortho_pipeline.exchange.rpc import rpc_of_dataset as rpc_of_dataset
     from ortho_pipeline.exchange.rpc import write_rpc_txt as write_rpc_txt
     from ortho_pipeline.exchange.rpc_files import read_rpc_text as read_rpc_text
@@ -178,6 +179,7 @@ _NAMES = {
         "export_rpc",
         "has_rpc",
         "read_rpc",
+        "require_same_rpc",
         "rpc_of_dataset",
         "write_rpc_txt",
     ),

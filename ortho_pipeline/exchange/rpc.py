@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,7 @@ __all__ = [
     "has_rpc",
     "name_sources_relatively",
     "read_rpc",
+    "require_same_rpc",
     "rpc_metadata",
     "rpc_of_dataset",
     "without_georeference",
@@ -133,7 +135,7 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
     elif choice == "tag":
         sidecar = None
     if sidecar and tag:
-        _check_agreement(rpc_of_fields(sidecar[0], sidecar[1]), rpc_of_fields(tag, name), sidecar[1], name)
+        _check_agreement(rpc_of_fields(tag, name), [rpc_of_fields(*sidecar)], sidecar[1], name, "sidecar")
     if sidecar:
         return rpc_of_fields(*sidecar), sidecar[1]
     if tag:
@@ -146,6 +148,26 @@ def rpc_of_dataset(dataset: gdal.Dataset, choice: str | PathLike[str] | None = N
         field="scene.rpc",
         remedy=Text("give the RPC file with ", Setting("scene.rpc", "FILE")),
     )
+
+
+def require_same_rpc(dataset: gdal.Dataset, delivered: Iterable[RPC], source: str) -> None:
+    """Raise an error if an image has an RPC tag that agrees with none of the RPCs in the metadata `source`.
+
+    Raises
+    ------
+    InputError
+        If all differ from the tag by more than a pixel at the centre of the scene: the tag is of a crop, or adjusted.
+
+    Examples
+    --------
+    >>> image = open_dataset("sample_data/scene.tif")
+    >>> require_same_rpc(image, [rpc_of_dataset(image)[0]], "metadata.xml")
+    """
+    try:
+        own, _ = rpc_of_dataset(dataset, "tag")
+    except InputError:
+        return
+    _check_agreement(own, delivered, source, dataset.GetDescription())
 
 
 def _in_tile(dataset: gdal.Dataset, model: RPC, path: str) -> RPC:
@@ -275,20 +297,20 @@ def _sidecar_source(fields: dict[str, str], beside: list[Path], name: str) -> st
     return ", ".join(map(os.fspath, likely)) or f"{name} (metadata)"
 
 
-def _check_agreement(sidecar: RPC, tag: RPC, sidecar_name: str, name: str) -> None:
+def _check_agreement(tag: RPC, others: Iterable[RPC], source: str, name: str, *choices: str) -> None:
+    """Raise an error unless one of `others`, in the file `source`, agrees with the tag at the centre of the scene."""
     centre = np.array([[tag.lon_off, tag.lat_off, tag.h_off]])
-    difference = float(np.abs(sidecar.ground_to_image(centre) - tag.ground_to_image(centre)).max())
+    seen = tag.ground_to_image(centre)
+    difference = float(np.fmin.reduce([np.abs(one.ground_to_image(centre) - seen).max() for one in others]))
     if not difference <= DISAGREEMENT:
         apart = f"by {difference:.1f} px" if np.isfinite(difference) else "completely"
         raise InputError(
-            f"the RPC in the file and the RPC in {sidecar_name} differ {apart} at the centre of the scene",
+            f"the RPC in the file and the RPC in {source} differ {apart} at the centre of the scene",
             file=name,
             field="scene.rpc",
             remedy=Text(
                 "choose one: ",
-                Setting("scene.rpc", "tag"),
-                ", ",
-                Setting("scene.rpc", "sidecar"),
+                Text.joined(", ", [Text(Setting("scene.rpc", choice)) for choice in ("tag", *choices)]),
                 ", or ",
                 Setting("scene.rpc", "FILE"),
             ),

@@ -18,9 +18,8 @@ from ortho_pipeline.plugin import (
     Scene,
     Sensor,
     SensorModel,
-    Setting,
-    Text,
     hookimpl,
+    require_same_rpc,
     rpc_of_dataset,
     rpc_of_fields,
 )
@@ -153,29 +152,11 @@ def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | 
         model, source = rpc_of_dataset(dataset, choice)
         warnings = []
     if model is not None and choice is None:
-        _require_same(dataset, model, str(source))
+        require_same_rpc(dataset, [model], str(source))
         warnings += _compared_with_gdal(dataset, model, str(source))
     if model is not None and origin == "1":
         model = model._replace(col_off=model.col_off - 1.0, row_off=model.row_off - 1.0)
     return model, source, warnings
-
-
-def _require_same(dataset: gdal.Dataset, model: RPC, source: str) -> None:
-    """Raise an error if the image itself has another RPC than the one in the file `source`."""
-    try:
-        own, _ = rpc_of_dataset(dataset, "tag")
-    except InputError:
-        return
-    apart = _apart(own, model)
-    if not apart <= DISAGREEMENT:
-        raise InputError(
-            f"the RPC in the file and the RPC in {source} differ by {apart:.1f} px at the centre of the scene",
-            file=dataset.GetDescription(),
-            field="scene.rpc",
-            remedy=Text(
-                "choose one: ", Setting("scene.rpc", "tag"), ", or the other with ", Setting("scene.rpc", "FILE")
-            ),
-        )
 
 
 def _apart(other: RPC, model: RPC) -> float:

@@ -28,6 +28,8 @@ from ortho_pipeline.plugin import (
     place,
     read_bounded,
     reads,
+    require_same_rpc,
+    rpc_of_dataset,
     rpc_of_fields,
 )
 
@@ -65,7 +67,10 @@ def ortho_sensors() -> Iterable[Sensor]:
         "EnMAP level 1B: ...SPECTRAL_IMAGE_VNIR.TIF or _SWIR.TIF with ...METADATA.XML",
         recognises,
         open_scene,
-        options={"band": "number of the band whose RPC is used, from 1; default: the middle band"},
+        options={
+            "band": "number of the band whose RPC is used, from 1; default: the middle band",
+            "rpc": "which RPC to use: tag, sidecar, or an RPC file; default: that of the band",
+        },
     )
 
 
@@ -95,8 +100,8 @@ def recognises(dataset: gdal.Dataset) -> bool:
         return False
 
 
-def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
-    """Open the image of a detector with the RPC of one of its bands."""
+def open_scene(dataset: gdal.Dataset, *, band: str | None = None, rpc: str | None = None) -> Scene:
+    """Open the image of a detector with the RPC of one of its bands, or with another that is chosen."""
     name, size = dataset.GetDescription(), (dataset.RasterXSize, dataset.RasterYSize)
     metadata = metadata_of(name)
     if metadata is None:
@@ -118,7 +123,13 @@ def open_scene(dataset: gdal.Dataset, *, band: str | None = None) -> Scene:
         warnings.append(Notice("bands-differ", text, difference_px=round(apart, 3)))
     other = rpcs[facts["bands_vnir"] + facts["bands_swir"] // 2 if detector == "VNIR" else facts["bands_vnir"] // 2]
     facts |= {"detector": detector, "band": number, "parallax_to_other_detector_px_per_km": parallax(model, other)}
-    return Scene("enmap", name, *size, {"rpc": model}, str(path), facts, tuple(warnings))
+    if rpc is None:
+        require_same_rpc(dataset, its, path.name)
+        used, source = model, str(path)
+    else:
+        used, source = rpc_of_dataset(dataset, rpc)
+    sources = () if rpc is None else (path,)
+    return Scene("enmap", name, *size, {"rpc": used}, source, facts, tuple(warnings), sources=sources)
 
 
 @reads(_REMEDY)

@@ -17,18 +17,15 @@ from ortho_pipeline.plugin import (
     Scene,
     Sensor,
     SensorModel,
-    Setting,
-    Text,
     has_rpc,
     hookimpl,
     place,
+    require_same_rpc,
     rpc_of_dataset,
 )
 
 #: If rigorous model and RPC differ by more (px), warn; if by more than the second value, they are of different images.
 APART, DISAGREEMENT = 5.0, 100.0
-#: RPCs of image and XML that differ by more (px) are different models.
-RPCS_APART = 1.0
 
 
 @hookimpl
@@ -100,28 +97,9 @@ def _rpc(dataset: gdal.Dataset, isd: Isd, choice: str | None, tile: Tile | None)
         return rpc_of_dataset(dataset, choice)
     if isd.rpc is None:
         return rpc_of_dataset(dataset) if has_rpc(dataset) else (None, str(isd.path))
-    _require_same(dataset, isd.rpc, tile, place(isd.path).name)
-    return cut(isd.rpc, tile), str(isd.path)
-
-
-def _require_same(dataset: gdal.Dataset, rpc: RPC, tile: Tile | None, xml: str) -> None:
-    """Raise an error if the image has an RPC of its own that differs from that of the XML, of the tile or uncut."""
-    try:
-        own, source = rpc_of_dataset(dataset, "tag")
-    except InputError:
-        return
-    centre = np.array([[own.lon_off, own.lat_off, own.h_off]])
-    seen = own.ground_to_image(centre)
-    apart = min(float(np.abs(one.ground_to_image(centre) - seen).max()) for one in (cut(rpc, tile), rpc))
-    if not apart <= RPCS_APART:
-        raise InputError(
-            f"the RPCs in {source} and in {xml} differ by {apart:.1f} px at the centre of the scene",
-            file=dataset.GetDescription(),
-            field="scene.rpc",
-            remedy=Text(
-                "choose one: ", Setting("scene.rpc", "tag"), ", or the XML with ", Setting("scene.rpc", "FILE")
-            ),
-        )
+    of_tile = cut(isd.rpc, tile)
+    require_same_rpc(dataset, (of_tile, isd.rpc), place(isd.path).name)
+    return of_tile, str(isd.path)
 
 
 def _compared(rigorous: Pushbroom, rpc: RPC | None) -> list[Notice]:

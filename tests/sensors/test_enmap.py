@@ -9,11 +9,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from ortho_enmap import parallax, read_enmap
+from osgeo import gdal
 from products import enmap_text
 from seeds import SIZE, rpc
 from used import pixels, used
 
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.exchange.rpc_files import rpc_metadata
 from ortho_pipeline.host import open_scene
 from ortho_pipeline.models import RPC
 
@@ -106,3 +108,19 @@ def test_what_is_refused(folder: Path, old: str, new: str, said: str) -> None:
     (folder / f"{STEM}-METADATA.XML").write_text(enmap_text(SIZE, bands()).replace(old, new))
     with pytest.raises(InputError, match=said):
         open_scene(image)
+
+
+def tagged(image: Path, model: RPC) -> Path:
+    gdal.OpenEx(str(image), gdal.OF_UPDATE).SetMetadata(rpc_metadata(model), "RPC")
+    return image
+
+
+def test_a_tag_that_contradicts_the_metadata_is_an_error(folder: Path) -> None:
+    image = tagged(pixels(folder / f"{STEM}-SPECTRAL_IMAGE_VNIR.TIF", SIZE, 3), rpc().shifted(0.0, 9.0))
+    (folder / f"{STEM}-METADATA.XML").write_text(enmap_text(SIZE, bands()))
+    with pytest.raises(InputError, match=r"differ by 9\.0 px") as caught:
+        open_scene(image)
+    assert caught.value.field == "scene.rpc"
+    assert open_scene(image, options={"rpc": "tag"}).model.row_off == pytest.approx(rpc().row_off - 9.0)
+    # The metadata have the RPC of each band.
+    assert open_scene(tagged(image, bands()[2])).model.row_off == pytest.approx(rpc().row_off)
