@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from ortho_pipeline.geodesy.crs import ground_transform as ground_transform
     from ortho_pipeline.geodesy.crs import parse_crs as parse_crs
     from ortho_pipeline.geodesy.crs import same_crs as same_crs
+    from ortho_pipeline.geodesy.declared_vertical import declared_vertical as declared_vertical
     from ortho_pipeline.geodesy.ellipsoid import ECCENTRICITY_SQUARED as ECCENTRICITY_SQUARED
     from ortho_pipeline.geodesy.ellipsoid import SEMI_MAJOR as SEMI_MAJOR
     from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation as angles_of_rotation
@@ -209,6 +210,7 @@ _NAMES = {
         "parse_crs",
         "same_crs",
     ),
+    "geodesy.declared_vertical": ("declared_vertical",),
     "geodesy.ellipsoid": (
         "ECCENTRICITY_SQUARED",
         "SEMI_MAJOR",

@@ -43,6 +43,11 @@ def declared_vertical(crs: pyproj.CRS) -> DeclaredVertical | None:
     ------
     DatumError
         If the vertical axis points down.
+
+    Examples
+    --------
+    >>> declared_vertical(pyproj.CRS("EPSG:32636+5773")).vertical.label
+    'EGM96 height (EPSG:5773)'
     """
     if not crs.is_compound and len(crs.axis_info) < 3:
         return None

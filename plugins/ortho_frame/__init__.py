@@ -31,10 +31,12 @@ from ortho_pipeline.plugin import (
     Setting,
     Text,
     Vertical,
+    declared_vertical,
     exterior_sigmas,
     ground_transform,
     height_range,
     hookimpl,
+    parse_crs,
     place,
     pose_sigmas,
     priors_at,
@@ -118,6 +120,7 @@ def open_scene(
         axes = _axes_of(pose, frame or TOPOCENTRIC, crs)
         model = _shot_model(interior, pose, axes, _datum(vertical), **others)
     else:
+        vertical = vertical or _declared(pose.crs)
         # Orthority's angles belong to the axes of its map.
         model = _model(
             interior, pose, crs or pose.crs, _datum(vertical), frame or (MAP if own else TOPOCENTRIC), **others
@@ -177,6 +180,7 @@ def open_orthority(
         )
     pose = read_exterior(files[1], dataset.GetDescription())
     assert isinstance(pose, Pose)
+    vertical = vertical or _declared(pose.crs)
     interior = read_camera(files[0], dataset.RasterXSize, dataset.RasterYSize, pose.camera)
     model = _model(interior, pose, pose.crs, _datum(vertical), MAP, heights=heights)
     return _scene("orthority", dataset, model, pose, str(files[1]), vertical, heights, sigmas, (files[0],))
@@ -211,6 +215,12 @@ def _scene(
 def _datum(vertical: str | None) -> Vertical:
     """Return the height datum; an unknown one counts as ellipsoidal, with a warning."""
     return Vertical.parse("ellipsoid" if vertical is None else vertical)
+
+
+def _declared(crs: str | None) -> str | None:
+    """Return the height datum that the compound CRS of a file declares; None without."""
+    declared = None if crs is None else declared_vertical(parse_crs(crs))
+    return declared.vertical.name if declared is not None and declared.certain and declared.vertical else None
 
 
 def _unknown_datum() -> Notice:

@@ -188,6 +188,11 @@ def test_orthoritys_files_are_found_and_mean_its_map(tmp_path):
     stated = open_scene(tmp_path / "one.tif", SceneOptions(sensor_options={"vertical": "egm96"}))
     assert stated.model.exterior[2] > 2520.0
     assert stated.notices == ()
+    file = tmp_path / "my_ext_param.geojson"
+    file.write_text(file.read_text().replace("EPSG:32636", "EPSG:32636+5773"))
+    declared = open_scene(tmp_path / "one.tif")
+    assert declared.model.exterior[2] == pytest.approx(stated.model.exterior[2], abs=1e-6)
+    assert declared.notices == ()
 
 
 @pytest.mark.parametrize(
