@@ -19,10 +19,11 @@ import numpy as np
 import pyproj
 from numpy.typing import ArrayLike, NDArray
 
-from ortho_pipeline.errors import InputError, completed, reads
+from ortho_pipeline.errors import CrsError, InputError, completed, reads
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files import json_text, write_text
 from ortho_pipeline.geodesy.crs import Vertical, ground_transform, horizontal, parse_crs
+from ortho_pipeline.geodesy.declared_vertical import declared_vertical
 from ortho_pipeline.geodesy.naming import crs_definition
 from ortho_pipeline.points.formats import read_table
 from ortho_pipeline.points.geojson import feature_of
@@ -126,10 +127,10 @@ class Points:
         object.__setattr__(self, "groups", checked_groups(self.groups, count))
         for name in CSV_ERRORS[4:]:
             object.__setattr__(self, name, checked_common(getattr(self, name), count, name))
-        roles = np.asarray(self.roles, dtype="<U7")
+        roles = np.asarray(self.roles, dtype=str)
         if roles.shape != (count,) or not set(roles.tolist()) <= set(ROLES):
             raise InputError(f"each role must be one of {', '.join(ROLES)}", field="roles")
-        object.__setattr__(self, "roles", roles)
+        object.__setattr__(self, "roles", roles.astype("<U7"))
         if len(set(self.ids)) != count:
             twice = sorted({name for name in self.ids if self.ids.count(name) > 1})
             raise InputError(f"two points have the id {twice[0]!r}", file=self.source or None, field="id")
@@ -153,23 +154,31 @@ class Points:
         Raises
         ------
         InputError
-            If the shapes do not agree, or `crs` is not a CRS.
+            If the shapes do not agree, or `crs` is not a CRS or has heights above a geoid.
 
         Examples
         --------
         >>> Points.of([[10.0, 20.0]], [[33.35, 37.25, 800.0]], "EPSG:4979")
         <1 point: 1 control; WGS 84; arrays>
         """
-        image = np.asarray(image, dtype=float)
-        count = len(image)
+        crs = parse_crs(crs)
+        heights = declared_vertical(crs)
+        if heights is not None and (heights.vertical is None or not heights.vertical.is_ellipsoid):
+            raise CrsError(
+                f"{crs.name!r} has heights above a geoid; points have them above the ellipsoid",
+                field="crs",
+                remedy="give the horizontal CRS, and `op.Vertical.parse(DATUM).ellipsoidal(lon, lat, heights)`",
+            )
+        image = _numbers("image", image)
+        count = len(image) if image.ndim else 0
         return cls(
-            ids=tuple(ids) if ids is not None else tuple(str(k + 1) for k in range(count)),
+            ids=tuple(map(str, ids)) if ids is not None else tuple(str(k + 1) for k in range(count)),
             image=image,
-            ground=np.asarray(ground, dtype=float),
-            roles=np.broadcast_to(np.asarray(roles), (count,)),
-            sigma_image=np.broadcast_to(np.asarray(sigma_image, dtype=float), (count,)),
-            sigma_ground=np.broadcast_to(np.asarray(sigma_ground, dtype=float), (count, 3)),
-            crs=parse_crs(crs),
+            ground=_numbers("ground", ground),
+            roles=np.full(count, roles) if np.size(roles) == 1 else np.array(roles),
+            sigma_image=_numbers("sigma_image", sigma_image, (count,)),
+            sigma_ground=_numbers("sigma_ground", sigma_ground, (count, 3)),
+            crs=crs,
             source="arrays",
         )
 
@@ -220,7 +229,8 @@ class Points:
 
     def select(self, mask: ArrayLike) -> Points:
         """Return the points that a mask ``(N,)`` or indices select, in their order."""
-        index = np.arange(len(self))[np.asarray(mask)]
+        mask = np.asarray(mask)
+        index = np.arange(len(self))[mask if mask.size else mask.astype(int)]
         return replace(
             self,
             ids=tuple(self.ids[i] for i in index),
@@ -268,6 +278,15 @@ class Points:
         elif missing.any():
             ground[missing] = np.nan
         return replace(self, ground=ground, crs=target)
+
+
+def _numbers(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+    """Return a copy of the values as numbers, repeated to a shape."""
+    try:
+        numbers = np.array(values, dtype=float)
+        return numbers if shape is None else np.broadcast_to(numbers, shape)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is no array of numbers of the right shape ({error})", field=name) from error
 
 
 # -- reading ---------------------------------------------------------------------------------------------------------

@@ -534,3 +534,42 @@ def test_a_pixel_is_the_same_to_a_millionth(tmp_path):
                 read_points(path, crs="EPSG:4979", vertical="ellipsoid")
         else:
             assert len(read_points(path, crs="EPSG:4979", vertical="ellipsoid")) == 2
+
+
+def test_heights_above_a_geoid_are_no_points_of_arrays() -> None:
+    with pytest.raises(CrsError, match="above a geoid") as caught:
+        Points.of([[10.0, 20.0]], [[33.0, 37.0, 800.0]], "EPSG:4326+5773")
+    remedy = str(caught.value.remedy).split("`")[1].removeprefix("op.")
+    scope = {"Vertical": Vertical, "DATUM": "egm96", "lon": [33.0], "lat": [37.0], "heights": [800.0]}
+    assert eval(remedy, scope)[0] == pytest.approx(832.9, abs=0.05)  # the undulation of EGM96 there
+    for crs in ("EPSG:4979", "EPSG:4326", "EPSG:32636"):
+        assert len(Points.of([[10.0, 20.0]], [[33.0, 37.0, 800.0]], crs)) == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "values"),
+    [
+        ("roles", "controls"),
+        ("roles", ["control", "control-check", "check"]),
+        ("roles", ["control"] * 2),
+        ("sigma_image", [1.0, 2.0]),
+        ("sigma_image", "unknown"),
+        ("sigma_ground", [1.0, 2.0, 3.0, 4.0]),
+        ("image", 5.0),
+        ("ground", [["a", "b", "c"]] * 3),
+    ],
+)
+def test_arrays_that_are_no_points_are_refused_by_name(field: str, values: object) -> None:
+    arrays = {"image": np.zeros((3, 2)), "ground": np.zeros((3, 3)), "crs": "EPSG:4979"}
+    with pytest.raises(InputError) as caught:
+        Points.of(**{**arrays, field: values})
+    assert caught.value.field == field
+
+
+def test_points_do_not_change_with_the_arrays_they_were_made_of() -> None:
+    image = np.array([[1.0, 2.0], [3.0, 4.0]])
+    points = Points.of(image, [[33.0, 37.0, 0.0], [33.1, 37.0, 0.0]], "EPSG:4979", ids=[7, 8])
+    image[:] = 0.0
+    assert points.image.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert points.ids == ("7", "8")
+    assert len(points.select([])) == 0
