@@ -369,7 +369,8 @@ class _Apart:
 
 def _checks(solution: Solution, points: Points, used: np.ndarray, common: Array | None) -> _Apart | None:
     """Return the distances of check points that have an image."""
-    usable = points.check & np.isfinite(solution.model.ground_to_image(points.ground)).all(axis=1)
+    seen = points.image - solution.model.ground_to_image(points.ground)
+    usable = points.check & np.isfinite(seen).all(axis=1)
     if not usable.any():
         return None
     apart = _Apart.of(solution, Problem.of(solution.model, points, usable, {}))

@@ -166,15 +166,15 @@ class Fit:
             Used control points, check points, or control points left out one at a time. 'matched': check points that
             are matches, if others were measured. 'agreeing': check points without outliers, which is not the accuracy.
         """
+        if which not in (known := ("control", "check", "loo", "matched", "agreeing")):
+            raise InputError(f"there is no RMSE of {which!r}", field="which", remedy=f"use one of {', '.join(known)}")
         if which == "loo":
             residuals = self.loo_residuals[np.isfinite(self.loo_residuals).all(axis=1)]
         elif which == "control":
             residuals = self.residuals[self.used]
         else:
-            checks = self.points.tests
-            if which == "matched":
-                checks = self.points.check & ~checks
-            elif which == "agreeing":
+            checks = self.points.check & ~self.points.tests if which == "matched" else self.points.tests
+            if which == "agreeing":
                 off = {point.id for point in self.outlying}
                 checks = checks & np.array([name not in off for name in self.points.ids], dtype=bool)
             residuals = self.residuals[checks]

@@ -16,8 +16,9 @@ from ortho_pipeline.estimation.family_fit import fit_own, prune, restricted, rid
 from ortho_pipeline.estimation.fit import Fit, fit
 from ortho_pipeline.estimation.observations.common_unknown import CommonGroundError
 from ortho_pipeline.estimation.observations.on_points import OnPoints, Planes
+from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.models import RPC, ImageCorrection
-from ortho_pipeline.points import Points
+from ortho_pipeline.points import Points, read_points
 
 ORIGIN = (800.0, 1100.0)
 
@@ -269,3 +270,23 @@ def test_points_that_a_model_cannot_project_are_named_by_their_role(level: RPC) 
     assert noted([10]) == {"check": [ids[10]]}
     assert noted([2, 10, 11]) == {"control": [ids[2]], "check": [ids[10], ids[11]]}
     assert noted([2, 5, 10], exclude={ids[2]: "moved"}) == {"control": [ids[5]], "check": [ids[10]]}
+
+
+def test_an_unknown_figure_is_refused_and_not_taken_for_that_of_the_check_points(sample) -> None:
+    points = read_points(sample / "gcps.geojson")
+    result = fit(ImageCorrection.identity(read_rpc(sample / "scene_RPC.TXT"), "shift", (500.0, 500.0)), points)
+    assert result.rmse("check").n == 6
+    for name in ("Control", "leave-one-out", None):
+        with pytest.raises(InputError, match="no RMSE of"):
+            result.rmse(name)
+
+
+def test_a_check_point_without_an_image_position_has_no_residual(sample) -> None:
+    points = read_points(sample / "gcps.geojson")
+    image = points.image.copy()
+    image[np.flatnonzero(points.check)[0]] = np.nan
+    model = ImageCorrection.identity(read_rpc(sample / "scene_RPC.TXT"), "shift", (500.0, 500.0))
+    result = fit(model, dataclasses.replace(points, image=image))
+    assert result.rmse("check").n == 5
+    assert not result.outlying
+    np.testing.assert_allclose(result.values, fit(model, points).values)
