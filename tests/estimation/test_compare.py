@@ -39,7 +39,7 @@ from ortho_pipeline.exchange.rpc import read_rpc
 from ortho_pipeline.geodesy.crs import ground_transform
 from ortho_pipeline.models import RPC, families
 from ortho_pipeline.options import OutputOptions, PointOptions, SceneOptions, SurfaceOptions
-from ortho_pipeline.points import Points
+from ortho_pipeline.points import Points, read_points
 
 CAMERA = LineScanner.over(33.35, 37.25, 850.0, off_nadir_deg=20.0, heights=(650.0, 1350.0))
 TERRAIN = Terrain("EPSG:32636", 531100.0, 4122700.0)
@@ -549,3 +549,14 @@ def test_the_recommended_model_is_mostly_the_best(sensor):
     losses = [loss(sensor, seed, count) for seed in range(2, 8) for count in (40, 60)]
     assert np.median(losses) <= 1.02
     assert np.mean(np.array(losses) > 1.3) <= 0.1
+
+
+def test_names_of_models_are_checked_and_may_come_one_by_one(sample: Path) -> None:
+    points, own = read_points(sample / "gcps.geojson"), read_rpc(sample / "scene_RPC.TXT")
+    names = ["rpc+shift", "dlt"]
+    for given in (names, iter(names), "rpc+shift,dlt"):
+        assert [row.model for row in compare(points, given, own=own).rows] == names
+    for wrong, model in ((["nothing"], own), (["rpc+shift"], None), ([], own)):
+        with pytest.raises(InputError, match="model") as caught:
+            compare(points, wrong, own=model)
+        assert "affine3d" in str(caught.value.remedy)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
@@ -133,7 +133,7 @@ def choose_models(text: str, own: SensorModel | None = None) -> tuple[str, ...]:
 @one_blas_thread()
 def compare(
     points: Points,
-    models: Sequence[str],
+    models: Iterable[str],
     *,
     own: SensorModel | None = None,
     priors: Mapping[str, Prior] | None = None,
@@ -151,8 +151,8 @@ def compare(
 
     Parameters
     ----------
-    models : sequence of str
-        From `choose_models`.
+    models : iterable of str
+        Names such as ``affine3d``, or ``all``; `available_models` lists them.
     own : SensorModel, optional
         The scene's own model, for names such as ``rpc+shift``.
     priors : mapping of parameter name to Prior, optional
@@ -172,6 +172,11 @@ def compare(
     robust : bool
         Find gross errors and leave them out.
 
+    Raises
+    ------
+    InputError
+        If a name is unknown or there is none.
+
     Examples
     --------
     >>> points = op.read_points("sample_data/gcps.geojson")
@@ -179,6 +184,7 @@ def compare(
     'affine3d'
     """
     known = available_models(own)
+    models = choose_models(models if isinstance(models, str) else ",".join(map(str, models)), own)
     job = _Job(own, dict(priors or {}), size, crs, heights, ridge)
     first = {name: job.attempt(name, points, robust) for name in models}
     blunders = _blunders([outcome for outcome in first.values() if isinstance(outcome, Fit)])
