@@ -15,6 +15,7 @@ from pathlib import Path
 
 import click
 import numpy as np
+import pyproj
 import pytest
 import shapely
 
@@ -273,3 +274,34 @@ def test_signatures_are_read_by_people(name: str) -> None:
 def test_options_are_shown_as_they_are_written() -> None:
     assert repr(op.SceneOptions()) == "SceneOptions()"
     assert repr(op.SceneOptions(rpc="tag", crop_offset=(1, 2))) == "SceneOptions(rpc='tag', crop_offset=(1, 2))"
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        (op.OutputOptions, "resolution", "10"),
+        (op.OutputOptions, "resolution", (10.0,)),
+        (op.OutputOptions, "extent", "1 2 3 4"),
+        (op.OutputOptions, "bands", ["1"]),
+        (op.OutputOptions, "bands", []),
+        (op.OutputOptions, "memory", "1GB"),
+        (op.SurfaceOptions, "dem", ["dem.tif"]),
+        (op.SurfaceOptions, "override_vertical", "egm96"),
+        (op.MatchOptions, "reference", "reference.tif"),
+        (op.MatchOptions, "reference", (name for name in ("a.tif", "b.tif"))),
+        (op.PointOptions, "gcps", ["gcps.csv"]),
+        (op.SceneOptions, "sensor_options", "a=b"),
+    ],
+)
+def test_a_value_of_a_wrong_type_is_refused_with_the_name_of_its_option(group, name, value) -> None:
+    with pytest.raises(InputError, match=" is not ") as caught:
+        group(**{name: value})
+    assert str(caught.value.field).endswith(f".{name}")
+    assert caught.value.remedy
+
+
+def test_values_of_numpy_and_pyproj_are_options() -> None:
+    output = op.OutputOptions(resolution=np.float32(20), crs=pyproj.CRS(32636), bands=np.array([1]), nodata=np.uint8(0))
+    assert output == op.OutputOptions(resolution=20.0, crs="EPSG:32636", bands=[1], nodata=0)
+    surface = op.SurfaceOptions(height=np.float32(800))
+    json.dumps([output.resolution, output.crs, output.bands, output.nodata, surface.height])

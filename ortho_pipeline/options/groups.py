@@ -4,7 +4,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.options.option import CORRECTIONS, PIXEL_ORIGINS, Option, PathLike, documented
@@ -79,6 +79,7 @@ def _is_file(value: object) -> bool:
     return isinstance(value, str | os.PathLike) and (os.fspath(value).startswith("/vsi") or os.path.isfile(value))
 
 
+@runtime_checkable
 class PointTable(Protocol):
     """Points that are read already: `ortho_pipeline.Points`."""
 

@@ -1,12 +1,15 @@
 """What an option is: its flag, its help, and the values that it may have."""
 
 # Annotations are read from the classes: as values, not as text.
+import functools
 import inspect
 import math
 import os
+import reprlib
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields
-from typing import Any, Literal, TypeVar, get_args
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from ortho_pipeline.errors import InputError
 
@@ -179,6 +182,7 @@ def documented(group: type[_T]) -> type[_T]:
     group.__doc__ = f"{text}\n\nParameters\n----------\n" + "\n".join(lines) + heading + examples
     types = {field.name: get_args(field.type)[0] for field in fields(group)}  # type: ignore[arg-type]
     group.__init__.__annotations__ = {**types, "return": None}
+    group.__init__ = _checking(group.__init__)  # type: ignore[method-assign]
     group.__repr__ = _as_called  # type: ignore[method-assign]
     return group
 
@@ -193,3 +197,71 @@ def _as_called(self: Any) -> str:
     return (
         f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in values if value != defaults[name])})"
     )
+
+
+#: What a value of a kind is called; texts and files have the types of their field.
+_FORMS = {
+    "number": "a number",
+    "integer": "a whole number",
+    "bytes": "a whole number of bytes",
+    "pair": "a list of two numbers",
+    "box": "a list of four numbers: xmin, ymin, xmax, ymax",
+    "one or two": "a number or a list of two",
+    "number or word": "a number or a text",
+    "number or nan": "a number",
+    "integers": "a list of whole numbers",
+    "files": "a list of files",
+    "folders": "a list of folders",
+    "keys": "a mapping of names to texts",
+}
+
+
+def _checking(init: Any) -> Any:
+    """Return an ``__init__`` that refuses values of a wrong type; NumPy's values and CRSs become plain ones."""
+
+    @functools.wraps(init)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        init(self, *args, **kwargs)
+        for name, option in options_of(type(self)).items():
+            value, kind = getattr(self, name), self.__init__.__annotations__[name]
+            plain = _plain(value, option.kind, kind)
+            if plain is not None and not _fits(plain, option.kind, kind):
+                form = "True or False" if kind is bool else "a path" if os.PathLike in _types(kind) else "a text"
+                form = _FORMS.get(option.kind, form)
+                group = type(self).__name__.removesuffix("Options").lower()
+                group = {"point": "points", "block": "points"}.get(group, group)
+                raise InputError(f"{reprlib.repr(value)} is not {form}", field=f"{group}.{name}", remedy=f"give {form}")
+            object.__setattr__(self, name, plain)
+
+    return checked
+
+
+def _plain(value: Any, form: Kind, kind: Any) -> Any:
+    if isinstance(value, type):
+        return value
+    if hasattr(value, "tolist"):  # of NumPy, which a record cannot hold
+        value = value.tolist()
+    elif hasattr(value, "to_wkt"):  # a CRS of pyproj
+        value = value.to_string()
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if number and form == "text" and kind is not bool else value
+
+
+def _types(kind: Any) -> set[Any]:
+    members = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    return {get_origin(member) or member for member in members}
+
+
+def _fits(value: Any, form: Kind, kind: Any) -> bool:
+    """Return whether a value has the type of its field, and as many numbers as its form needs."""
+    types = _types(kind)
+    if form in ("text", "file") and kind is not bool:
+        return isinstance(value, (*types, os.PathLike))
+    if isinstance(value, str):
+        return str in types
+    if isinstance(value, int | float):
+        return bool(types & {float, bool} or form == "number or word" or (int in types and isinstance(value, int)))
+    if not isinstance(value, Sequence) or form in ("files", "folders"):
+        return isinstance(value, tuple(types))
+    counts = {"pair": (2,), "box": (4,), "one or two": (2,), "integers": range(1, 1000)}.get(form, ())
+    return len(value) in counts and all(isinstance(one, int if form == "integers" else int | float) for one in value)
