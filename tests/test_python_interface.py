@@ -305,3 +305,19 @@ def test_values_of_numpy_and_pyproj_are_options() -> None:
     assert output == op.OutputOptions(resolution=20.0, crs="EPSG:32636", bands=[1], nodata=0)
     surface = op.SurfaceOptions(height=np.float32(800))
     json.dumps([output.resolution, output.crs, output.bands, output.nodata, surface.height])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "remedy"),
+    [
+        ("points", "gcps.csv", "op.PointOptions(gcps='gcps.csv')"),
+        ("surface", Path("dem.tif"), "op.SurfaceOptions(dem='dem.tif')"),
+        ("match", "reference.tif", "op.MatchOptions(reference=['reference.tif'])"),
+        ("output", {"resolution": 10.0}, "op.OutputOptions(**{'resolution': 10.0})"),
+    ],
+)
+def test_a_path_in_place_of_options_is_refused_with_the_options(name, value, remedy, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        op.rectify("scene.tif", tmp_path, **{name: value})
+    assert (caught.value.field, caught.value.remedy) == (name, f"give {remedy}")
+    assert isinstance(eval(remedy), getattr(op, remedy[3:].partition("(")[0]))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
 from typing import Any, ParamSpec, TypeVar, cast
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files import read_bounded
 from ortho_pipeline.files.locations import Location
-from ortho_pipeline.options import MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
+from ortho_pipeline.options import GROUPS, MatchOptions, OutputOptions, PointOptions, SceneOptions, SurfaceOptions
 from ortho_pipeline.points import Points
 from ortho_pipeline.stores.sidecars import ask_beside
 from ortho_pipeline.stores.stac.item import Asset, Item, item_at, read_item
@@ -37,6 +37,7 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
         bound = signature.bind(*args, **named)
         bound.apply_defaults()
         arguments = bound.arguments
+        _refuse_plain(arguments)
         place = next((name for name, value in arguments.items() if isinstance(value, SceneOptions)), None)
         scene = _of_first(arguments) if place is None else cast(SceneOptions, arguments[place])
         for name, value in arguments.items():
@@ -55,6 +56,20 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
         return command(*bound.args, **bound.kwargs)
 
     return wrapper
+
+
+def _refuse_plain(arguments: Mapping[str, Any]) -> None:
+    """Refuse a path or a mapping in place of options."""
+    for group, kind in GROUPS.items():
+        value = arguments.get(group)
+        if not isinstance(value, str | os.PathLike | Mapping):
+            continue
+        text = f"**{value!r}"
+        if not isinstance(value, Mapping):
+            file: Any = os.fspath(value)
+            text = f"{fields(kind)[0].name}={[file] if group == 'match' else file!r}"
+        remedy = f"give op.{kind.__name__}({text})"
+        raise InputError(f"a {type(value).__name__} is not {kind.__name__}", field=group, remedy=remedy)
 
 
 def _of_first(arguments: dict[str, Any]) -> SceneOptions:
