@@ -321,3 +321,13 @@ def test_a_path_in_place_of_options_is_refused_with_the_options(name, value, rem
         op.rectify("scene.tif", tmp_path, **{name: value})
     assert (caught.value.field, caught.value.remedy) == (name, f"give {remedy}")
     assert isinstance(eval(remedy), getattr(op, remedy[3:].partition("(")[0]))
+
+
+def test_an_error_names_the_file_of_any_kind_of_path(tmp_path: Path) -> None:
+    class Named:
+        def __fspath__(self) -> str:
+            return "nowhere.csv"
+
+    with pytest.raises(InputError) as caught:
+        op.read_points(Named())
+    assert caught.value.file == "nowhere.csv"

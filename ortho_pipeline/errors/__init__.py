@@ -71,7 +71,7 @@ class OrthoError(Exception):
         remedy: str | None = None,
     ) -> None:
         self.message = message
-        self.file = None if file is None else str(file)
+        self.file = None if file is None else str(fspath(file) if isinstance(file, PathLike) else file)
         self.field = field
         self.remedy = remedy
         super().__init__(message)
