@@ -331,3 +331,15 @@ def test_an_error_names_the_file_of_any_kind_of_path(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         op.read_points(Named())
     assert caught.value.file == "nowhere.csv"
+
+
+def test_gdal_exceptions_that_the_caller_turned_off_change_no_error(sample: Path) -> None:
+    from osgeo import gdal
+
+    op.open_scene(sample / "scene.tif")
+    gdal.DontUseExceptions()
+    try:
+        with pytest.raises(InputError, match="cannot open this as a raster"):
+            op.open_scene(sample / "gcps.csv")
+    finally:
+        gdal.UseExceptions()

@@ -82,6 +82,7 @@ def open_seen(
     RuntimeError
         If GDAL cannot open the file.
     """
+    gdal.UseExceptions()  # other code of the process may have turned them off since the import
     remove_network_drivers()
     if siblings:
         ask_beside(path, allow_network=True)
