@@ -343,3 +343,11 @@ def test_gdal_exceptions_that_the_caller_turned_off_change_no_error(sample: Path
             op.open_scene(sample / "gcps.csv")
     finally:
         gdal.UseExceptions()
+
+
+def test_a_correction_needs_a_value_for_each_parameter(sample: Path) -> None:
+    start = op.ImageCorrection.identity(op.open_scene(sample / "scene.tif").model, "shift", (500.0, 500.0))
+    assert start.with_params([1.0, 2.0]).params.tolist() == [1.0, 2.0]
+    for wrong in ([1.0], 1.0, [1.0, 2.0, 3.0]):
+        with pytest.raises(InputError, match="col_shift, row_shift"):
+            start.with_params(wrong)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -337,6 +337,14 @@ def _as_points(points: ArrayLike, columns: int, what: str) -> Array:
     array = np.ascontiguousarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != columns:
         raise InputError(f"{what} points must have the shape (N, {columns}), not {array.shape}")
+    return array
+
+
+def as_params(params: ArrayLike, names: Sequence[str]) -> Array:
+    """Return parameters ``(P,)`` as float64, one for each name."""
+    array = np.asarray(params, dtype=np.float64)
+    if array.shape != (len(names),):
+        raise InputError(f"parameters must have the shape ({len(names)},), not {array.shape}: {', '.join(names)}")
     return array
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
-from ortho_pipeline.models.base import Array, SensorModel, as_image, model_from_dict
+from ortho_pipeline.models.base import Array, SensorModel, as_image, as_params, model_from_dict
 
 COEFFICIENTS = ("col_shift", "col_per_col", "col_per_row", "row_shift", "row_per_col", "row_per_row")
 FREE = {
@@ -173,7 +173,7 @@ class ImageCorrection(OverAnother):
 
     def with_params(self, params: ArrayLike) -> Self:
         coefficients = np.zeros(6)
-        coefficients[self._free] = params
+        coefficients[self._free] = as_params(params, self.param_names)
         return self._replace(coefficients=coefficients)
 
     @property

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs
-from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image, box_around, ground_of_corners
+from ortho_pipeline.models.base import Array, SensorModel, as_ground, as_image, as_params, box_around, ground_of_corners
 
 PARAMETERS = ("shift_x", "shift_y", "relief_x", "relief_y")
 #: Length (m) over which a direction on the ellipsoid is converted to the map.
@@ -168,7 +168,7 @@ class MapPlane(SensorModel):
         return np.array([*self.shift, *self.relief])
 
     def with_params(self, params: ArrayLike) -> Self:
-        values = np.asarray(params, dtype=np.float64)
+        values = as_params(params, self.param_names)
         return self._replace(shift=(values[0], values[1]), relief=(values[2], values[3]))
 
     def ground_to_image(self, ground: ArrayLike) -> Array:

@@ -34,6 +34,7 @@ from ortho_pipeline.models.base import (
     SensorModel,
     as_ground,
     as_image,
+    as_params,
 )
 from ortho_pipeline.models.families import exponents, family_of, points_needed
 from ortho_pipeline.models.polynomials import term_partials, term_table, terms_of
@@ -331,7 +332,7 @@ class Rational(SensorModel):
 
     def with_params(self, params: ArrayLike) -> Self:
         coefficients = np.zeros(len(self.coefficients))
-        coefficients[self._free] = params
+        coefficients[self._free] = as_params(params, self.param_names)
         return self._replace(coefficients=coefficients)
 
     @property

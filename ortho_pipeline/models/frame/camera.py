@@ -31,6 +31,7 @@ from ortho_pipeline.models.base import (
     SensorModel,
     as_ground,
     as_image,
+    as_params,
     box_around,
     checked_names,
     ground_of_corners,
@@ -233,7 +234,7 @@ class FrameCamera(SensorModel):
         ValueError
             If one of them is not finite.
         """
-        values = self._values | dict(zip(self.free, np.asarray(params, dtype=np.float64).tolist(), strict=True))
+        values = self._values | dict(zip(self.free, as_params(params, self.free).tolist(), strict=True))
         exterior = np.array([values[name] for name in EXTERIOR])
         if not np.isfinite(exterior).all():
             raise ValueError("a parameter is not finite")

@@ -55,6 +55,7 @@ from ortho_pipeline.models.base import (
     SensorModel,
     as_ground,
     as_image,
+    as_params,
     box_around,
     checked_names,
     ground_of_grid,
@@ -227,7 +228,7 @@ class Pushbroom(SensorModel):
             If one of them is not finite.
         """
         values = self._values.copy()
-        values[self._columns] = np.asarray(params, dtype=np.float64)
+        values[self._columns] = as_params(params, self.param_names)
         if not np.isfinite(values).all():
             raise ValueError("a parameter is not finite")
         path, attitude, path_line, attitude_line, camera = self.parameters.split(values)
