@@ -204,14 +204,22 @@ def _checked(ctx: click.Context, args: Sequence[str], params: Sequence[click.Par
             return words + rest
         option = known.get(word)
         if option is None:
+            if word.startswith("--") and word.endswith("=") and word[:-1] in known:
+                _empty(ctx, word[:-1])
             if _WORD.match(word) and not _repeated(word, known):
                 _unknown(ctx, word, known)
             continue
         taken = [] if option.is_flag or option.count else [rest.pop(0) for _ in range(min(option.nargs, len(rest)))]
         if isinstance(option.type, OneOrTwo) and all(map(_NUMBER.fullmatch, (*taken, *(rest[:1] or ["-"])))):
             taken = [f"{taken[0]},{rest.pop(0)}"]
+        if "" in taken:
+            _empty(ctx, word)
         words += taken
     return words
+
+
+def _empty(ctx: click.Context, name: str) -> NoReturn:
+    ctx.fail(f"The value of '{name}' is empty. Is a variable of your shell not set?")
 
 
 def _repeated(word: str, known: Mapping[str, click.Option]) -> bool:

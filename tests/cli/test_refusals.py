@@ -191,3 +191,11 @@ def test_a_pixel_larger_than_the_earth_is_none(tiny, tmp_path, text):
 def test_an_extent_beyond_what_numbers_tell_apart_is_none(tiny, tmp_path, box):
     words = ["rectify", str(tiny.image), "--height", "500", "-tr", "5", "5", "-o", str(tmp_path / "out"), "-te", *box]
     assert "is not an extent" in document(words)["message"]
+
+
+@pytest.mark.parametrize("words", [["--reference", ""], ["--reference="], ["-t_srs", ""], ["-o", ""], ["--gcps="]])
+def test_an_empty_value_is_refused_and_not_taken_for_no_option(tiny, tmp_path, words):
+    command = ["rectify", str(tiny.image), "--dem", str(tiny.dem), "-o", str(tmp_path), "--dry-run", *words]
+    done = CliRunner().invoke(cli, command)
+    assert done.exit_code == 2
+    assert f"The value of '{words[0].rstrip('=')}' is empty" in done.stderr
