@@ -194,3 +194,10 @@ def test_cells_of_nan_have_no_value_without_nodata(tmp_path):
     del written
     shares = filled_of(open_ortho(tmp_path / "nan.tif", SceneOptions()), SceneOptions(), 4)
     np.testing.assert_allclose(shares, np.repeat([[1.0, 1.0, 0.0, 0.0]], 4, axis=0))
+
+
+def test_a_band_that_the_ortho_has_not_is_refused(tmp_path: Path) -> None:
+    path = raster(tmp_path / "o.tif", *GRIDS["metres"])
+    done = CliRunner().invoke(cli, ["verify", str(path), "--reference", str(path), "--compare-band", "2"])
+    assert done.exit_code == 2
+    assert "there is no band 2: the ortho has 1 band" in done.stderr

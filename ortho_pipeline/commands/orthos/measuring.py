@@ -18,6 +18,7 @@ from ortho_pipeline.commands.control.matching import Matched, match_scene
 from ortho_pipeline.commands.orthos.masks import ClassMask
 from ortho_pipeline.commands.orthos.opening import filled_of, open_ortho
 from ortho_pipeline.errors import InputError
+from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.estimation.ground_residuals import metre_partials
 from ortho_pipeline.estimation.spatial.displacement_field import DisplacementField
 from ortho_pipeline.estimation.spatial.shared_errors import MATCHED_ALIKE
@@ -231,6 +232,14 @@ def _matched(
 def _intensity(
     source: RasterSource, bands: Sequence[int], masks: Sequence[ClassMask], opened: SceneOptions
 ) -> Intensity:
+    count = len(source.bands)
+    if max(bands, default=1) > count:
+        raise InputError(
+            f"there is no band {max(bands)}: the ortho has {counted(count, 'band')}",
+            file=source.path,
+            field="band",
+            remedy=f"give one from 1 to {count}",
+        )
     if not masks:
         return Intensity(source, bands)
     from ortho_pipeline.commands.orthos.masks import Masked
