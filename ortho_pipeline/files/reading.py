@@ -55,6 +55,23 @@ def read_bounded(path: str | os.PathLike[str], limit: int, **told: str) -> bytes
         raise InputError(f"this file cannot be read ({reason})", file=path, **told) from error
 
 
+def why_no_file(name: str) -> str:
+    """Return why a path is neither a file nor a folder.
+
+    Examples
+    --------
+    >>> why_no_file("missing.tif")
+    'there is no such file'
+    """
+    try:
+        os.stat(name)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return "there is no such file"
+    except OSError as error:
+        return f"this file cannot be read ({error.strerror})"
+    return "this is a pipe or a device"
+
+
 def decoded(data: bytes) -> str:
     """Return text that ought to be UTF-8 but may be Latin-1: what is read of it is ASCII, its names need not be.
 

@@ -26,6 +26,7 @@ from ortho_pipeline.errors import InputError, reads
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.files.folders import listing
 from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_path, located, members
+from ortho_pipeline.files.reading import why_no_file
 from ortho_pipeline.files.shell import converted
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
 from ortho_pipeline.raster.opening.drivers import DRIVERS
@@ -124,9 +125,8 @@ def _opened(
         drivers.remove("VRT")
         if Location(name).in_archive and not place.exists():
             raise InputError("there is no such file in the archive", file=name, remedy=_in_archive(name))
-    elif not Path(name).is_file() and not (Path(name).is_dir()):
-        what = "this is a pipe or a device" if Path(name).exists() else "there is no such file"
-        raise InputError(what, file=name, remedy=check_path(name))
+    elif not os.path.isfile(name) and not os.path.isdir(name):
+        raise InputError(why_no_file(name), file=name, remedy=check_path(name))
     elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
         raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))
     elif Path(name).suffix.lower() != ".vrt":

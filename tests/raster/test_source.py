@@ -139,3 +139,8 @@ def test_a_block_of_a_gigabyte_is_opened(tmp_path):
 def test_a_larger_block_is_refused_with_its_size(tmp_path):
     with pytest.raises(InputError, match=f"32768 x 32768 pixels in blocks of {1 << 31} bytes"):
         RasterSource(one_block(tmp_path / "a.tif", gdal.GDT_UInt16))
+
+
+def test_a_name_that_is_too_long_for_the_system_is_named_as_the_cause() -> None:
+    with pytest.raises(InputError, match=r"cannot be read \(File name too long\)"):
+        RasterSource("x" * 300)
