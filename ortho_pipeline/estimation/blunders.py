@@ -209,7 +209,7 @@ def _snooping_start(
     count = len(problem.rows)
     keep = np.ones(count, dtype=bool) if keep is None else keep.copy()
     # One more than the limit: then the caller raises an error.
-    while (~keep).sum() <= REJECTED_LIMIT * count:
+    while (~keep).sum() <= REJECTED_LIMIT * count and keep.sum() > problem.fewest:
         tested = _against_others(solution)
         if tested is None:
             break

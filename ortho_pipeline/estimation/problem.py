@@ -147,6 +147,12 @@ class Problem:
         """Their measurements ``(n, 2)`` px."""
         return self.points.image
 
+    @property
+    def fewest(self) -> int:
+        """Least number of points that it needs."""
+        known = len(self.priors) + (len(self.model.constraints()) if self.priors else 0)
+        return math.ceil((len(self.model.params) - known) / 2) if known else self.model.minimum_points
+
     def shifted(self, offset: Array) -> Problem:
         """Return this problem with images moved by ``(n, 2)`` px."""
         return replace(self, points=replace(self.points, image=self.points.image + offset))
@@ -212,9 +218,7 @@ class Problem:
         )
 
     def _enough(self, points: int) -> None:
-        count, known = len(self.model.params), len(self.priors)
-        known += len(self.model.constraints()) if known else 0
-        least = self.model.minimum_points if not known else math.ceil((count - known) / 2)
+        count, least = len(self.model.params), self.fewest
         if points < least:
             simpler: str = "a simpler model"
             if isinstance(self.model, ImageCorrection) and count > 2:

@@ -20,6 +20,7 @@ from ortho_pipeline.estimation.blunders import (
     outlying,
     refuse_many,
 )
+from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.problem import Problem, Solution
 from ortho_pipeline.models import RPC, ImageCorrection
 from ortho_pipeline.models.frame.camera import FrameCamera
@@ -153,6 +154,15 @@ def test_one_point_more_than_three_tenths_is_removed_one_after_another(level: RP
     problem = problem_of(level, points_of(level, misses)).with_ridge({"row_shift": 1e6})
     keep, reasons = find_blunders(problem)
     assert sorted(reasons) == [1, 4, 6, 7] == np.flatnonzero(~keep).tolist()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_good_points_near_the_minimum_are_not_removed_before_the_model_follows_them(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    unit = random.uniform(-1.0, 1.0, (8, 3))
+    image = 1000.0 + 1000.0 * unit[:, :2] / (1.0 + unit @ [[0.02], [-0.01], [0.04]]) + random.normal(0.0, 0.2, (8, 2))
+    points = Points.of(image, unit * (1000.0, 1000.0, 300.0) + (500e3, 4e6, 500.0), crs="EPSG:32636", sigma_image=0.2)
+    assert fit_family("rfm1", points).rejected == ()
 
 
 def test_ten_points_are_named_and_further_ones_are_counted() -> None:
