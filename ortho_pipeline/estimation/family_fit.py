@@ -86,20 +86,26 @@ def fit_family(
     """
     chosen = family_of(family)
     if chosen.variants:
-        fits = [
-            fit_family(
-                name,
-                points,
-                crs=crs,
-                size=size,
-                heights=heights,
-                ridge=ridge,
-                priors=priors,
-                params=params,
-                robust=robust,
-            )
-            for name in chosen.variants
-        ]
+        fits, refusals = list[Fit](), list[OrthoError]()
+        for name in chosen.variants:
+            try:
+                fits.append(
+                    fit_family(
+                        name,
+                        points,
+                        crs=crs,
+                        size=size,
+                        heights=heights,
+                        ridge=ridge,
+                        priors=priors,
+                        params=params,
+                        robust=robust,
+                    )
+                )
+            except (DegeneratePoints, NotConverged) as error:
+                refusals.append(error)
+        if not fits:
+            raise refusals[0]
         return min(fits, key=_leave_one_out)
     if ridge == "auto":
         ridge = "gcv" if chosen.regularised else None

@@ -11,6 +11,7 @@ import pytest
 
 from ortho_pipeline.errors import DegeneratePoints
 from ortho_pipeline.estimation.determinacy import corner_ratio_of, nothing_adjusted, uncertain_edge, unstable
+from ortho_pipeline.estimation.family_fit import fit_family
 from ortho_pipeline.estimation.observations.image_errors import ImageErrors
 from ortho_pipeline.estimation.problem import Solution
 from ortho_pipeline.models import ImageCorrection, MapPlane
@@ -124,3 +125,14 @@ def test_a_model_without_parameters_is_noted_if_it_was_to_be_adjusted() -> None:
     assert len(nothing_adjusted(Fixed(partials(1)), both)) == 1  # type: ignore[arg-type]
     tie = Points.of([[1, 2]], [[500_000.0, 4.64e6, 10.0]], pyproj.CRS("EPSG:32633"), roles=["check"])
     assert nothing_adjusted(Fixed(partials(1)), tie) == []  # type: ignore[arg-type]
+
+
+def test_a_variant_that_contradicts_the_points_does_not_refuse_the_other_one() -> None:
+    random = np.random.default_rng(8)
+    u, v, w = random.uniform(-1.0, 1.0, (3, 26))
+    image = np.column_stack([900 * u + 60 * w + 60 * u * v, -900 * v + 30 * w + 60 * u * u])
+    ground = np.column_stack([500e3 + 900 * u, 4e6 + 900 * v, 500 + 200 * w])
+    points = Points.of(image + random.normal(0.0, 0.3, (26, 2)), ground, "EPSG:32636", sigma_image=0.3)
+    with pytest.raises(DegeneratePoints, match="8 of 26 control points contradict"):
+        fit_family("affine14-col", points)
+    assert fit_family("affine14", points).model_name == "affine14-row"
