@@ -315,6 +315,9 @@ def sigma_lines(report: BlockReport) -> list[str]:
 
 
 def _absolute(fit: BlockFit) -> AbsoluteAccuracy | None:
+    # The sigmas of points do not contain the errors of models that are not adjusted.
+    if not fit.parameters:
+        return None
     sigmas = fit.ground_sigmas[np.isfinite(fit.ground_sigmas).all(axis=1)]
     if not len(sigmas):
         return None

@@ -411,6 +411,8 @@ def test_correction_none_only_intersects(stereo: Stereo, tmp_path: Path) -> None
     assert adjustment["images"]["aft_BAND"]["parameters"] == {}
     assert adjustment["object_rms"]["check"]["plan"] > 15
     assert load_model(document["files"]["aft_BAND model"]).kind == "rpc"
+    report = document["report"]
+    assert (report["absolute"], report["relative"], report["network"]["pairs"][0]["sigma_px"]) == (None, None, None)
 
 
 def test_check_option_and_gross_errors(stereo: Stereo, tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ class Join:
 
 
 def joins_of(fit: BlockFit, dem: AdjustedDem | None = None) -> tuple[Join, ...]:
-    """Return the joins of all pairs of images with points in common that took part, in the order of the images.
+    """Return the joins of all adjusted pairs of images with used points in common, in the order of the images.
 
     At the true heights of the ground; for orthos over the DEM of the block, give `fit.adjusted_dem`.
     """
@@ -82,6 +82,9 @@ def joins_of(fit: BlockFit, dem: AdjustedDem | None = None) -> tuple[Join, ...]:
         over, shared = (dem, with_height) if len(with_height) else (None, shared)
         chosen = shared[np.linspace(0, len(shared) - 1, min(len(shared), _PLACES)).astype(int)]
         one, other = (_Moves.of(fit, image, chosen, over) for image in (first, second))
+        # Errors of models without parameters are not known.
+        if not (one.by_params.size or other.by_params.size):
+            continue
         if not (np.isfinite(one.by_params).all() and np.isfinite(other.by_params).all()):
             continue
         between = _between(fit, first, second, one.by_params.shape[1], other.by_params.shape[1])
