@@ -10,6 +10,7 @@ without an error, if a geoid grid is not installed. PROJ's network access is off
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import os
 import re
@@ -40,6 +41,8 @@ VERTICAL_FORMS = "ellipsoid, egm96, egm2008, EPSG:n of a vertical CRS, or a geoi
 _GRID_SUFFIXES = {".gtx", ".tif", ".tiff", ".byn", ".isg", ".gri"}
 _BARE_NAME = re.compile(r"\w[\w.-]*")
 _WGS84_SEMI_MAJOR = 6378137.0
+#: Realisations differ by less (m). Other datums on an ellipsoid of the same size by 4 to 80 m (GGRS87, VN-2000).
+_REALISATIONS = 3.0
 #: How WKT, PROJJSON and PROJ strings begin. PROJ seeks anything else by its name, for a quarter of a second.
 _STATED = re.compile(
     r"\s*(?:\{|[A-Za-z]\w{0,40}\s*[\[(]|\+?\s*(?:proj|init|title)\s*=|\+?\w+\s*=.*\bproj\s*=)", re.DOTALL
@@ -362,8 +365,8 @@ class GroundTransform:
     """Transforms ground points ``(N, 3)`` from one CRS to another; heights are ellipsoidal metres on both sides.
 
     A CRS on a modern ellipsoid is promoted to 3D, so small differences between realisations enter the height. A CRS on
-    a classical ellipsoid (Bessel, Airy, Hayford ...) is transformed horizontally and keeps the WGS84 height, because
-    heights are not measured above such ellipsoids. Geocentric CRSs are allowed on either side.
+    a classical ellipsoid (Bessel, Airy, Hayford ...), or on a modern one about another centre, keeps the WGS84 height,
+    because heights are not measured above such ellipsoids. Geocentric CRSs are allowed on either side.
 
     Instances can be pickled, and shared between threads.
 
@@ -381,22 +384,18 @@ class GroundTransform:
     def __init__(self, source: str | pyproj.CRS, target: str | pyproj.CRS) -> None:
         self.source, self.target = parse_crs(source), parse_crs(target)
         first, last = _ground_crs(self.source), _ground_crs(self.target)
-        self._legs: list[tuple[Transformer, bool]] = []
+        self._legs: list[tuple[Transformer, str]] = []
         self._checked = False
         if same_crs(first, last):
             return
-        modern = _is_modern(first), _is_modern(last)
-        if all(modern):
-            stops = [(_promoted(first), _promoted(last), True)]
-        elif first.is_geocentric or last.is_geocentric:
-            middle = pyproj.CRS.from_epsg(4326)
-            stops = [
-                (_promoted(first), _promoted(middle), True) if modern[0] else (first, middle, False),
-                (_promoted(middle), _promoted(last), True) if modern[1] else (middle, last, False),
-            ]
-        else:
-            stops = [(first, last, False)]
-        self._legs = [(_transformer(one, other), spatial) for one, other, spatial in stops]
+        middle = [pyproj.CRS.from_epsg(4326)] if first.is_geocentric or last.is_geocentric else []
+        for one, other in itertools.pairwise([first, *middle, last]):
+            geocentric, modern = one.is_geocentric or other.is_geocentric, _is_modern(one) and _is_modern(other)
+            ends = (_promoted(one), _promoted(other)) if geocentric or modern else (one, other)
+            if not same_crs(one, other):
+                self._legs.append(
+                    (_transformer(*ends), "all" if geocentric else "plan and height" if modern else "plan")
+                )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return GroundTransform, (self.source, self.target)
@@ -410,23 +409,26 @@ class GroundTransform:
         """Transform points ``(N, 3)``; rows that are not finite or cannot be transformed come back as NaN."""
         out = np.array(ground, dtype=float, ndmin=2)
         out[~np.isfinite(out).all(axis=1)] = np.nan
-        for transformer, spatial in self._legs:
+        for transformer, kind in self._legs:
             before = out
-            out = self._leg(transformer, spatial, before)
-            self._check(transformer, spatial, before, out)
+            out = self._leg(transformer, kind, before)
+            self._check(transformer, kind, before, out)
         return out
 
     @staticmethod
-    def _leg(transformer: Transformer, spatial: bool, ground: Array, errcheck: bool = False) -> Array:
+    def _leg(transformer: Transformer, kind: str, ground: Array, errcheck: bool = False) -> Array:
         x, y, h = (np.ascontiguousarray(column) for column in ground.T)
-        if spatial:
-            out = np.column_stack(transformer.transform(x, y, h, errcheck=errcheck))
-        else:
+        if kind == "plan":
             out = np.column_stack([*transformer.transform(x, y, errcheck=errcheck), h])
+        else:
+            out = np.column_stack(transformer.transform(x, y, h, errcheck=errcheck))
+        if kind == "plan and height":
+            far = np.abs(out[:, 2] - h) > _REALISATIONS
+            out[far, 2] = h[far]
         out[~np.isfinite(out).all(axis=1)] = np.nan
         return out
 
-    def _check(self, transformer: Transformer, spatial: bool, before: Array, after: Array) -> None:
+    def _check(self, transformer: Transformer, kind: str, before: Array, after: Array) -> None:
         """Tell a missing grid from points out of range, once, on the first finite point."""
         finite = np.isfinite(before).all(axis=1)
         if self._checked or not finite.any():
@@ -439,7 +441,7 @@ class GroundTransform:
             return
         sample = before[finite][:1]
         try:
-            self._leg(transformer, spatial, sample, errcheck=True)
+            self._leg(transformer, kind, sample, errcheck=True)
         except ProjError as error:
             grid = grid_of_message(str(error))
             if grid is None and "No operation" in str(error):

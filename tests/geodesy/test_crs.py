@@ -407,6 +407,24 @@ def test_heights_stay_wgs84_on_classical_ellipsoids() -> None:
     assert through == pytest.approx(straight, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("text", "lon", "lat"),
+    [
+        ("EPSG:2100", 23.7, 38.0),  # GGRS87, on GRS80: PROJ's 3D height is 30 m lower
+        ("EPSG:4756", 106.0, 16.0),  # VN-2000, on the ellipsoid of WGS84: 15 m higher
+        ("+proj=tmerc +lon_0=24 +ellps=GRS80 +towgs84=-199.87,74.79,246.62 +type=crs", 23.7, 38.0),
+    ],
+)
+def test_heights_stay_wgs84_on_modern_ellipsoids_about_another_centre(text: str, lon: float, lat: float) -> None:
+    ground = np.array([[lon, lat, 100.0]])
+    there = GroundTransform("EPSG:4979", text)(ground)
+    assert there[0, 2] == 100.0
+    assert GroundTransform(text, "EPSG:4979")(there) == pytest.approx(ground, abs=1e-6)
+    assert GroundTransform(text, "EPSG:4978")(there) == pytest.approx(
+        GroundTransform("EPSG:4979", "EPSG:4978")(ground), abs=0.01
+    )
+
+
 def test_a_bad_point_is_nan_and_spoils_no_other() -> None:
     ground = [[24.4, -33.65, 100.0], [np.nan, 1, 1], [24.4, -33.65, np.inf], [0, 95, 0]]
     out = GroundTransform("EPSG:4979", "EPSG:32735")(ground)
