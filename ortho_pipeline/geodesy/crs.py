@@ -298,9 +298,9 @@ def _vertical_of_code(code: str) -> Vertical:
         return Vertical("ellipsoid")
     part = crs.sub_crs_list[1] if crs.is_compound else crs
     authority = part.to_authority()
-    if not part.is_vertical or authority is None:
+    if not part.is_vertical or authority is None or authority[0] != "EPSG":
         raise DatumError(
-            f"{code} ({crs.name}) is not a vertical CRS", field="vertical", remedy=f"give {VERTICAL_FORMS}"
+            f"{code} ({crs.name}) is not a vertical CRS of EPSG", field="vertical", remedy=f"give {VERTICAL_FORMS}"
         )
     if part.axis_info[0].direction.lower() != "up":
         raise DatumError(f"{code} ({crs.name}) gives depths, not heights", field="vertical")

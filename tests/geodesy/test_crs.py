@@ -125,6 +125,11 @@ def test_what_is_no_height_datum(text: str) -> None:
         Vertical.parse(text)
 
 
+def test_a_vertical_crs_of_another_authority_is_no_grid_file() -> None:
+    with pytest.raises(DatumError, match=r"ESRI:105703 .* is not a vertical CRS of EPSG"):
+        Vertical.parse("ESRI:105703")
+
+
 def test_a_file_that_is_no_geoid(tmp_path: Path) -> None:
     path = tmp_path / "notes.gtx"
     path.write_text("this is no grid")
