@@ -40,8 +40,9 @@ def meet_surface(model: SensorModel, image: ArrayLike, surface: Surface, *, tole
     """Intersect the rays of image points with a surface.
 
     It is the first, visible, intersection, also where a ridge hides the slope behind it. Many rays are followed from
-    cell to cell of the DEM, so that not even the top of a needle is passed by (see `ray_kernel`); few rays come down
-    from above the highest terrain in steps of at most one DEM sample in plan, and the bracket is then narrowed.
+    cell to cell of the DEM, so that not even the top of a needle is passed by (see `ray_kernel`). Few rays come down
+    from above the highest terrain in steps of at most one DEM sample in plan, and the bracket is then narrowed. They
+    can pass the corner of a cell; so can many rays where the terrain rises by hundreds of metres between samples.
 
     Parameters
     ----------
