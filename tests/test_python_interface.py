@@ -351,3 +351,8 @@ def test_a_correction_needs_a_value_for_each_parameter(sample: Path) -> None:
     for wrong in ([1.0], 1.0, [1.0, 2.0, 3.0]):
         with pytest.raises(InputError, match="col_shift, row_shift"):
             start.with_params(wrong)
+
+
+def test_the_output_of_some_commands_is_a_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no such file"):
+        commands.match(tmp_path / "scene.tif", tmp_path / "m.geojson", op.MatchOptions(reference=("reference.tif",)))

@@ -37,7 +37,7 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
         bound = signature.bind(*args, **named)
         bound.apply_defaults()
         arguments = bound.arguments
-        _refuse_plain(arguments)
+        _refuse_plain(arguments, signature)
         place = next((name for name, value in arguments.items() if isinstance(value, SceneOptions)), None)
         scene = _of_first(arguments) if place is None else cast(SceneOptions, arguments[place])
         for name, value in arguments.items():
@@ -58,11 +58,12 @@ def with_items(command: Callable[_P, _R]) -> Callable[_P, _R]:
     return wrapper
 
 
-def _refuse_plain(arguments: Mapping[str, Any]) -> None:
+def _refuse_plain(arguments: Mapping[str, Any], signature: inspect.Signature) -> None:
     """Refuse a path or a mapping in place of options."""
     for group, kind in GROUPS.items():
         value = arguments.get(group)
-        if not isinstance(value, str | os.PathLike | Mapping):
+        # `output` of some commands is a file.
+        if not isinstance(value, str | os.PathLike | Mapping) or kind.__name__ not in str(signature.parameters[group]):
             continue
         text = f"**{value!r}"
         if not isinstance(value, Mapping):
