@@ -471,11 +471,11 @@ def _undulations(vertical: Vertical, grid: SampleGrid, window: tuple[int, int, i
 def _across_seam(dem: DemSurface, u: Array, v: Array, filled: bool) -> Array:
     """Return heights ``(N,)`` between the last and the first column of a global DEM; NaN for another DEM."""
     x, a, *_ = dem.grid.crs_from_pixel
-    turned = dem.around(x - a / 2)
-    if turned is dem:
+    turned = dem.grid.around(x - a / 2)
+    if turned is dem.grid:
         return np.full(len(u), np.nan)
-    shift = turned.grid.first_column - dem.grid.first_column
-    return turned._interpolated((u - shift) % dem.shape[1], v, filled)
+    shift = turned.first_column - dem.grid.first_column
+    return replace(dem, grid=turned)._interpolated((u - shift) % dem.shape[1], v, filled)
 
 
 def _by_tile(u: Array, v: Array, index: NDArray[np.intp], across: int) -> Iterator[tuple[int, int, NDArray[np.intp]]]:

@@ -9,7 +9,7 @@ import pickle
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -251,6 +251,9 @@ def test_the_seam_of_a_global_dem(tmp_path: Path) -> None:
     assert surface.coverage(where) == 1.0
     corner = here.samples_at(np.array([[179.5, 0.5]]))[0].astype(int)
     assert here.window(*corner, 2, 1)[0] == pytest.approx(heights[0, [-1, 0]])
+    # A DEM of a region has no height outside, even if its accuracy is a raster of the world.
+    region = open_dem(write_dem(tmp_path / "r.tif", heights[:10, :10], "EPSG:4326", (10, 1, 0, 10, 0, -1)), "ellipsoid")
+    assert np.isnan(replace(region, sigma=surface).heights([[9.9, 5.0], [25.0, 5.0]])).all()
 
 
 # -- voids

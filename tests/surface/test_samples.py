@@ -32,7 +32,7 @@ class Samples:
 
 
 def surface(heights: np.ndarray, fill: str | float = "mask", first_column: int = 0, raised: float = 0.0) -> DemSurface:
-    grid = SampleGrid(None, heights.shape, (0.0, 1.0, 0.0, 0.0, 0.0, -1.0), first_column)
+    grid = SampleGrid(pyproj.CRS("EPSG:32636"), heights.shape, (0.0, 1.0, 0.0, 0.0, 0.0, -1.0), first_column)
     vertical = SimpleNamespace(is_ellipsoid=True)
     return DemSurface(Samples(heights / 0.3), grid, vertical, 0.3, fill, {}, 10**6, raised=raised)
 

@@ -347,7 +347,7 @@ def _with_datum(
     if len(numbers) > 1:
         names = [dates[number].name for number in numbers]
         raise InputError(
-            f"{len(names)} images are of {wanted}: {', '.join(names)}",
+            f"{counted(len(names), 'image')} are of {wanted}: {', '.join(names)}",
             field="stack.datum",
             remedy=Text("name one of them: ", Setting("stack.datum", names[0])),
         )
