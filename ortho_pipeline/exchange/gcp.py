@@ -14,6 +14,7 @@ from ortho_pipeline.errors import InputError, ModelError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.exchange.rpc import name_sources_relatively, without_georeference
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.points import Points
 from ortho_pipeline.raster.verified_writing import close, raster_output, written
@@ -73,7 +74,7 @@ def _unwrapped(ground: Array) -> Array:
     """Return ground without a jump of longitude at 180 degrees: all are within half a turn of the first finite one."""
     lon = ground[:, 0]
     first = lon[np.isfinite(lon)][:1].sum()
-    return np.column_stack([first + np.remainder(lon - first + 180.0, 360.0) - 180.0, ground[:, 1:]])
+    return np.column_stack([longitudes_near(lon, first), ground[:, 1:]])
 
 
 def write_gcps(dataset: gdal.Dataset, gcps: Gcps, path: str | PathLike[str]) -> None:

@@ -12,6 +12,7 @@ from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.models.polynomials import terms_of
 from ortho_pipeline.models.rational import RPC
@@ -190,6 +191,6 @@ def domain_box(model: SensorModel) -> tuple[tuple[float, float, float, float], t
     signs = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     ground = ground_transform(model.crs, "EPSG:4979")(centre + signs * half)
     # Unwrapped about the middle: a scene across the antimeridian is one box.
-    lon = ground[13, 0] + np.remainder(ground[:, 0] - ground[13, 0] + 180.0, 360.0) - 180.0
+    lon = longitudes_near(ground[:, 0], ground[13, 0])
     lat = ground[:, 1]
     return (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())), model.height_range

@@ -73,6 +73,17 @@ def enu_from_ecef(ground: Array) -> Array:
     return np.stack([east, north, up], axis=1)
 
 
+def longitudes_near(lon: Array, about: float) -> Array:
+    """Return longitudes (degrees) within half a turn of `about`, so that they do not jump at the antimeridian.
+
+    Examples
+    --------
+    >>> longitudes_near(np.array([179.0, -179.0]), 180.0).tolist()
+    [179.0, 181.0]
+    """
+    return np.asarray(about + np.remainder(lon - about + 180.0, 360.0) - 180.0)
+
+
 def metres_per_degree(ground: Array) -> Array:
     """Return the lengths ``(N, 2)`` of a degree of longitude and of latitude at lon, lat (degrees), height."""
     lat = np.radians(ground[:, 1])

@@ -19,6 +19,7 @@ from ortho_pipeline.errors import CrsError, InputError
 from ortho_pipeline.files.shell import converted, typed
 from ortho_pipeline.geodesy.crs import ground_transform, horizontal, parse_crs
 from ortho_pipeline.geodesy.distortion import metres_of_steps
+from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.raster.source import first_line, open_pixels
 from ortho_pipeline.surface.base import Array
 
@@ -107,7 +108,7 @@ class SampleGrid:
             middle = x0 + a * (columns - 1) / 2 + b * (rows - 1) / 2
             far = np.abs(x - middle) > 180
             if far.any():
-                x = np.where(far, middle + np.remainder(x - middle + 180, 360) - 180, x)
+                x = np.where(far, longitudes_near(x, middle), x)
         p = self.pixel_from_crs
         return np.stack([p[0] + p[1] * x + p[2] * y, p[3] + p[4] * x + p[5] * y], axis=1)
 

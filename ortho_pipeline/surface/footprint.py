@@ -21,7 +21,7 @@ from ortho_pipeline.display.numbers import share, significant
 from ortho_pipeline.errors import CoverageError, InputError
 from ortho_pipeline.errors.texts import Setting, Text, counted
 from ortho_pipeline.geodesy.crs import ground_transform, parse_crs, utm_crs
-from ortho_pipeline.geodesy.ellipsoid import geocentric
+from ortho_pipeline.geodesy.ellipsoid import geocentric, longitudes_near
 from ortho_pipeline.models.base import Array, SensorModel
 from ortho_pipeline.raster.source import Grid
 from ortho_pipeline.surface.base import Surface
@@ -480,7 +480,7 @@ def _continuous(ground: Array, crs: pyproj.CRS) -> Array:
     """Unwrap longitudes across the antimeridian about the first point."""
     if crs.is_geographic and len(ground):
         ground = ground.copy()
-        ground[:, 0] = ground[0, 0] + np.remainder(ground[:, 0] - ground[0, 0] + 180.0, 360.0) - 180.0
+        ground[:, 0] = longitudes_near(ground[:, 0], ground[0, 0])
     return ground
 
 

@@ -22,6 +22,7 @@ from ortho_pipeline.exchange.rpc import write_bare_vrt
 from ortho_pipeline.files import part_of_outputs, write_text
 from ortho_pipeline.files.shell import typed
 from ortho_pipeline.geodesy.crs import ground_transform
+from ortho_pipeline.geodesy.ellipsoid import longitudes_near
 from ortho_pipeline.geodesy.naming import crs_text
 from ortho_pipeline.hookspecs import BlockFormat, Format
 from ortho_pipeline.host import Host
@@ -178,8 +179,7 @@ class AdjustedBlock:
             return None
         ground = np.concatenate(list(self._corners()))
         # Across the antimeridian each image may count longitudes from another side.
-        west = np.nanmin(ground[:, 0])
-        ground[:, 0] = west + np.remainder(ground[:, 0] - west + 180.0, 360.0) - 180.0
+        ground[:, 0] = longitudes_near(ground[:, 0], np.nanmin(ground[:, 0]))
         box = [np.nanmin(ground, axis=0) - _AROUND, np.nanmax(ground, axis=0) + _AROUND]
         write_ellipsoidal(folder / _ELEVATION, corrected(self.heights, self.fit).with_fill("mask"), box)
         files["elevation"] = folder / _ELEVATION

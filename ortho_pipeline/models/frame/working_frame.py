@@ -19,6 +19,7 @@ from ortho_pipeline.geodesy.ellipsoid import (
     enu_from_geodetic,
     geocentric,
     geodetic,
+    longitudes_near,
     meet_height,
     metres_per_degree,
 )
@@ -99,7 +100,7 @@ class Topocentric:
         start = np.broadcast_to(self.zero + position @ self.axes, direction.shape)
         ground = meet_height(start, direction @ self.axes, height)
         # Near the antimeridian, stay on the side of the origin.
-        ground[:, 0] = self.origin[0] + np.remainder(ground[:, 0] - self.origin[0] + 180.0, 360.0) - 180.0
+        ground[:, 0] = longitudes_near(ground[:, 0], self.origin[0])
         return ground
 
     def metres_per_unit(self, position: Array) -> Array:

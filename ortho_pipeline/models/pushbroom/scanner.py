@@ -46,6 +46,7 @@ from ortho_pipeline.geodesy.ellipsoid import (
     SEMI_MAJOR,
     enu_from_ecef,
     geocentric,
+    longitudes_near,
     meet_height,
     metres_per_degree,
 )
@@ -293,7 +294,7 @@ class Pushbroom(SensorModel):
                 ground = meet_height(origin, direction, heights + self.light.lift(heights, cosine))
             # Near the antimeridian, stay on the side of the sub-satellite point.
             foot = math.degrees(math.atan2(self.origin[1], self.origin[0]))
-            ground[:, 0] = foot + np.remainder(ground[:, 0] - foot + 180.0, 360.0) - 180.0
+            ground[:, 0] = longitudes_near(ground[:, 0], foot)
             # Above the satellite a ray meets the height only where it leaves the Earth again.
             good = (enu_from_ecef(ground)[:, 2] * direction).sum(axis=1) < 0
         ground[good, 2] = heights[good]

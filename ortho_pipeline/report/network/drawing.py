@@ -10,7 +10,7 @@ from ortho_pipeline.display.drawing import Drawing, round_down
 from ortho_pipeline.display.notices import doubted
 from ortho_pipeline.display.numbers import significant
 from ortho_pipeline.errors.texts import counted
-from ortho_pipeline.geodesy.ellipsoid import metres_per_degree
+from ortho_pipeline.geodesy.ellipsoid import longitudes_near, metres_per_degree
 from ortho_pipeline.models.base import Array
 from ortho_pipeline.report.block_records import BlockReport
 
@@ -28,7 +28,7 @@ def plot_network(report: BlockReport) -> Drawing | None:
     first = next(iter(outlines.values()))[0, 0]
     for corners in outlines.values():
         # Over the antimeridian longitudes go on.
-        corners[:, 0] = first + (corners[:, 0] - first + 180.0) % 360.0 - 180.0
+        corners[:, 0] = longitudes_near(corners[:, 0], first)
     paper = _Paper(np.concatenate(list(outlines.values())))
     said = f"{counted(len(outlines), 'image')} and {counted(len(report.adjustment.points), 'point')} of the block"
     drawing = Drawing(paper.width, paper.height + 22.0, f"Map of {said}, north up", "network")
@@ -120,7 +120,7 @@ def _draw_points(drawing: Drawing, report: BlockReport, paper: _Paper, first: fl
     wrong = doubted(report.notices)
     for point, angle in (*ties[:: max(1, len(ties) // _POINTS)], *known[:_POINTS]):
         lon, lat = point.ground[0] or 0.0, point.ground[1] or 0.0
-        at = paper.at(np.array([[first + (lon - first + 180.0) % 360.0 - 180.0, lat]]))[0]
+        at = paper.at(np.column_stack([longitudes_near(np.array([lon]), first), [lat]]))[0]
         meet = "" if angle is None else f", which meet at {angle:.1f}°"
         with drawing.titled(f"{point.id} ({point.role}): {counted(rays.get(point.id, 0), 'ray')}{meet}"):
             if point.role == "tie":
