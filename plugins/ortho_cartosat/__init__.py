@@ -159,12 +159,6 @@ def _rpc(dataset: gdal.Dataset, choice: str | None, origin: str) -> tuple[RPC | 
     return model, source, warnings
 
 
-def _apart(other: RPC, model: RPC) -> float:
-    """Return the distance (px) of two RPCs at the centre of the second."""
-    centre = np.array([[model.lon_off, model.lat_off, model.h_off]])
-    return float(np.abs(other.ground_to_image(centre) - model.ground_to_image(centre)).max())
-
-
 def _compared_with_gdal(dataset: gdal.Dataset, model: RPC, source: str) -> list[Notice]:
     """Return a warning if GDAL reads another RPC than this plugin."""
     try:
@@ -172,7 +166,8 @@ def _compared_with_gdal(dataset: gdal.Dataset, model: RPC, source: str) -> list[
     except (InputError, RuntimeError):
         # There is none, or the file is encrypted.
         return []
-    apart = _apart(other, model)
+    centre = np.array([[model.lon_off, model.lat_off, model.h_off]])
+    apart = float(np.abs(other.ground_to_image(centre) - model.ground_to_image(centre)).max())
     if apart <= DISAGREEMENT:
         return []
     text = f"this image uses the RPC in {Path(source).name}; GDAL reads another one, which differs by {apart:.1f} px"

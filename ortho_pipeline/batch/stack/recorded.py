@@ -79,7 +79,7 @@ class FileSet:
             folder.mkdir(parents=True, exist_ok=True)
             self.write(folder)
         except InputError as error:
-            # A full disk says nothing of the inputs: the next run tries again.
+            # The cause is the disk, not the inputs. The next run must try again.
             if not self.may_fail or isinstance(error.__cause__, OSError):
                 raise
             return record.replaced(error=error_document(error))
