@@ -124,9 +124,7 @@ _KNOW: dict[str, str] = {
     "ortho-relative": Text(
         "State the accuracy of the reference with ",
         Setting("match.reference_sigma"),
-        ", or measure surveyed points in the ortho (ortho measure --ortho) and give them with ",
-        Setting("points.gcps"),
-        ".",
+        ", or measure surveyed points in the ortho (ortho measure --ortho) and give them to ortho verify --gcps.",
     ),
     "ortho-local-changes": "Check the places that the file of displacements marks as local.",
     "dem-sigma-by-default": Text("State the accuracy of the DEM with ", Setting("surface.sigma"), "."),
