@@ -33,6 +33,9 @@ for _number, _action in (
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# Files of tests need not survive a power failure, and each wait for the disk takes milliseconds.
+os.fsync = lambda _: None
+
 ROOT = Path(__file__).resolve().parent.parent
 REAL = data_folder()
 SAMPLE = ROOT / "sample_data"

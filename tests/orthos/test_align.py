@@ -58,7 +58,7 @@ def test_a_bent_ortho_is_aligned_by_a_field(bent, tmp_path):
 
 
 def test_a_shifted_ortho_is_aligned_by_a_shift(shifted, tmp_path):
-    document = aligned(*shifted, tmp_path)
+    document = aligned(*shifted, tmp_path, "--match-points", 150)
     assert document["correction"]["kind"] == "shift"
     np.testing.assert_allclose(document["correction"]["shift_px"], np.array(SHIFTED.shift) * (1, -1), atol=0.03)
     assert np.abs(left_by(SHIFTED, tmp_path)).max() < 0.05
@@ -176,7 +176,7 @@ def test_a_local_change_does_not_move_the_whole(tmp_path):
 
 
 def test_only_a_shift_is_corrected_where_that_is_asked_for(bent, tmp_path):
-    document = aligned(*bent, tmp_path, "--shift-only", "--match-points", 200)
+    document = aligned(*bent, tmp_path, "--shift-only", "--match-points", 100)
     assert document["correction"]["kind"] == "shift"
     # The mean displacement is gone; the bending is not.
     assert document["relative"]["bias_m"]["value"] < 0.1

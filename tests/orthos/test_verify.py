@@ -361,7 +361,7 @@ def test_displacements_by_wrong_heights_are_named(tmp_path):
 
     ortho, reference = Leaning(side=400, seed=6).write(tmp_path / "leaning")
     options = SurfaceOptions(dem=str(dem), vertical="ellipsoid")
-    result = verify(ortho, match=MatchOptions(reference=[str(reference)]), surface=options)
+    result = verify(ortho, match=MatchOptions(reference=[str(reference)], points=200), surface=options)
     found = result.document["heights"]
     assert found["significant"]
     np.testing.assert_allclose(found["rate_m_per_m"], 0.1, atol=0.015)

@@ -95,10 +95,10 @@ def align(
     Examples
     --------
     >>> displaced = op.rectify("sample_data/scene.tif", out, surface=op.SurfaceOptions(dem="sample_data/dem.tif"))
-    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"])
+    >>> match = op.MatchOptions(reference=["sample_data/reference.tif"], points=150)
     >>> done = op.align(displaced.files["ortho"], out / "aligned", match=match)
     >>> done.document["correction"]["kind"]
-    'field'
+    'shift'
     """
     _refuse_unusable(match, bending)
     output = OutputOptions(resampling="cubic") if output is None else output
