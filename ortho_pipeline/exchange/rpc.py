@@ -78,10 +78,10 @@ def read_rpc(path: str | PathLike[str]) -> RPC:
     >>> rpc.ground_to_image([[33.35, 37.25, 800.0]]).round(1)
     array([[501.9, 504.2]])
     """
-    path = path if isinstance(path, VsiPath) else Path(path)
-    if path.suffix.lower() in TEXT_SUFFIXES or _begins_like_rpc(path):
-        return read_rpc_text(path)
-    return rpc_of_dataset(open_dataset(path))[0]
+    file = place(path)
+    if file.suffix.lower() in TEXT_SUFFIXES or _begins_like_rpc(file):
+        return read_rpc_text(file)
+    return rpc_of_dataset(open_dataset(file))[0]
 
 
 def has_rpc(dataset: gdal.Dataset) -> bool:

@@ -482,6 +482,16 @@ def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbr
     assert np.abs(scene.model.ground_to_image(ground) - [250.0, 100.0]).max() < 1e-3
 
 
+@pytest.mark.driver("DIMAP")
+@pytest.mark.parametrize("given", ["DIM_A.XML", ""], ids=["metadata", "folder"])
+def test_metadata_or_folder_in_an_archive(tiled: tuple[Path, Path, Pushbroom], tmp_path: Path, given: str) -> None:
+    folder = tiled[0].parent
+    inside = f"/vsizip/{shutil.make_archive(str(tmp_path / 'order'), 'zip', folder.parent, folder.name)}/{folder.name}"
+    scene = open_scene(f"{inside}/{given}".rstrip("/"))
+    assert ((scene.width, scene.height), list(scene.models)) == ((300, 400), ["rpc", "pushbroom"])
+    assert scene.model.to_dict() == open_scene(folder).model.to_dict()
+
+
 @pytest.mark.driver("JP2OpenJPEG")
 @pytest.mark.driver("DIMAP")
 def test_tiles_in_jpeg_2000(tiled: tuple[Path, Path, Pushbroom], tmp_path: Path) -> None:
