@@ -57,6 +57,8 @@ __all__ = [
 
 #: Corners of a chip, and how far (px) they may be from a shift and a scale: they have three decimals.
 _CORNERS, _CHIP_ROUNDING = ("11", "12", "21", "22"), 0.01
+#: Drivers of images that consist of several files: without the others GDAL does not open them.
+_OF_SEVERAL_FILES = ("VRT", "ENVI", "EHdr", "TIL")
 #: Tag and sidecar that differ by more than this at the centre (px) are different models.
 DISAGREEMENT = 1.0
 
@@ -254,7 +256,7 @@ def _unreadable_beside(path: Path) -> list[str]:
 def _own_fields(dataset: gdal.Dataset) -> dict[str, str]:
     """Return the RPC domain of the file itself, without sidecars."""
     name = dataset.GetDescription()
-    if not place(name).is_file() or dataset.GetDriver().ShortName == "VRT":
+    if not place(name).is_file() or dataset.GetDriver().ShortName in _OF_SEVERAL_FILES:
         return dict(dataset.GetMetadata("RPC") or {})
     return dict(open_dataset(place(name), siblings=False).GetMetadata("RPC") or {})
 

@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 import pytest
 from osgeo import gdal
+from products import til_text
 from real_data import data_folder
 
 from ortho_pipeline.errors import InputError, OrthoError
@@ -803,6 +804,32 @@ def test_a_side_car_that_gdal_cannot_read_is_named(tmp_path):
     assert has_rpc(dataset)
     with pytest.raises(InputError, match="damaged or encrypted"):
         rpc_of_dataset(dataset)
+
+
+@pytest.mark.parametrize(("driver", "ending"), [("ENVI", "img"), ("EHdr", "bil")])
+def test_the_rpc_of_an_image_with_its_header_in_another_file(tmp_path, driver, ending):
+    made = gdal.Open(str(make_image(tmp_path / "made.tif", make_rpc())))
+    path = str(tmp_path / f"scene.{ending}")
+    gdal.GetDriverByName(driver).CreateCopy(path, made)
+    ground = in_box(make_rpc(), 100)
+    found, source = rpc_of_dataset(gdal.Open(path))
+    np.testing.assert_allclose(found.ground_to_image(ground), make_rpc().ground_to_image(ground), atol=1e-6)
+    assert source == f"{path} ({driver} metadata)"
+
+
+@pytest.mark.driver("TIL")
+def test_the_rpc_of_all_tiles_of_a_delivery_without_xml(tmp_path):
+    tiles = [("scene_R1C1.tif", 0, 0, 40, 30), ("scene_R1C2.tif", 40, 0, 40, 30)]
+    for name, *_ in tiles:
+        make_image(tmp_path / name)
+    (tmp_path / "scene.TIL").write_text(til_text(tuple(tiles)))
+    (tmp_path / "scene.IMD").write_text("numRows = 30;\nnumColumns = 80;\nbitsPerPixel = 16;\nEND;\n")
+    write_rpb(make_rpc(), tmp_path / "scene.RPB")
+    found, source = rpc_of_dataset(gdal.Open(str(tmp_path / "scene.TIL")))
+    np.testing.assert_allclose(
+        found.ground_to_image([[24.4, -33.7, 600.0]]), make_rpc().ground_to_image([[24.4, -33.7, 600.0]]), atol=1e-6
+    )
+    assert source == str(tmp_path / "scene.RPB")
 
 
 @pytest.mark.driver("NITF")
