@@ -22,7 +22,7 @@ import numpy as np
 from ortho_pipeline.display.notices import Notice
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.errors.texts import Setting, Text
-from ortho_pipeline.exchange.rpc_files import size_of_image
+from ortho_pipeline.exchange.rpc_files import read_rpc_text, size_of_image
 from ortho_pipeline.files.locations import place
 from ortho_pipeline.hookspecs import Scene
 from ortho_pipeline.models import RPC, Cropped, ImageCorrection, SensorModel
@@ -35,6 +35,10 @@ _SMALL, _BEGINS = 0.75, 0.1
 _COVERED = 0.05
 #: A hypothesis is right if its distance from the evidence is at most this part of the distance between the two.
 _CLOSE = 0.25
+#: Offsets that differ by less (px) are the same: GDAL writes them with 15 digits.
+_SAME = 1e-6
+#: Row and column of a tile, in file names of Airbus and Maxar; their RPC files are for all tiles together.
+_TILE, _OF_ALL_TILES = re.compile(r"_R(\d{1,4})C(\d{1,4})(?![A-Z0-9])", re.IGNORECASE | re.ASCII), (".xml", ".rpb")
 #: Last row and column of the larger image, in tags of Airbus' products.
 _GML_SIZE = re.compile(r"<gml:high>\s*(\d{1,7})\s+(\d{1,7})\s*</gml:high>")
 
@@ -134,6 +138,7 @@ def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) ->
     ------
     InputError
         If the offset is not two finite numbers.
+        Also if the image is a tile with the RPC of all tiles together, and its offset is not known.
     UndecidedCrop
         If the image notes an offset, and there is no evidence to which image the RPC belongs.
     """
@@ -143,6 +148,7 @@ def placed(scene: Scene, dataset: Any, offset: Sequence[float] | None = None) ->
         return _moved(scene, stated, Notice("crop-stated", text, offset=stated))
     noted = noted_offset(dataset)
     if noted is None:
+        _refuse_tile(scene)
         remark = _elsewhere(scene) or _small(scene)
         return scene if remark is None else replace(scene, warnings=(*scene.warnings, remark))
     if not isinstance(scene.model, RPC):
@@ -279,6 +285,27 @@ def _ranges(model: RPC) -> Array:
     corners = model.ground_to_image([centre + reach * signs for signs in itertools.product((-1, 0, 1), repeat=3)])
     corners = corners[np.isfinite(corners).all(axis=1)]
     return np.stack([corners.min(axis=0), corners.max(axis=0)], axis=1) if len(corners) else stated
+
+
+def _refuse_tile(scene: Scene) -> None:
+    """Refuse a tile whose model is the RPC of all tiles together as it is in the file: its place is not known."""
+    source, tile = place(scene.model_source), _TILE.search(place(scene.path).stem)
+    if tile is None or int(tile[1]) == int(tile[2]) == 1 or not isinstance(scene.model, RPC):
+        return
+    if source.suffix.lower() not in _OF_ALL_TILES or tile[0].lower() in source.stem.lower() or not source.is_file():
+        return
+    whole = read_rpc_text(source)
+    if math.hypot(whole.col_off - scene.model.col_off, whole.row_off - scene.model.row_off) < _SAME:
+        raise InputError(
+            f"by its name this image is the tile {tile[0][1:]}, but {source.name} has the RPC of all tiles together",
+            file=scene.path,
+            field="scene.crop_offset",
+            remedy=Text(
+                "copy the metadata that list the tiles (DIM_*.XML, Maxar's .XML) from the delivery next to it, or give"
+                " the tile's first pixel in the whole image: ",
+                Setting("scene.crop_offset", "COL,ROW"),
+            ),
+        )
 
 
 def _elsewhere(scene: Scene) -> Notice | None:

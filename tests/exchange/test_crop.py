@@ -17,7 +17,7 @@ from ortho_pipeline.commands.inputs import open_scene
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.estimation.family_fit import fit_own
 from ortho_pipeline.exchange.crop import fits, moved, nearer, noted_offset, placed
-from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpc_txt
+from ortho_pipeline.exchange.rpc import read_rpc, rpc_metadata, write_rpb, write_rpc_txt
 from ortho_pipeline.exchange.rpc_files import write_geom
 from ortho_pipeline.geodesy.crs import parse_crs
 from ortho_pipeline.hookspecs import Piece
@@ -138,6 +138,23 @@ def opened(tiny: Any, tmp_path: Path, size: tuple[int, int], first: tuple[float,
     write_rpc_txt(tiny.model.shifted(-first[0], -first[1]), tmp_path / "any_RPC.TXT")
     gdal.GetDriverByName("GTiff").Create(str(tmp_path / "any.tif"), *size, 1)
     return open_scene(tmp_path / "any.tif", SceneOptions(rpc=tmp_path / "any_RPC.TXT"))
+
+
+@pytest.mark.parametrize("name", ["IMG_A_R2C1.TIF", "21FEB01-P1BS_R1C2-01_P001.TIF"])
+def test_a_tile_with_the_rpc_of_all_tiles_needs_its_place(tiny, tmp_path, name):
+    """GDAL applies the RPC of all tiles to each, if the metadata that list them are missing."""
+    image = cut(tiny, tmp_path / name, None)
+    write_rpb(tiny.model, tmp_path / "A.RPB")
+    choice = {"rpc": str(tmp_path / "A.RPB")}
+    with pytest.raises(InputError, match=r"the tile R[12]C[12], but A\.RPB has the RPC of all tiles") as error:
+        open_product(image, options=choice)
+    assert "crop_offset=COL,ROW" in str(error.value.remedy)
+    placed_there = open_product(image, options=choice, crop_offset=CORNER)
+    np.testing.assert_allclose(tiny.model.ground_to_image(ground_of(placed_there)), [[150.0, 80.0]], atol=1e-6)
+    # The first tile begins where all do, and a file of this name is that of the tile.
+    open_product(image.rename(tmp_path / "IMG_A_R1C1.TIF"), options=choice)
+    own = (tmp_path / "A.RPB").rename(tmp_path / "IMG_A_R1C2.RPB")
+    open_product((tmp_path / "IMG_A_R1C1.TIF").rename(tmp_path / "IMG_A_R1C2.TIF"), options={"rpc": str(own)})
 
 
 @pytest.mark.parametrize(
