@@ -30,7 +30,7 @@ from ortho_pipeline.exchange.rpc_files import (
 )
 from ortho_pipeline.exchange.rpc_fit import RpcExport, box_grid, domain_box, fit_rpc
 from ortho_pipeline.files.folders import listing
-from ortho_pipeline.files.locations import VsiPath, place
+from ortho_pipeline.files.locations import Location, VsiPath, place
 from ortho_pipeline.models.base import SensorModel
 from ortho_pipeline.models.correction import ImageCorrection
 from ortho_pipeline.models.rational import RPC
@@ -59,6 +59,8 @@ __all__ = [
 _CORNERS, _CHIP_ROUNDING = ("11", "12", "21", "22"), 0.01
 #: Drivers of images that consist of several files: without the others GDAL does not open them.
 _OF_SEVERAL_FILES = ("VRT", "ENVI", "EHdr", "TIL")
+#: What is before the path of an archive in a name of GDAL's.
+_FIRST_FOLDER = re.compile(r"^(/vsi[a-z0-9]+(?=/vsi))*/vsi[a-z0-9]+/\{*")
 #: Tag and sidecar that differ by more than this at the centre (px) are different models.
 DISAGREEMENT = 1.0
 
@@ -379,7 +381,7 @@ def without_georeference(dataset: gdal.Dataset) -> gdal.Dataset:
 
 
 def name_sources_relatively(vrt: Path, final: Path) -> None:
-    """Make the source paths of a VRT relative to `final`, its final path."""
+    """Make the source paths of a VRT relative to `final`, its final path; those in archives become absolute."""
     from defusedxml import ElementTree
 
     root = ElementTree.fromstring(vrt.read_bytes())
@@ -388,6 +390,8 @@ def name_sources_relatively(vrt: Path, final: Path) -> None:
         if source.get("relativeToVRT") != "1" and source.text and Path(source.text).is_file():
             source.text = os.path.relpath(Path(source.text).resolve(), folder)
             source.set("relativeToVRT", "1")
+        elif source.text and (archive := Location(source.text).archive) is not None and not archive.is_absolute():
+            source.text = _FIRST_FOLDER.sub(lambda before: f"{before[0]}{Path.cwd()}/", source.text, count=1)
     vrt.write_bytes(ElementTree.tostring(root))
 
 

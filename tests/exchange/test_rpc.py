@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -227,6 +228,20 @@ def test_vrt_finds_its_source_when_the_folder_moves(tmp_path):
     dataset = gdal.Open(str(tmp_path / "two" / "out" / "b.vrt"))
     assert dataset.ReadAsArray().max() > 0
     assert same(rpc_of_dataset(dataset)[0], rpc)
+
+
+@pytest.mark.parametrize("name", ["/vsizip/order.zip/a.tif", "/vsizip/{order.zip}/a.tif", "/vsizip/./order.zip/a.tif"])
+def test_vrt_finds_an_archive_from_any_folder(tmp_path, monkeypatch, name):
+    make_image(tmp_path / "a.tif")
+    monkeypatch.chdir(tmp_path)
+    with zipfile.ZipFile("order.zip", "w") as archive:
+        archive.write("a.tif")
+    write_vrt(gdal.Open(name), make_rpc(), tmp_path / "b.vrt")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert np.array_equal(
+        gdal.Open(str(tmp_path / "b.vrt")).ReadAsArray(), gdal.Open(str(tmp_path / "a.tif")).ReadAsArray()
+    )
 
 
 def test_tagged_copy_keeps_pixels_nodata_mask_and_colours(tmp_path):
