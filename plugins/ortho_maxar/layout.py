@@ -72,10 +72,13 @@ def tile_of(isd: Isd, image: str) -> Tile | None:
 
 
 def tiles_beside(isd: Isd, image: Path, own: Tile | None) -> Iterator[Piece]:
-    """Yield the other tiles of a product, in the pixels of this one."""
-    for tile in isd.tiles if own is not None else ():
-        if own is not None and tile != own and (there := _file(image, tile.name)) is not None:
-            yield Piece(there, (tile.left - own.left, tile.top - own.top), (tile.width, tile.height))
+    """Yield the other tiles of a product, in the pixels of this one; for the .TIL all tiles, in those of the whole."""
+    if own is None and image.suffix.lower() != ".til":
+        return
+    left, top = (0, 0) if own is None else (own.left, own.top)
+    for tile in isd.tiles:
+        if tile != own and (there := _file(image, tile.name)) is not None:
+            yield Piece(there, (tile.left - left, tile.top - top), (tile.width, tile.height))
 
 
 def parts_beside(isd: Isd, image: Path, rigorous: bool) -> tuple[list[Piece], list[Notice]]:

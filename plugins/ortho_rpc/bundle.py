@@ -29,16 +29,17 @@ def rpc_of_dimap(path: Path) -> Path | None:
 
 
 def pieces_beside(image: Path, model: SensorModel) -> tuple[Piece, ...]:
-    """Return the other tiles of an image's scene, in its pixels, and the images of other bands of the same strip."""
+    """Return the other tiles of an image's scene, in its pixels, and the images of other bands of the same strip.
+
+    `image` may also be the metadata, which stand for all tiles together.
+    """
     if not _names(image.parent).matching(DIMAP):
         return ()
     beside = _files(image.parent)
     for path in _metadata(beside):
-        if path.name == image.name:
-            continue
         try:
             file = DimapFile(path)
-            if image.name.lower() in images_of(file):
+            if path.name == image.name or image.name.lower() in images_of(file):
                 return (*_tiles(file, image.name, beside), *_other_bands(file, model))
         except InputError:
             continue
@@ -46,10 +47,14 @@ def pieces_beside(image: Path, model: SensorModel) -> tuple[Piece, ...]:
 
 
 def _tiles(file: DimapFile, image: str, beside: dict[str, Path]) -> Iterator[Piece]:
-    own = tile_of(file, image)
+    own = (0, 0) if image == file.path.name else tile_of(file, image)
     for name in images_of(file) if own is not None else ():
-        if name in beside and name != image.lower() and (tile := tile_of(file, name)) is not None and own is not None:
+        if name not in beside or name == image.lower() or own is None:
+            continue
+        if (tile := tile_of(file, name)) is not None:
             yield Piece(beside[name], (tile[0] - own[0], tile[1] - own[1]), (tile[2], tile[3]))
+        else:
+            yield Piece(beside[name])  # the only image of the metadata
 
 
 def _other_bands(file: DimapFile, model: SensorModel) -> Iterator[Piece]:

@@ -484,6 +484,16 @@ def test_metadata_or_folder_in_place_of_an_image(tiled: tuple[Path, Path, Pushbr
 
 @pytest.mark.driver("DIMAP")
 @pytest.mark.parametrize("given", ["DIM_A.XML", ""], ids=["metadata", "folder"])
+def test_points_of_the_tiles_count_for_all_tiles_together(tiled: tuple[Path, Path, Pushbroom], given: str) -> None:
+    first, second, _ = tiled
+    assert [(Path(piece.path), piece.offset, piece.size) for piece in open_scene(first.parent / given).pieces] == [
+        (first, (0, 0), (200, 400)),
+        (second, (200, 0), (100, 400)),
+    ]
+
+
+@pytest.mark.driver("DIMAP")
+@pytest.mark.parametrize("given", ["DIM_A.XML", ""], ids=["metadata", "folder"])
 def test_metadata_or_folder_in_an_archive(tiled: tuple[Path, Path, Pushbroom], tmp_path: Path, given: str) -> None:
     folder = tiled[0].parent
     inside = f"/vsizip/{shutil.make_archive(str(tmp_path / 'order'), 'zip', folder.parent, folder.name)}/{folder.name}"

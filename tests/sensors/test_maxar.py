@@ -275,6 +275,10 @@ def test_tiles_are_one_scene(folder: Path, whole: tuple[Pushbroom, RPC]) -> None
     together = open_scene(folder / f"{STEM}.TIL")
     assert (together.width, together.height) == SIZE
     assert np.abs(together.models["pushbroom"].ground_to_image(ground) - image - (40, 0)).max() < 1e-6
+    assert [(Path(piece.path).name, piece.offset) for piece in together.pieces] == [
+        (TILES[0][0], (0, 0)),
+        (TILES[1][0], (40, 0)),
+    ]
 
 
 def test_a_wrong_size_of_the_whole_does_not_move_tiles(folder: Path, whole: tuple[Pushbroom, RPC]) -> None:
