@@ -243,7 +243,8 @@ class DemFile:
         try:
             raw = band.ReadAsArray(left, top, width, height)
             mask = None
-            if band.GetMaskFlags() & gdal.GMF_PER_DATASET:
+            flags = band.GetMaskFlags()
+            if flags & gdal.GMF_PER_DATASET or not flags:  # 0: a mask of this band alone
                 mask = band.GetMaskBand().ReadAsArray(left, top, width, height)
         except RuntimeError as error:
             raise InputError(

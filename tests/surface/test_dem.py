@@ -284,6 +284,20 @@ def test_voids_are_not_heights_and_do_not_mix(tmp_path: Path, void: float) -> No
     assert surface.height_range[1] < 400
 
 
+@pytest.mark.parametrize("flags", [0, gdal.GMF_PER_DATASET])
+def test_masked_samples_are_voids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: int) -> None:
+    """Flags 0 are a mask of one band, which GDAL keeps in a sidecar."""
+    path = write_dem(tmp_path / "d.tif", np.full((3, 3), 100.0))
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    monkeypatch.setenv("GDAL_TIFF_INTERNAL_MASK", "NO")
+    dataset.GetRasterBand(1).CreateMaskBand(flags)
+    mask = np.full((3, 3), 255, dtype=np.uint8)
+    mask[1, 1] = 0
+    dataset.GetRasterBand(1).GetMaskBand().WriteArray(mask)
+    dataset = None
+    assert (np.isnan(open_dem(path, "ellipsoid").window(0, 0, 3, 3)) == (mask == 0)).all()
+
+
 @pytest.mark.parametrize(("unit", "metres"), [("", 1.0), ("ft", 0.3048)])
 def test_scale_offset_and_integers(tmp_path: Path, unit: str, metres: float) -> None:
     """GDAL: what scale and offset make of a number is in the unit of the band."""
