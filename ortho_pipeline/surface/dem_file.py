@@ -25,6 +25,8 @@ from ortho_pipeline.surface.base import Array
 
 #: Heights (m) outside of this are voids, declared or not.
 SANE_HEIGHTS = (-500.0, 9000.0)
+#: The void of DEMs of 16 bits with sign, declared or not; a scale can make it look like a height.
+_VOID_16_BITS = -32768
 #: No DEM has samples that are nearer to each other (m); work along a ray is counted in samples.
 _FINEST = 1e-3
 #: Option of gdal_edit.py for a geotransform.
@@ -258,6 +260,8 @@ class DemFile:
             heights = heights * (scale * metres_per_unit) + offset * metres_per_unit
         with np.errstate(invalid="ignore"):
             void = ~((heights >= SANE_HEIGHTS[0]) & (heights <= SANE_HEIGHTS[1]))
+        if raw.dtype == np.int16:
+            void |= raw == _VOID_16_BITS
         nodata = band.GetNoDataValue()
         if nodata is not None and math.isfinite(nodata):
             with np.errstate(over="ignore"):

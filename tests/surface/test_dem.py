@@ -311,6 +311,17 @@ def test_scale_offset_and_integers(tmp_path: Path, unit: str, metres: float) -> 
     assert window == pytest.approx(metres * np.array([[150.0, 250.0], [np.nan, 350.0]]), nan_ok=True)
 
 
+@pytest.mark.parametrize("nodata", [None, -9999])
+def test_the_lowest_integer_of_16_bits_is_a_void_with_any_scale(tmp_path: Path, nodata: float | None) -> None:
+    raw = np.array([[10_000, -32768], [-32767, 20_000]], dtype=np.int16)
+    path = write_dem(tmp_path / "d.tif", raw, kind=gdal.GDT_Int16, nodata=nodata)
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    dataset.GetRasterBand(1).SetScale(0.01)
+    dataset = None
+    window = open_dem(path, "ellipsoid").window(0, 0, 2, 2)
+    assert window == pytest.approx(np.array([[100.0, np.nan], [-327.67, 200.0]]), nan_ok=True)
+
+
 def test_outside_is_nan_and_fill_rules_say_otherwise(tmp_path: Path) -> None:
     heights = hills()
     heights[10:14, 10:14] = np.nan
