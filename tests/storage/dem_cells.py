@@ -32,7 +32,7 @@ def heights_of(cell: Cell) -> np.ndarray:
     return (500 + 30 * np.sin(np.deg2rad(40 * lon)) + 20 * np.cos(np.deg2rad(60 * lat))[:, None]).astype(np.float32)
 
 
-def write_cell(folder: Path, cell: Cell, *, crs: str = "EPSG:4326", columns: int | None = None) -> Path:
+def write_cell(folder: Path, cell: Cell, *, crs: str = "EPSG:4326", columns: int | None = None, unit: str = "") -> Path:
     """Write a cell where the bucket has it: in a folder of its own name, compressed."""
     heights, step = heights_of(cell), 1.0 / cell.columns
     heights = heights[:, : columns or cell.columns]
@@ -46,6 +46,7 @@ def write_cell(folder: Path, cell: Cell, *, crs: str = "EPSG:4326", columns: int
     reference.SetAxisMappingStrategy(osr.OAMS_TRADITIONAL_GIS_ORDER)
     dataset.SetSpatialRef(reference)
     dataset.SetGeoTransform((cell.lon - step / 2, step, 0, cell.lat + 1 + 0.5 / ROWS, 0, -1.0 / ROWS))
+    dataset.GetRasterBand(1).SetUnitType(unit)
     dataset.WriteArray(heights)
     dataset = None
     return path

@@ -135,6 +135,18 @@ def test_sea_is_at_height_0_above_the_geoid_and_lost_land_is_refused(bucket: Pub
     assert dem.provenance["sea_cells"] == [lost.name]
 
 
+@pytest.mark.parametrize(("crs", "unit"), [("EPSG:4326+3855", ""), ("EPSG:4326", "m")])
+def test_the_sea_beside_cells_that_state_their_unit(tmp_path: Path, geoid: str, crs: str, unit: str) -> None:
+    """GDAL gives the unit of a vertical CRS as that of the band."""
+    land, sea = Cell(20, -31), Cell(19, -31)
+    write_cell(tmp_path, land, crs=crs, unit=unit)
+    write_list(tmp_path, [land])
+    dem = found(str(tmp_path), Extent(19.5, -30.5, 20.5, -30.4), geoid)
+    assert dem.provenance["sea_cells"] == [sea.name]
+    assert dem.heights([[19.5, -30.5]])[0] == pytest.approx(20 + 1.95, abs=1e-3)
+    assert dem.heights([[20.0, -30.0]])[0] == pytest.approx(heights_of(land)[0, 0] + 22, abs=1e-3)
+
+
 def test_without_a_list_nobody_says_what_is_sea(bucket: PublicFolder, geoid: str) -> None:
     (bucket.folder / "tileList.txt").unlink()
     extent = Extent(19.5, -30.5, 20.5, -29.5)

@@ -41,7 +41,7 @@ class SeaCell:
 
     @property
     def unit(self) -> str:
-        """Metres; the files do not state it."""
+        """None is stated: a height of 0 is the same in each."""
         return ""
 
     @property
@@ -98,7 +98,9 @@ def open_cells(
     if lost and parse_fill(fill) == "error":
         raise _lost(source, lost, known=land is not None)
     placed = [_file_of(cell, path) for cell, path in there.items()]
-    placed += [(cell_of_sea, *cell_of_sea.place(), "") for cell_of_sea in map(SeaCell, sea)]
+    # The sea has the unit of the files: its height, 0, is the same in each unit.
+    unit = placed[0][3] if placed else ""
+    placed += [(cell_of_sea, *cell_of_sea.place(), unit) for cell_of_sea in map(SeaCell, sea)]
     if not placed:
         raise CoverageError(
             "this source has no DEM cells for the scene",
