@@ -18,6 +18,15 @@ UNITS = (
 )
 
 
+def named_unit(text: str) -> float | None:
+    """Return the length in metres of the unit of heights with this name; None if no unit has it.
+
+    >>> named_unit("US survey foot") == named_unit("ftUS")
+    True
+    """
+    return UNITS.get("".join(c for c in text.lower() if c.isalpha()))
+
+
 def dem_vertical_remedy(first: str = "") -> str:
     """Return the advice to state the height datum by option, after another advice if there is one."""
     option = Text("give the height datum with ", Setting("surface.vertical"), f" ({VERTICAL_FORMS})")
@@ -98,7 +107,7 @@ def dem_unit(text: str, declared: DeclaredVertical | None, option: Vertical | No
     DatumError
         If the unit is unknown, or if two of the band, the CRS and a datum in feet contradict each other.
     """
-    stated = UNITS.get("".join(c for c in text.lower() if c.isalpha())) if text else None
+    stated = named_unit(text)
     if text and stated is None:
         raise DatumError(f"unknown unit of heights {text!r}", field="unit", remedy="use metres or feet")
     # Two-dimensional systems have no unit of heights; promoted 3D ones always state metres.

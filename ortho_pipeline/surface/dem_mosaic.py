@@ -27,6 +27,7 @@ from ortho_pipeline.errors import CrsError, DatumError, InputError, completed
 from ortho_pipeline.errors.texts import counted
 from ortho_pipeline.files.locations import Location
 from ortho_pipeline.files.shell import typed_pattern
+from ortho_pipeline.geodesy.datum import named_unit
 from ortho_pipeline.geodesy.declared_vertical import DeclaredVertical, declared_vertical
 from ortho_pipeline.surface.base import Array
 from ortho_pipeline.surface.dem_file import DemFile, SampleGrid
@@ -264,7 +265,8 @@ def laid_out(name: str, placed: Sequence[tuple[Samples, pyproj.CRS, SampleGrid, 
     first, crs, grid, unit = placed[0]
     for other, its_crs, its_grid, its_unit in placed[1:]:
         _refuse_other_system(first, crs, grid, other, its_crs, its_grid)
-        if (its_crs is not crs and _datum(its_crs) != _datum(crs)) or its_unit != unit:
+        same_unit = (named_unit(its_unit) or its_unit) == (named_unit(unit) or unit)
+        if (its_crs is not crs and _datum(its_crs) != _datum(crs)) or not same_unit:
             raise DatumError(
                 f"this file has {_said(its_crs, its_unit)}, but {first.path} has {_said(crs, unit)}: they are not one "
                 "DEM",

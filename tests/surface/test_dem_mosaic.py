@@ -155,6 +155,19 @@ def test_what_is_not_one_dem_is_refused(other: Formula, error: type[Exception], 
         mosaic(Formula(10.0, 50.0, 5, 4, 0.1), other)
 
 
+@pytest.mark.parametrize(("unit", "other", "same"), [
+    ("m", "metre", True), ("ft", "foot", True), ("ft", "US survey foot", False), ("m", "", False), ("", "km", False),
+    ("km", "dm", False),
+])  # fmt: skip
+def test_a_unit_has_several_names(unit: str, other: str, same: bool) -> None:
+    parts = Formula(10.0, 50.0, 5, 4, 0.1, unit=unit), Formula(10.5, 50.0, 5, 4, 0.1, unit=other)
+    if same:
+        assert mosaic(*parts).unit == unit
+    else:
+        with pytest.raises(DatumError, match="not one DEM"):
+            mosaic(*parts)
+
+
 def test_files_that_are_sheared_are_no_mosaic() -> None:
     for place in (2, 4):
         other = Formula(10.5, 50.0, 5, 4, 0.1)
