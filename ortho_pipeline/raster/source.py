@@ -29,7 +29,7 @@ from ortho_pipeline.files.locations import AnyPath, Location, VsiPath, check_pat
 from ortho_pipeline.files.reading import why_no_file
 from ortho_pipeline.files.shell import converted
 from ortho_pipeline.raster.caching.block_cache import keep_blocks
-from ortho_pipeline.raster.opening.drivers import DRIVERS
+from ortho_pipeline.raster.opening.drivers import DRIVERS, refuse_dataset_within
 from ortho_pipeline.raster.opening.gate import DecodedUnit, open_seen
 from ortho_pipeline.raster.pixel_types import check_types, nodata_of, numpy_type, read_type
 from ortho_pipeline.runtime.process_limits import require_memory
@@ -126,6 +126,7 @@ def _opened(
         if Location(name).in_archive and not place.exists():
             raise InputError("there is no such file in the archive", file=name, remedy=_in_archive(name))
     elif not os.path.isfile(name) and not os.path.isdir(name):
+        refuse_dataset_within(name)
         raise InputError(why_no_file(name), file=name, remedy=check_path(name))
     elif Path(name).suffix.lower() in (".zip", ".tar", ".tgz"):
         raise InputError("this is an archive, not an image", file=name, remedy=_in_archive(name))

@@ -222,6 +222,16 @@ def _signed(printed: Printed, folder: Path) -> None:
     assert (RasterSource(folder / "int16.tif").read(0, 0, 4, 4) == -1).all()
 
 
+@case("raster", "gdal_translate X dataset.tif")
+def _within_a_file(printed: Printed, folder: Path) -> None:
+    tiff(folder / "two.tif", GREY)
+    gdal.Translate(
+        str(folder / "two.tif"), str(tiff(folder / "next.tif", GREY + 1)), creationOptions=["APPEND_SUBDATASET=YES"]
+    )
+    printed.paste(refused(open_dataset, "GTIFF_DIR:2:two.tif"))
+    assert (open_dataset(folder / "dataset.tif").ReadAsArray() == GREY + 1).all()
+
+
 @case("raster", "gdal_translate X")
 def _one_file(printed: Printed, folder: Path) -> None:
     beside, below = tiff(folder / "grey.tif", GREY), folder / "below"

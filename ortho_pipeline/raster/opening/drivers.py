@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from osgeo import gdal
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import network_is_closed
+from ortho_pipeline.files.shell import typed
 
 gdal.UseExceptions()
 
@@ -110,6 +112,16 @@ def require_driver(name: str, file: Any) -> None:
             file=file,
             remedy="use a GDAL that has it, such as the one of Debian or Ubuntu; or give a GeoTIFF "
             "(an image of the product, or one converted with gdal_translate)",
+        )
+
+
+def refuse_dataset_within(name: str) -> None:
+    """Raise an `InputError` if GDAL so names a dataset within a file: ``GTIFF_DIR:2:scan.tif``, ``NETCDF:dem.nc:z``."""
+    if re.match(r"[A-Z][A-Z0-9_]+:", name):
+        raise InputError(
+            "this is GDAL's name of a dataset within a file; only whole files are opened",
+            file=name,
+            remedy=f"extract the dataset: `gdal_translate {typed(name)} dataset.tif`",
         )
 
 
