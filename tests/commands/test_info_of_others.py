@@ -58,6 +58,28 @@ def test_an_ortho_says_what_it_is():
     assert info(SAMPLE / "reference.tif", "--rpc", SAMPLE / "scene_RPC.TXT", "--json").exit_code == 0
 
 
+@pytest.mark.parametrize(("scale", "heights"), [(0.1, [51.0, 53.0]), (-0.1, [47.0, 49.0])])
+def test_the_heights_of_a_dem_have_its_scale(tmp_path: Path, scale: float, heights: list[float]):
+    path = str(tmp_path / "dem.tif")
+    made = gdal.GetDriverByName("GTiff").Create(path, 2, 1, 1, gdal.GDT_Int16)
+    made.SetProjection(gdal.Open(str(SAMPLE / "dem.tif")).GetProjection())
+    made.SetGeoTransform((530_000, 20, 0, 4_124_000, 0, -20))
+    made.GetRasterBand(1).WriteArray(np.array([[10, 30]]))
+    made.GetRasterBand(1).SetScale(scale)
+    made.GetRasterBand(1).SetOffset(50.0)
+    made = None
+    assert json.loads(info(path, "--json").stdout)["heights"] == pytest.approx(heights)
+
+
+def test_a_dem_of_voids_is_described(tmp_path: Path):
+    made = gdal.Translate(str(tmp_path / "dem.tif"), str(SAMPLE / "dem.tif"), width=2, height=1)
+    made.GetRasterBand(1).WriteArray(np.full((1, 2), made.GetRasterBand(1).GetNoDataValue()))
+    made = None
+    done = info(tmp_path / "dem.tif")
+    assert "no valid sample found, EGM96 height" in done.output
+    assert done.exit_code == 0
+
+
 def test_a_dem_without_a_datum_asks_for_it(tmp_path):
     dem = str(tmp_path / "dem.tif")
     gdal.Translate(dem, str(SAMPLE / "dem.tif"), outputSRS="EPSG:32636")

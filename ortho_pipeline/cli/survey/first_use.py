@@ -109,8 +109,9 @@ def _print_map_raster(document: Mapping[str, Any]) -> None:
 
 
 def _heights_text(document: Mapping[str, Any]) -> str:
-    low, high = document["heights"]
-    return f"about {low:.0f} to {high:.0f}, {document['vertical'] or 'height datum not declared'}"
+    heights = document["heights"]
+    spread = "no valid sample found" if heights is None else "about {:.0f} to {:.0f}".format(*heights)
+    return f"{spread}, {document['vertical'] or 'height datum not declared'}"
 
 
 def _print_survey(folder: str, scene: SceneOptions, as_json: bool) -> None:

@@ -41,7 +41,7 @@ def described(image: str | os.PathLike[str], dataset: Any) -> dict[str, Any]:
     corners = pixels @ [[along_x, along_y], [over_x, over_y]] + (left, top)
     lon_lat = ground_transform(horizontal(crs), "EPSG:4979")(np.column_stack([corners, np.zeros(4)]))[:, :2]
     declared = declared_vertical(crs)
-    heights = list(band.ComputeRasterMinMax(True)) if kind == "dem" else None
+    heights = _range_of(band) if kind == "dem" else None
     return {
         "schema_version": SCHEMA_VERSION,
         "image": str(image),
@@ -61,6 +61,16 @@ def described(image: str | os.PathLike[str], dataset: Any) -> dict[str, Any]:
         "option": "surface.dem" if kind == "dem" else "match.reference",
         **to_document([]),
     }
+
+
+def _range_of(band: Any) -> list[float] | None:
+    """Return the lowest and the highest height about, in the unit of the band; None if no valid sample was found."""
+    try:
+        ends = np.array(band.ComputeRasterMinMax(True))
+    except RuntimeError:
+        return None
+    scale = 1.0 if band.GetScale() is None else band.GetScale()
+    return sorted((ends * scale + (band.GetOffset() or 0.0)).tolist())
 
 
 def _type_of(band: Any) -> str:
