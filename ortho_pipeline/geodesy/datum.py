@@ -109,7 +109,11 @@ def dem_unit(text: str, declared: DeclaredVertical | None, option: Vertical | No
     """
     stated = named_unit(text)
     if text and stated is None:
-        raise DatumError(f"unknown unit of heights {text!r}", field="unit", remedy="use metres or feet")
+        raise DatumError(
+            f"unknown unit of heights {text!r}",
+            field="unit",
+            remedy="state metres or feet, such as `gdal_edit.py -units m FILE`",
+        )
     # Two-dimensional systems have no unit of heights; promoted 3D ones always state metres.
     axis = declared.metres_per_unit if declared else None
     if stated is not None and axis is not None and abs(stated - axis) > 1e-3:

@@ -386,6 +386,12 @@ def _unit(printed: Printed, folder: Path) -> None:
     del dataset
     printed.paste(refused(open_dem, path), FILE="dem.tif")
     assert open_dem(path).height_range[0] > 800.0
+    dataset = gdal.Open(str(path), gdal.GA_Update)
+    dataset.GetRasterBand(1).SetUnitType("metres above the geoid")
+    dataset.FlushCache()
+    del dataset
+    printed.paste(refused(open_dem, path), FILE="dem.tif")
+    assert open_dem(path).height_range[0] > 800.0
 
 
 # -- warp ------------------------------------------------------------------------------------------------------------
