@@ -211,6 +211,13 @@ class DemFile:
                 field="band 1",
                 remedy=f"extract the real part: `gdal_translate -ot Float32 {converted(self.path, 'real')}`",
             )
+        if dataset.GetRasterBand(1).GetColorInterpretation() == gdal.GCI_RedBand:
+            raise InputError(
+                "the pixels of this DEM are colours, not heights",
+                file=self.path,
+                field="band 1",
+                remedy="give the raster of heights from which this picture was made",
+            )
         # GDAL counts from the corner of the first pixel; heights belong to the centres.
         centre = (x + 0.5 * (a + b), a, b, y + 0.5 * (c + d), c, d)
         grid = SampleGrid(plane, (dataset.RasterYSize, dataset.RasterXSize), centre)

@@ -544,6 +544,23 @@ def test_no_georeference(tmp_path: Path) -> None:
         open_dem(tmp_path / "e.tif", "ellipsoid")
 
 
+@pytest.mark.parametrize(("count", "kind", "heights"), [
+    (3, gdal.GDT_Byte, False), (4, gdal.GDT_Byte, False), (1, gdal.GDT_Byte, True), (3, gdal.GDT_Float32, True),
+])  # fmt: skip
+def test_a_picture_in_colours_is_no_dem(tmp_path: Path, count: int, kind: int, heights: bool) -> None:
+    """As shaded relief, and heights in red, green and blue."""
+    path = tmp_path / "d.tif"
+    dataset = gdal.GetDriverByName("GTiff").Create(str(path), 3, 3, count, kind)
+    dataset.SetGeoTransform((300000, 10, 0, 6280000, 0, -10))
+    dataset.SetSpatialRef(osr.SpatialReference(pyproj.CRS("EPSG:32735").to_wkt()))
+    dataset = None
+    if heights:
+        assert open_dem(path, "ellipsoid").height_range == (0.0, 0.0)
+    else:
+        with pytest.raises(InputError, match="colours, not heights"):
+            open_dem(path, "ellipsoid")
+
+
 def test_nothing_but_voids(tmp_path: Path) -> None:
     surface = open_dem(write_dem(tmp_path / "d.tif", np.full((5, 5), np.nan)), "ellipsoid")
     with pytest.raises(InputError, match="no valid height"):
