@@ -153,9 +153,9 @@ class Fit:
 
     @property
     def not_justified(self) -> tuple[str, ...]:
-        """Parameters that are not significant: their p is above `significance`."""
-        _, p = self.student
-        return tuple(name for name, chance in zip(self.param_names, p, strict=True) if not chance <= self.significance)
+        """Parameters that `prune` removes first: removable ones that are not significant (p above `significance`)."""
+        chances = dict(zip(self.param_names, self.student[1], strict=True))
+        return tuple(name for name in self.model.removable if not chances[name] <= self.significance)
 
     def rmse(self, which: str) -> Rmse | None:
         """Return root mean squares in pixels; None if there is no such point.

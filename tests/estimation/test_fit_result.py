@@ -109,6 +109,19 @@ def test_a_parameter_is_justified_up_to_its_significance(level: RPC) -> None:
         assert (found.param_names[k] not in strict.not_justified) == justified
 
 
+def test_a_shift_of_zero_beside_slopes_is_not_called_unjustified(level: RPC) -> None:
+    """It is zero only because of the origin, so pruning cannot remove it."""
+    places = np.random.default_rng(3).uniform([19.992, -30.008, 300.0], [20.008, -29.992, 700.0], (14, 3))
+    start = ImageCorrection.identity(level, "affine", ORIGIN)
+    true = start.with_params([0.0, 0.02, -0.01, 0.0, 0.01, 0.02])
+    noise = np.random.default_rng(4).normal(0, 0.1, (14, 2))
+    found = fit(start, Points.of(true.ground_to_image(places) + noise, places, "EPSG:4979", sigma_image=0.1))
+    _, p = found.student
+    assert min(p[0], p[3]) > 0.05
+    assert found.not_justified == ()
+    assert prune(found).removed == ()
+
+
 # -- parameters that are removed ---------------------------------------------------------------------------------------
 
 

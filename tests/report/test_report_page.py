@@ -77,7 +77,7 @@ def test_a_correction_with_parameters_that_the_points_do_not_justify_is_noted(ma
     assert notice["parameters"] == document["adjustment"]["statistics"]["not_justified"]
     assert {"row_per_row", "col_per_col"} <= set(notice["parameters"])
     page = made["rectify"].files["html"].read_text(encoding="utf-8")
-    assert "Use a simpler correction (<code>--correction shift</code>), or add <code>--prune</code>." in page
+    assert "Remove them with <code>--prune</code>." in page
     shift = json.loads(made["compare"].files["report"].read_text())
     assert "parameters-not-justified" not in {one["code"] for one in shift["notices"]}
 

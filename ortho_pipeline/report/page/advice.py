@@ -116,9 +116,7 @@ _KNOW: dict[str, str] = {
     "search-by-default": Text("If matching fails, change the radius with ", Setting("match.search"), "."),
     "control-without-height": "Add heights if you have them.",
     "unstated-sigma": Text("State the accuracy of the points with ", Setting("points.ground_sigma"), "."),
-    "parameters-not-justified": Text(
-        "Use a simpler correction (", Setting("points.correction", "shift"), "), or add ", Setting("points.prune"), "."
-    ),
+    "parameters-not-justified": Text("Remove them with ", Setting("points.prune"), "."),
     "parameters-removed": "Nothing to do: the points did not justify these parameters.",
     "relative-to-reference": "Measure check points if the absolute position matters.",
     "ortho-relative": Text(
