@@ -153,9 +153,10 @@ class Fit:
 
     @property
     def not_justified(self) -> tuple[str, ...]:
-        """Parameters that `prune` removes first: removable ones that are not significant (p above `significance`)."""
+        """Parameters that `prune` would remove first: removable, p above `significance`; none without redundancy."""
         chances = dict(zip(self.param_names, self.student[1], strict=True))
-        return tuple(name for name in self.model.removable if not chances[name] <= self.significance)
+        removable = () if self.sigma0 is None else self.model.removable
+        return tuple(name for name in removable if not chances[name] <= self.significance)
 
     def rmse(self, which: str) -> Rmse | None:
         """Return root mean squares in pixels; None if there is no such point.
@@ -175,8 +176,7 @@ class Fit:
         else:
             checks = self.points.check & ~self.points.tests if which == "matched" else self.points.tests
             if which == "agreeing":
-                off = {point.id for point in self.outlying}
-                checks = checks & np.array([name not in off for name in self.points.ids], dtype=bool)
+                checks = checks & ~np.isin(np.array(self.points.ids), [point.id for point in self.outlying])
             residuals = self.residuals[checks]
             # A point that does not project has no residual; a warning names it.
             residuals = residuals[np.isfinite(residuals).all(axis=1)]

@@ -122,6 +122,15 @@ def test_a_shift_of_zero_beside_slopes_is_not_called_unjustified(level: RPC) -> 
     assert prune(found).removed == ()
 
 
+def test_without_redundancy_no_parameter_is_called_unjustified(level: RPC) -> None:
+    """Pruning refuses such a fit, because it has no sigma0."""
+    found = fitted(level, "shift-drift")
+    two = fit(ImageCorrection.identity(level, "shift-drift", ORIGIN), found.points.select([0, 1]), robust=False)
+    assert two.sigma0 is None
+    assert (two.student[1] > 0.05).any()
+    assert two.not_justified == ()
+
+
 # -- parameters that are removed ---------------------------------------------------------------------------------------
 
 
