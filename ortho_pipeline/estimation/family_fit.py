@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, OrthoError
-from ortho_pipeline.errors.texts import Text
+from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.estimation.fit import Fit, Prior, fit, gross_errors
 from ortho_pipeline.estimation.regularisation import METHODS
 from ortho_pipeline.models import family_of, start_model
@@ -250,6 +250,12 @@ def prune(found: Fit, *, significance: float | None = None) -> Pruned:
     if found.sigma0 is None:
         raise InputError(
             "there is no redundancy, so parameters cannot be tested", field="points.prune", remedy="add control points"
+        )
+    if found.param_names and not found.model.removable:
+        raise InputError(
+            f"the parameters of the model {found.model.kind!r} cannot be removed",
+            field="points.prune",
+            remedy=Text("leave this option out, or use ", Setting("points.correction", "shift")),
         )
     removed: list[Removed] = []
     while True:

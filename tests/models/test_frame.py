@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ortho_pipeline.errors import DegeneratePoints, InputError, NotConverged, TooFewPoints
+from ortho_pipeline.estimation.family_fit import prune
 from ortho_pipeline.estimation.fit import Prior, fit
 from ortho_pipeline.estimation.problem import Problem
 from ortho_pipeline.geodesy.ellipsoid import angles_of_rotation, geocentric, geodetic, meet_height, rotation_of_angles
@@ -454,3 +455,11 @@ def test_points_on_both_sides_of_the_antimeridian_have_a_frame_among_them():
     found = resect(points, BILSAT)
     assert abs((found.origin[0] - 179.99 + 180) % 360 - 180) < 1
     assert apart(found, truth)[0] < 1
+
+
+def test_pruning_a_camera_is_refused():
+    """Without a part of its pose there is no camera."""
+    camera = aerial()
+    with pytest.raises(InputError, match="'frame' cannot be removed") as caught:
+        prune(fit(camera, measured(camera, 12, noise=0.5)))
+    assert caught.value.field == "points.prune"

@@ -81,7 +81,7 @@ _LOOK: dict[str, str] = {
         "), or a more accurate one. The report of a mosaic shows how well the orthos fit at the seams.",
     ),
     "uncertain-at-edge": "Add control points near the corners. With an RPC, a simpler correction helps, too.",
-    "inseparable-parameters": Text("Use a simpler correction, or add ", Setting("points.prune"), "."),
+    "inseparable-parameters": "Use a simpler correction or model.",
     "unsuited-model": "Use a model that the sensor suggests.",
     "points-cover-part": "Add points in the empty parts: ties where images overlap, control elsewhere.",
     "block-in-parts": "Measure common points, or adjust the parts separately.",
