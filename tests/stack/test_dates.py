@@ -51,6 +51,27 @@ def test_a_list_and_a_pattern_count_more_than_metadata(tmp_path):
     assert {one.source for one in found} == {"list"}
 
 
+def test_the_date_of_a_list_counts_wherever_else_the_image_was_given(tmp_path):
+    for name in "ab":
+        ortho(tmp_path / f"{name}.tif", ACQUISITIONDATETIME="2020-01-05")
+    (tmp_path / "list.csv").write_text("file,date\na.tif,2021-02-03\n")
+    for given in (["list.csv", "."], [".", "list.csv"], [".", "list.csv", "list.csv"]):
+        found = dated_orthos([tmp_path / name for name in given])
+        assert [(one.name, str(one.time.date()), one.source) for one in found] == [
+            ("b", "2020-01-05", "ACQUISITIONDATETIME"),
+            ("a", "2021-02-03", "list"),
+        ]
+
+
+def test_an_image_with_two_dates_in_lists_is_refused(tmp_path):
+    for name in "ab":
+        ortho(tmp_path / f"{name}.tif")
+    (tmp_path / "list.csv").write_text("file,date\na.tif,2020-01-05\nb.tif,2020-02-01\na.tif,2020-03-01\n")
+    with pytest.raises(InputError, match="lists give this image two dates: 2020-01-05 and 2020-03-01") as error:
+        dated_orthos([tmp_path / "list.csv"])
+    assert Path(str(error.value.file)) == tmp_path / "a.tif"
+
+
 def test_clouds_and_sun_come_from_documents_and_metadata(tmp_path):
     ortho(tmp_path / "a_20200101.tif", CLOUD_COVERAGE_ASSESSMENT="12.5")
     ortho(tmp_path / "b_20200102.tif", CLOUD_COVER="999")

@@ -9,7 +9,7 @@ import io
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -133,19 +133,15 @@ def dated_orthos(
     Raises
     ------
     InputError
-        If an image has no date, two have one name, or one is raw and there are no heights.
+        If an image has no date or two, two have one name, or one is raw and there are no heights.
     """
     found: dict[str, _Given] = {}
     heights, skipped = has_surface(surface), {_real(path) for path in dem_files(surface)}
     for one in _files(given, options):
         if _real(one.path) in skipped:
             continue
-        name = one.path.stem
-        other = found.setdefault(key_of_name(name), one)
-        if _real(other.path) != _real(one.path):
-            raise InputError(
-                f"two images are called {name}", file=one.path, field="orthos", remedy="rename one of them"
-            )
+        key = key_of_name(one.path.stem)
+        found[key] = found[key].completed(one) if key in found else one
     if len(found) < 2:
         raise InputError(
             f"a stack needs at least two images, not {len(found)}",
@@ -190,6 +186,30 @@ class _Given:
     path: Place
     stated: str | None = None
     item: Place | None = None
+
+    def completed(self, other: _Given) -> _Given:
+        """Return an image that was given twice, with the date and the STAC item of either.
+
+        Raises
+        ------
+        InputError
+            If the other one is another image of this name, or states another date.
+        """
+        if _real(self.path) != _real(other.path):
+            raise InputError(
+                f"two images are called {other.path.stem}",
+                file=other.path,
+                field="orthos",
+                remedy="rename one of them",
+            )
+        if self.stated and other.stated and time_of(self.stated, self.path) != time_of(other.stated, self.path):
+            raise InputError(
+                f"lists give this image two dates: {self.stated} and {other.stated}",
+                file=self.path,
+                field="date",
+                remedy="delete the wrong row",
+            )
+        return replace(self, stated=self.stated or other.stated, item=self.item or other.item)
 
 
 def _files(given: Sequence[str | os.PathLike[str]], options: SceneOptions) -> list[_Given]:
