@@ -70,7 +70,7 @@ class StackResult(Result):
         Raises
         ------
         InputError
-            Without xarray and dask, if the pixels were kept, or if dates differ in bands or type.
+            Without xarray and dask, if the pixels were kept, or if dates differ in bands, type or scale.
         """
         known = [one for one in self.dates if one.output is not None]
         if not known or not all((one.output or "").endswith(".tif") for one in known):

@@ -72,7 +72,7 @@ def cube_of(
     Raises
     ------
     InputError
-        If dask or xarray is missing, or the orthos differ in grid, bands, type or nodata value.
+        If dask or xarray is missing, or the orthos differ in grid, bands, type, nodata value, scale or colours.
     """
     dask, xarray = libraries("to_xarray")
     side = SIDE if chunks is None else chunks
@@ -88,6 +88,9 @@ def cube_of(
                 field="to_xarray",
                 remedy="stack orthos with the same bands and type, and let the stack write their pixels",
             )
+        what = first.unlike(one.profile, os.path.basename(paths[0]), os.path.basename(path))
+        if what:
+            raise InputError(what, file=path, field="to_xarray", remedy="stack only orthos whose values mean the same")
     blocks = [blocks_of(one, grid, side) for one in tiles]
     coordinates = coordinates_of(grid, first)
     # NumPy has no time zones: times are UTC.
