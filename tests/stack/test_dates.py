@@ -51,6 +51,14 @@ def test_a_list_and_a_pattern_count_more_than_metadata(tmp_path):
     assert {one.source for one in found} == {"list"}
 
 
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_the_delimiter_of_a_list_is_that_of_its_header(tmp_path, delimiter):
+    rows = [["Date", "File"], ["2020-01-05", '"a, b; c.tif"'], ["", "d.tif"]]
+    (tmp_path / "list.csv").write_text("\ufeff\n" + "\n".join(delimiter.join(row) for row in rows))
+    names = [str(tmp_path / name) for name in ("a, b; c.tif", "d.tif")]
+    assert read_list(tmp_path / "list.csv") == list(zip(names, ["2020-01-05", None], strict=True))
+
+
 def test_the_date_of_a_list_counts_wherever_else_the_image_was_given(tmp_path):
     for name in "ab":
         ortho(tmp_path / f"{name}.tif", ACQUISITIONDATETIME="2020-01-05")

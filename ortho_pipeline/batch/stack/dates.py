@@ -278,22 +278,26 @@ def _listed(path: Place, options: SceneOptions) -> list[_Given]:
 def read_list(path: str | os.PathLike[str]) -> list[tuple[str, str | None]]:
     """Return the files of a list, relative to its folder, and their dates if it has a column of them.
 
+    The delimiter (comma, semicolon or tab) is that of the header.
+
     Raises
     ------
     InputError
         If it has no column of files, or a row has no file.
     """
     text = decoded(read_bounded(path, _BYTES, remedy="give a list of files"))
-    lines = csv.reader(io.StringIO(text))
+    header = next((line for line in text.splitlines() if line.strip()), "")
+    # Where a comma is the decimal mark, spreadsheets write semicolons.
+    lines = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=header.count))
     try:
         rows = [row for row in lines if any(cell.strip() for cell in row)]
     except csv.Error as error:
         raise InputError(f"this is not CSV ({error})", file=path, field=f"line {lines.line_num}") from error
     if not rows:
         raise InputError("this list is empty", file=path, field="line 1")
-    header = [cell.strip().lower() for cell in rows[0]]
-    file = next((header.index(name) for name in _FILE if name in header), None)
-    date = next((header.index(name) for name in _DATE if name in header), None)
+    names = [cell.strip().lower() for cell in rows[0]]
+    file = next((names.index(name) for name in _FILE if name in names), None)
+    date = next((names.index(name) for name in _DATE if name in names), None)
     if file is None:
         raise InputError(
             "this list has no column of files", file=path, field="line 1", remedy="name the columns file and date"
