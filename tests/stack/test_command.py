@@ -252,6 +252,23 @@ def test_orthos_that_are_no_part_of_the_result_go(made, tmp_path):
     assert left == {f"{path.stem}{ending}" for path in made[0][:3] for ending in endings}
 
 
+def test_images_that_the_stack_would_replace_or_remove_are_refused(made, tmp_path):
+    shutil.copytree(made[1], tmp_path / "out")
+    before = contents(tmp_path / "out")
+    aligned = sorted((tmp_path / "out" / "aligned").glob("*.tif"))
+    (tmp_path / "link.tif").symlink_to(aligned[1])
+    reference = {"match": MatchOptions(points=120, reference=[str(aligned[0])])}
+    for given, options, more, field in (
+        ([tmp_path / "out" / "aligned"], StackOptions(), {}, "orthos"),
+        ([made[0][0], tmp_path / "link.tif"], StackOptions(), {}, "orthos"),
+        (made[0], StackOptions(datum="reference"), reference, "match.reference"),
+    ):
+        with pytest.raises(InputError, match="this image is an output of the stack in the same folder") as error:
+            run(given, tmp_path / "out", options, **more)
+        assert error.value.field == field
+    assert contents(tmp_path / "out") == before
+
+
 def test_a_killed_run_resumes_to_the_same_result(made, tmp_path):
     words = ["stack", str(made[0][0].parent), "-o", str(tmp_path / "out"), "--match-points", "120", "--threads", "1"]
     killed = subprocess.Popen([sys.executable, "-m", "ortho_pipeline", *words], stderr=subprocess.DEVNULL)

@@ -220,6 +220,14 @@ class _Planned:
 def _refuse_unfit(planned: _Planned) -> None:
     """Refuse outputs that cannot be."""
     options, far = planned.options, address_of(planned.folder) is not None
+    written = next((one for one in planned.nodes if _is_written(one, planned.folder)), None)
+    if written is not None:
+        raise InputError(
+            "this image is an output of the stack in the same folder, which would replace or remove it",
+            file=written.image,
+            field="orthos" if written in planned.nodes[: planned.count] else "match.reference",
+            remedy="choose another output folder",
+        )
     if planned.output.stac and options.corrections_only:
         raise InputError(
             "STAC items need aligned orthos, and only corrections are written",
@@ -234,6 +242,15 @@ def _refuse_unfit(planned: _Planned) -> None:
             field="stack.corrections_only",
             remedy=Text("leave out ", Setting("stack.corrections_only"), ", or give the addresses of the images"),
         )
+
+
+def _is_written(one: Dated, folder: str) -> bool:
+    """Return whether an image is where a stack in a folder writes orthos."""
+    if Location(one.image).is_far:
+        image, place = str(Location(one.image).url), folder
+    else:
+        image, place = os.path.realpath(one.image), os.path.realpath(folder)
+    return os.path.dirname(image) in {f"{place}/{name}" for name in (_ALIGNED, _RAW)}
 
 
 def _crew(
