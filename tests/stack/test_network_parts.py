@@ -244,3 +244,16 @@ def test_ground_that_does_not_move_needs_one_solution_for_each_question(monkeypa
     stack = adjust(made.truth.cells, made.edges, made.years.tolist(), affine=False)
     assert not stack.motion.moving.any()
     assert asked == [{"steady": True}, {}]
+
+
+@pytest.mark.parametrize(("cells", "known"), [(8, 6), (5, 1)])
+def test_edges_in_few_cells_give_shifts_or_nothing(cells: int, known: int) -> None:
+    """Slopes need twelve cells, such as all of a narrow strip, and a shift needs six."""
+    made = Truth(dates=6, hidden=0.0).made()
+    value = made.edges.value.copy()
+    value[:, cells:] = np.nan
+    found = adjust(made.truth.cells, dataclasses.replace(made.edges, value=value), made.years)
+    assert found.determined.sum() == known
+    assert not found.sloped.any()
+    if known > 1:
+        np.testing.assert_allclose(found.network.value[:, 0], made.shift - made.shift.mean(axis=0), atol=0.2)

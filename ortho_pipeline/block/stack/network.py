@@ -261,7 +261,8 @@ def solve(
     design = sparse.kron(some.incidence(dates), np.eye(terms, 3)).tocsr()[:, columns]
     value, covariance = np.zeros((dates * 3, 2)), np.zeros((2, dates * 3, dates * 3))
     datum = _datum(part, free)[:, columns]
-    for axis in (0, 1):
+    # Without an accepted edge, each date is a part of its own.
+    for axis in (0, 1) if len(index) else ():
         sigma, own = limited.covariance(axis, some, kept, place)
         weight = _block_weights(sigma, own)
         scaled = weight @ design
