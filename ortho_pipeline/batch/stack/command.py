@@ -406,7 +406,7 @@ def _adjusted(
             field="orthos",
             remedy=remedy,
         )
-    cells = Cells.over(*placed.covered(dates))
+    cells = Cells.over(*placed.shared(dates, [(pair.first, pair.second) for pair in matched]))
     years = [one.days / _DAYS_A_YEAR for one in nodes]
     years = [year if number < len(dates) else np.nan for number, year in enumerate(years)]
     solved = adjust(cells, _edges(nodes, placed, cells, matched), years, datum, affine=affine)

@@ -69,10 +69,13 @@ class Placed:
         ground[:, 2] = surface.heights(ground[:, :2], self.model.crs)
         return ground
 
-    def covered(self, dates: Sequence[Dated]) -> tuple[Array, Array]:
-        """Return the lowest and highest place (px) of the orthos."""
-        places = np.concatenate([self.at(map_grid_of(one).corners[:, :2]) for one in dates])
-        return places.min(axis=0), places.max(axis=0)
+    def shared(self, dates: Sequence[Dated], pairs: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
+        """Return the lowest and highest place (px) of what two dates of a pair show; a reference shows all."""
+        places = [self.at(map_grid_of(one).corners[:, :2]) for one in dates]
+        known = [[number for number in pair if number < len(dates)] for pair in pairs]
+        low = [np.max([places[number].min(axis=0) for number in some], axis=0) for some in known]
+        high = [np.min([places[number].max(axis=0) for number in some], axis=0) for some in known]
+        return np.min(low, axis=0), np.max(high, axis=0)
 
     def corrected(self, one: Dated, stack: AdjustedStack, date: int) -> ImageCorrection:
         """Return the model of an ortho with its correction."""
