@@ -6,6 +6,7 @@ sensors here, the resolution in the focal plane, DJI's nominal focal length in p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -39,8 +40,8 @@ _NEAR = 0.03
 _ZOOMED = 1.01
 #: Millimetres of a unit of FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre.
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-#: The longer side (mm) of a frame of 35 mm film.
-_FILM_MM = 36.0
+#: Diagonal (mm) of a frame of 35 mm film, and the shape of this frame.
+_FILM_MM, _FILM_SHAPE = math.hypot(36.0, 24.0), 1.5
 #: Standard deviations of the focal length and principal point, in parts of the focal length, and of distortion: of a
 #: maker's calibration, and of a nominal camera without distortion.
 CALIBRATED = {
@@ -213,11 +214,15 @@ def _of_sensor(tags: Tags, width: int, height: int, full: tuple[float, float]) -
 
 
 def _of_film(tags: Tags, width: int, height: int) -> PhotoCamera | None:
-    """Return the camera by the focal length in 35 mm film."""
+    """Return the camera by the focal length in 35 mm film, which has the same angle along the diagonal.
+
+    Source: CIPA DCG-001. A longer shape than that of film shows a part of the rows.
+    """
     film = tags.positive("FocalLengthIn35mmFilm")
     if not film:
         return None
-    pixels = film / _FILM_MM * max(width, height)
+    longer = max(width, height)
+    pixels = film / _FILM_MM * math.hypot(longer, max(min(width, height), longer / _FILM_SHAPE))
     return PhotoCamera(_plain(width, height, pixels), "focal length in 35 mm film, rounded")
 
 

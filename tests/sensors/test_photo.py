@@ -388,10 +388,32 @@ def test_the_optical_centre_shows_a_crop(tmp_path):
     assert part.facts["focal_length_px"] == pytest.approx(402, abs=1e-3)
 
 
-def test_the_focal_length_in_35_mm_film_is_of_the_longer_side(tmp_path):
-    exif = {**EXIF, "Model": "X", "PixelXDimension": "400", "PixelYDimension": "600"}
-    portrait = opened(photo(tmp_path / "a.tif", exif, size=(400, 600)))
-    assert portrait.facts["focal_length_px"] == pytest.approx(600 * 24 / 36, abs=1e-3)
+@pytest.mark.parametrize(
+    ("size", "pixels"),
+    [
+        ((600, 400), 600 * 24 / 36),
+        ((400, 600), 600 * 24 / 36),  # a portrait
+        ((600, 450), 750 * 24 / math.hypot(36, 24)),  # 4:3, whose diagonal is 5
+        ((608, 342), 608 * 24 / 36),  # 16:9 shows a part of the rows
+    ],
+)
+def test_the_focal_length_in_35_mm_film_is_by_the_diagonal(tmp_path, size, pixels):
+    exif = {**EXIF, "Model": "X", "PixelXDimension": str(size[0]), "PixelYDimension": str(size[1])}
+    scene = opened(photo(tmp_path / "a.tif", exif, size=size))
+    assert scene.facts["focal_length_px"] == pytest.approx(pixels, abs=1e-3)
+
+
+@pytest.mark.parametrize(("model", "focal", "film"), [("FC330", 3.61, 20), ("FC220", 4.73, 26), ("FC6310", 8.8, 24)])
+def test_known_sensors_agree_with_their_focal_length_in_35_mm_film(tmp_path, model, focal, film):
+    size = (400, 300) if model != "FC6310" else (600, 400)
+    exif = {**EXIF, "FocalLength": f"({focal})", "FocalLengthIn35mmFilm": str(film)}
+    exif |= {"PixelXDimension": str(size[0]), "PixelYDimension": str(size[1])}
+    pixels = [
+        opened(photo(tmp_path / f"{name}.tif", {**exif, "Model": name}, size=size)).facts["focal_length_px"]
+        for name in (model, "X")
+    ]
+    # The tag has whole millimetres.
+    assert pixels[1] == pytest.approx(pixels[0], rel=0.03)
 
 
 def test_a_digital_zoom_is_a_crop_unless_the_width_of_the_part_is_given(tmp_path):
