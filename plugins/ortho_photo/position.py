@@ -20,6 +20,8 @@ LEAST = 0.02
 APART = 1.0
 _FIXED = 50.0
 _METRES_OF_DEGREE = 111_200.0
+#: GDAL gives EXIF's fractions with so many digits.
+_DIGITS = 6
 #: Values of GPSAltitudeRef: below the reference surface, and the two of EXIF 3 that state heights from sea level.
 _BELOW, _SEA_LEVEL = ("1", "3"), ("2", "3")
 
@@ -41,7 +43,10 @@ class Position:
 
 @dataclass(frozen=True)
 class _Source:
-    """What EXIF or XMP states: longitude and latitude, altitude, and their standard deviations."""
+    """What EXIF or XMP states: longitude and latitude, altitude, and their standard deviations.
+
+    `rounded` is the standard deviation of the rounding of the position, m.
+    """
 
     name: str
     place: tuple[float, float] | None = None
@@ -49,6 +54,7 @@ class _Source:
     plan: float | None = None
     height: float | None = None
     positioning: str = ""
+    rounded: float = 0.0
 
 
 def position_of(tags: Tags) -> Position:
@@ -88,7 +94,7 @@ def position_of(tags: Tags) -> Position:
         lon,
         lat,
         levelled.altitude,
-        (max(plan_by.plan or PLAN, LEAST), max(height, LEAST)),
+        (math.hypot(max(plan_by.plan or PLAN, LEAST), placed.rounded), max(height, LEAST)),
         plan_by.positioning if plan_by.plan else "no accuracy in the tags; assumed",
         _differing(tags, placed, xmp, exif),
     )
@@ -121,7 +127,8 @@ def _of_exif(tags: Tags) -> _Source:
     plan = tags.positive("Camera:GPSXYAccuracy", "senseFly:GPSXYAccuracy", "GPSHPositioningError")
     height = tags.positive("Camera:GPSZAccuracy", "senseFly:GPSZAccuracy") if plan else None
     place = None if lat is None or lon is None or (lat, lon) == (0.0, 0.0) else (lon, lat)
-    return _Source("EXIF", place, altitude, plan, height, "accuracy in the tags")
+    rounded = max(_rounding(tags, "GPSLatitude"), _rounding(tags, "GPSLongitude")) * _METRES_OF_DEGREE
+    return _Source("EXIF", place, altitude, plan, height, "accuracy in the tags", rounded)
 
 
 def _differing(tags: Tags, used: _Source, xmp: _Source, exif: _Source) -> tuple[Notice, ...]:
@@ -153,3 +160,13 @@ def _degrees(tags: Tags, name: str, negative: str) -> float | None:
         raise tags.error(f"{len(parts)} numbers are not an angle", name)
     value = sum(part / 60**power for power, part in enumerate(parts))
     return -value if tags.text(f"{name}Ref").upper().startswith(negative) else value
+
+
+def _rounding(tags: Tags, name: str) -> float:
+    """Return the standard deviation (degrees) of an angle's rounding: fractions of degrees or minutes are coarse."""
+    digits = (
+        10.0 ** (math.floor(math.log10(part)) + 1 - _DIGITS) / 60**power
+        for power, part in enumerate(tags.numbers(name) or [])
+        if part > 0 and not part.is_integer()
+    )
+    return max(digits, default=0.0) / math.sqrt(12)

@@ -239,6 +239,20 @@ def test_an_accuracy_counts_for_the_position_of_its_own_source(tmp_path, exif, x
     assert all(f"The position in {used} is used" in notice for notice in scene.notices)
 
 
+@pytest.mark.parametrize(
+    ("latitude", "sigma"),
+    [
+        ("(39) (30) (0.1234)", 0.02),  # 3 mm
+        ("(39) (30.1235) (0)", math.hypot(0.02, 0.0001 / 60 * 111_200 / math.sqrt(12))),
+        ("(39.5001) (0) (0)", math.hypot(0.02, 0.0001 * 111_200 / math.sqrt(12))),
+    ],
+)
+def test_a_position_in_fractions_of_degrees_is_as_coarse_as_gdal_reads_it(tmp_path, latitude, sigma):
+    exif = {**EXIF, "GPSLatitude": latitude, "GPSHPositioningError": "(0.02)"}
+    scene = opened(photo(tmp_path / "a.tif", exif))
+    assert sigmas(scene)[:2] == pytest.approx([sigma] * 2, rel=0.01)
+
+
 def test_a_height_from_sea_level_in_exif_is_not_compared_with_djis(tmp_path):
     scene = opened(photo(tmp_path / "a.tif", {**EXIF, "GPSAltitude": "(1030)", "GPSAltitudeRef": "0x02"}, PLACED))
     assert scene.notices == ()
