@@ -17,8 +17,12 @@ from skimage.registration import phase_cross_correlation
 from ortho_pipeline.cli.program import cli
 from ortho_pipeline.commands.block_results import orthos as orthos_of_blocks
 from ortho_pipeline.commands.results import Result
-from ortho_pipeline.errors import InputError
-from ortho_pipeline.options import MosaicOptions
+from ortho_pipeline.errors import CoverageError, InputError
+from ortho_pipeline.hookspecs import Scene
+from ortho_pipeline.models import FrameCamera
+from ortho_pipeline.models.lens import Interior
+from ortho_pipeline.options import MosaicOptions, OutputOptions
+from ortho_pipeline.surface.dem import open_dem
 from ortho_pipeline.surface.writing import write_dem
 
 
@@ -70,6 +74,20 @@ def test_the_cartosat_pair_on_one_grid(sample: Path, tmp_path: Path) -> None:
     one, other = (gdal.Open(str(path / "mosaic.tif")).ReadAsArray() for path in (tmp_path, out))
     np.testing.assert_array_equal(one, other)
     assert document["mosaic"]["seams"]
+
+
+@pytest.mark.parametrize(("fill", "told"), [("error", "the DEM covers 0.0 % of the scene"), ("mask", "no pixels")])
+def test_an_image_outside_the_dem_is_named(tmp_path: Path, fill: str, told: str) -> None:
+    """One photo of many is 900 m west of the DEM."""
+    write_dem(tmp_path / "dem.tif", np.full((201, 201), 80.0), (299_799.0, 2_700_201.0), 2.0, "EPSG:32651")
+    scenes = {}
+    for name, x in (("near", 300_000.0), ("far", 299_100.0)):
+        interior = Interior(600, 400, 0.006, 1e-5, 1e-5)
+        model = FrameCamera.from_map(interior, "EPSG:32651", [x, 2.7e6, 180.0, 0, 0, 0], frame="map", heights=(0, 100))
+        scenes[name] = Scene("frame", name, 600, 400, {"frame": model}, "table")
+    with pytest.raises(CoverageError, match=f"image far: .*{told}") as error:
+        orthos_of_blocks.on_one_grid(scenes, open_dem(tmp_path / "dem.tif", "ellipsoid", fill=fill), OutputOptions())
+    assert str(error.value.remedy).endswith("; or leave this image out")
 
 
 def test_options_of_orthos_need_orthos(sample: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from ortho_pipeline.commands.resolved.ledger import Ledger
 from ortho_pipeline.commands.resolved.request import Request
 from ortho_pipeline.commands.resolved.resolved import Resolved
 from ortho_pipeline.commands.results import Result, outputs
-from ortho_pipeline.errors import InputError, ReportError
+from ortho_pipeline.errors import CoverageError, InputError, ReportError
 from ortho_pipeline.errors.texts import Setting, Text
 from ortho_pipeline.geodesy.crs import map_crs
 from ortho_pipeline.geodesy.naming import crs_text
@@ -83,13 +83,21 @@ def on_one_grid(scenes: Mapping[str, Scene], surface: Surface, output: OutputOpt
 
     Raises
     ------
-    InputError
-        If the heights do not cover an image.
+    CoverageError
+        If the heights do not cover an image. The message names it.
     """
     steps, crs = [], None if output.crs is None else map_crs(output.crs)
-    for scene in scenes.values():
+    for label, scene in scenes.items():
         found = lay(scene.model, surface, scene.width, scene.height)
-        found.require_coverage()
+        try:
+            found.require_coverage()
+        except CoverageError as error:
+            raise CoverageError(
+                Text(f"image {label}: ", error.message),
+                file=error.file,
+                field=error.field,
+                remedy=Text(error.remedy or "", "; or leave this image out"),
+            ) from error
         crs = crs or output_crs(scene.model, scene.width, scene.height)
         steps.append(two_digits(ground_sample_distance(scene.model, crs, scene.width, scene.height, found.middle)))
     if output.like is not None or crs is None:
