@@ -238,11 +238,13 @@ def _begin() -> None:
     """Prepare the process for a command, before it is loaded."""
     from ortho_pipeline.files.folders import ignore_working_folder
     from ortho_pipeline.files.locations import close_network
+    from ortho_pipeline.raster.opening.environment import ignore_reading_options
     from ortho_pipeline.runtime.process_limits import share_freed_memory
 
     share_freed_memory()
     # Before GDAL is loaded, which reads the environment; worker processes inherit it.
     ignore_working_folder()
+    ignore_reading_options()
     close_network()
 
 

@@ -1,0 +1,82 @@
+"""Options of GDAL in the environment that would change what files are."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from osgeo import gdal
+
+from ortho_pipeline.raster.opening.environment import ignore_reading_options
+from ortho_pipeline.raster.source import open_dataset
+
+
+def _image(path: Path) -> Path:
+    """Write an image whose places are those of pixel centres, with a mask, and a nodata value next to it."""
+    gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", "NO")
+    image = gdal.GetDriverByName("GTiff").Create(str(path), 8, 8, 1, options=["COMPRESS=DEFLATE"])
+    image.SetMetadataItem("AREA_OR_POINT", "Point")
+    image.SetGeoTransform((500.0, 20.0, 0.0, 900.0, 0.0, -20.0))
+    image.WriteArray(np.arange(64, dtype=np.uint8).reshape(1, 8, 8))
+    image.CreateMaskBand(gdal.GMF_PER_DATASET)
+    image.GetRasterBand(1).GetMaskBand().WriteArray(np.tri(8, dtype=np.uint8) * 255)
+    del image
+    image = gdal.Open(str(path))
+    image.GetRasterBand(1).SetNoDataValue(7)
+    del image
+    gdal.SetThreadLocalConfigOption("GDAL_TIFF_INTERNAL_MASK", None)
+    return path
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "GTIFF_POINT_GEO_IGNORE=TRUE",
+        "GDAL_PAM_ENABLED=NO",
+        "GDAL_GEOREF_SOURCES=NONE",
+        "GDAL_DISABLE_READDIR_ON_OPEN=EMPTY_DIR",
+    ],
+)
+def test_options_that_change_what_is_read_are_ignored_with_a_warning(tmp_path, monkeypatch, caplog, option) -> None:
+    """Places moved by half a pixel, and masks and nodata values were lost, without a word."""
+
+    def read() -> tuple[object, ...]:
+        image = open_dataset(path)
+        band = image.GetRasterBand(1)
+        return image.GetGeoTransform(), band.GetNoDataValue(), band.GetMaskBand().ReadAsArray().tolist()
+
+    path = _image(tmp_path / "image.tif")
+    expected = read()
+    monkeypatch.setenv(*option.split("="))
+    assert read() != expected, "this GDAL does not know the option"
+    ignore_reading_options()
+    assert read() == expected
+    assert option in caplog.text
+
+
+def test_damaged_blocks_are_errors_whatever_the_environment(tmp_path, monkeypatch) -> None:
+    """GDAL returned what was in its memory."""
+    path = _image(tmp_path / "image.tif")
+    image = open_dataset(path)
+    offset = int(image.GetRasterBand(1).GetMetadataItem("BLOCK_OFFSET_0_0", "TIFF"))
+    del image
+    content = bytearray(path.read_bytes())
+    content[offset : offset + 8] = b"\xff" * 8
+    path.write_bytes(content)
+    monkeypatch.setenv("GTIFF_IGNORE_READ_ERRORS", "YES")
+    ignore_reading_options()
+    with pytest.raises(RuntimeError, match="IReadBlock"):
+        open_dataset(path).ReadAsArray()
+
+
+def test_the_command_line_ignores_them() -> None:
+    script = (
+        "import os; from ortho_pipeline.cli.program import _begin; _begin(); print('GDAL_PAM_ENABLED' in os.environ)"
+    )
+    surroundings = {**os.environ, "GDAL_PAM_ENABLED": "NO"}
+    done = subprocess.run([sys.executable, "-c", script], env=surroundings, capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
