@@ -1,4 +1,4 @@
-"""Options of GDAL in the environment that would change what files are."""
+"""Variables of the environment that would change what files are."""
 
 from __future__ import annotations
 
@@ -80,3 +80,19 @@ def test_the_command_line_ignores_them() -> None:
     surroundings = {**os.environ, "GDAL_PAM_ENABLED": "NO"}
     done = subprocess.run([sys.executable, "-c", script], env=surroundings, capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_a_folder_without_the_database_of_proj_is_named(tmp_path: Path) -> None:
+    """A DEM with a height datum was refused because it had none, and then the error was called a bug."""
+    script = (
+        "import sys; from ortho_pipeline.errors import InputError\n"
+        "from ortho_pipeline.raster.source import open_dataset\n"
+        "try: open_dataset(sys.argv[1])\n"
+        "except InputError as error: print(error)\n"
+    )
+    words = [sys.executable, "-c", script, str(_image(tmp_path / "image.tif"))]
+    surroundings = {**os.environ, "PROJ_LIB": str(tmp_path)}
+    surroundings.pop("PROJ_DATA", None)
+    done = subprocess.run(words, env=surroundings, capture_output=True, text=True, check=True)
+    assert f"{tmp_path}: PROJ_LIB: GDAL cannot use the database of PROJ" in done.stdout
+    assert "Remedy: remove the environment variable PROJ_LIB" in done.stdout

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from osgeo import gdal
+from osgeo import gdal, osr
 
 from ortho_pipeline.errors import InputError
 from ortho_pipeline.files.locations import network_is_closed
@@ -89,6 +90,33 @@ def remove_network_drivers() -> None:
             driver = gdal.GetDriverByName(name)
             if driver is not None:
                 driver.Deregister()
+
+
+@functools.cache
+def require_proj_database() -> None:
+    """Refuse rasters if GDAL does not find PROJ's database: it would lose height datums and misread systems.
+
+    Raises
+    ------
+    InputError
+    """
+    gdal.PushErrorHandler("CPLQuietErrorHandler")
+    try:
+        known = osr.SpatialReference().ImportFromEPSG(4326) == 0
+    except RuntimeError:
+        known = False
+    finally:
+        gdal.PopErrorHandler()
+    if not known:
+        named = [name for name in ("PROJ_DATA", "PROJ_LIB") if os.environ.get(name)]
+        raise InputError(
+            "GDAL cannot use the database of PROJ (proj.db): it is missing, or of another version",
+            file=os.environ[named[0]] if named else None,
+            field=" and ".join(named) or "PROJ_DATA",
+            remedy=f"remove the environment variable {' and '.join(named)}"
+            if named
+            else "set the environment variable PROJ_DATA to the folder of PROJ's proj.db, for example /usr/share/proj",
+        )
 
 
 def driver_for(path: Path) -> str | None:

@@ -35,6 +35,7 @@ from ortho_pipeline.raster.opening.drivers import (
     identified,
     remove_network_drivers,
     require_driver,
+    require_proj_database,
 )
 from ortho_pipeline.raster.opening.references import NAMES_OF, Named, crs_texts, products_of_volume, to_one_file
 from ortho_pipeline.stores.sidecars import ask_beside
@@ -84,6 +85,7 @@ def open_seen(
     """
     gdal.UseExceptions()  # other code of the process may have turned them off since the import
     remove_network_drivers()
+    require_proj_database()
     if siblings:
         ask_beside(path, allow_network=True)
     gate = _Gate(path, roots)
