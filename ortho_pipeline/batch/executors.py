@@ -6,6 +6,7 @@ Nothing heavy is imported at the top: a worker process sets its budget of thread
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import signal
@@ -23,6 +24,7 @@ from ortho_pipeline.errors import InputError, OrthoError
 from ortho_pipeline.errors.texts import Setting, Text, installing
 from ortho_pipeline.options import EXECUTORS
 from ortho_pipeline.runtime.process_limits import print_no_error_twice, require_memory, startable_threads
+from ortho_pipeline.runtime.signals import Terminated, ended_by_signals
 
 #: Jobs that are handed over before their turn, so that no worker waits for the next one.
 _AHEAD = 256
@@ -79,6 +81,7 @@ class Processes:
         a job that kills its process every time ends with `WorkerDied`.
         """
         suspects: list[Job] = []
+        work = functools.partial(_until_terminated, work)
         try:
             for job, future in self._on_new_pools(2 * self.workers, work, iter(jobs), ended):
                 if isinstance(future.exception(), BrokenExecutor):
@@ -113,7 +116,7 @@ class Processes:
             self.stop()
 
     def stop(self) -> None:
-        """End all processes now; unfinished scenes have no outputs."""
+        """End all processes; unfinished scenes have no outputs, and remove their temporary files."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
         for process in self._spawned:
@@ -246,6 +249,15 @@ def start_worker(threads: int) -> None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     import ortho_pipeline.commands.rectification
     import ortho_pipeline.warp.lattice_engine  # noqa: F401
+
+
+def _until_terminated(work: Callable[[Job], Outcome], job: Job) -> Outcome:
+    """Do a job; a signal that ends the process lets the job remove its temporary files first."""
+    try:
+        with ended_by_signals():
+            return work(job)
+    except Terminated as ended:
+        os._exit(ended.code)
 
 
 def _end_with(sentinel: int) -> None:

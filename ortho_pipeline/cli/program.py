@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ortho_pipeline.cli.machine.terminal import PrintableLog, say
-from ortho_pipeline.cli.signals import Terminated, ended_by_signals
 from ortho_pipeline.errors import InputError, OrthoError, PluginError, error_document
 
 if TYPE_CHECKING:
@@ -220,6 +219,8 @@ def _without_gdal() -> InputError | None:
 
 def main() -> None:
     """Run the command line."""
+    from ortho_pipeline.runtime.signals import Terminated, ended_by_signals
+
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(PrintableLog("%(levelname)s: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])

@@ -1,1 +1,1 @@
-"""The process: compiled kernels, memory and threads."""
+"""The process: compiled kernels, memory, threads and signals."""

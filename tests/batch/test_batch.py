@@ -754,6 +754,21 @@ def test_the_thread_that_a_signal_interrupts_calls_no_pool(crew):
     assert not called & {"submit", "wait", "cancel", "shutdown"}
 
 
+def test_processes_that_are_ended_remove_their_temporary_files(tmp_path):
+    """Ctrl-C left a folder with hidden files for each scene that was under way."""
+    writing = (
+        "import time; from ortho_pipeline.files import whole_or_nothing\n"
+        f"with whole_or_nothing({str(tmp_path / 'out' / 'ortho.tif')!r}): time.sleep(30)"
+    )
+    waiting = (
+        f"import pathlib, time\nwhile not any(pathlib.Path({str(tmp_path)!r}).rglob('*.part.tif')): time.sleep(0.01)"
+    )
+    pairs = completed(Processes(2, 1), exec, [writing, waiting])
+    assert next(pairs)[0] == waiting
+    pairs.close()  # as an interrupt does
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_a_killed_process_left_is_removed(block):
     begun = (
         "import os, sys; from ortho_pipeline.files import *\n"

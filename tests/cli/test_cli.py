@@ -49,7 +49,7 @@ def test_help_of_all_commands_loads_none_of_them():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert [name.removeprefix("ortho_pipeline.") for name in done.stdout.split()] == [
         "ortho_measure", "ortho_pipeline", "cli", "cli.machine", "cli.machine.added", "cli.machine.terminal",
-        "cli.program", "cli.signals", "errors", "hookspecs", "host", "host.registry", "plugin",
+        "cli.program", "errors", "hookspecs", "host", "host.registry", "plugin",
         "runtime", "runtime.lazy_names", "ortho_studies",
     ]  # fmt: skip
 

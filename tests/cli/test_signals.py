@@ -10,7 +10,7 @@ import pytest
 
 LOST = """
 import os, sys, time
-from ortho_pipeline.cli.signals import ended_by_signals
+from ortho_pipeline.runtime.signals import ended_by_signals
 
 class Dying:
     def __del__(self):
@@ -26,7 +26,7 @@ with ended_by_signals():
 """
 AFTER = """
 import os, sys, time
-from ortho_pipeline.cli.signals import ended_by_signals
+from ortho_pipeline.runtime.signals import ended_by_signals
 with ended_by_signals():
     pass
 os.kill(os.getpid(), int(sys.argv[1]))
